@@ -230,6 +230,17 @@ def test_relabelled_scans_are_label_files_that_are_read_again(run, folder, tmp_p
     assert np.mean(fused[both] == truth[both]) > np.mean(flips[both] == truth[both]) + 0.05
 
 
+def test_predictions_in_a_folder_of_their_own_are_called_by_scene_and_model(street, folder, tmp_path):
+    """As benchmarks take them: LABELS/SCENE/MODEL/NAME.label."""
+    (tmp_path / "00").mkdir()
+    (tmp_path / "00/mine").symlink_to(folder / "00/predictions/far")
+    options = {"root": folder, "labels_root": tmp_path}
+    scene = open_dataset("semantickitti", options).scene("00")
+    assert scene.models == ("mine",)
+    far = open_dataset("semantickitti", {"root": folder}).scene("00").frame(3, "far")
+    np.testing.assert_array_equal(scene.frame(3, "mine").labels, far.labels)
+
+
 def test_moving_points_are_left_out_of_all_models_by_default(street, tmp_path):
     moving = street.with_ids(lambda ids, k: np.where(ids == 10, 252, ids))
     write_street(tmp_path / "00", moving)

@@ -23,7 +23,7 @@ from semstab.core.types import Float32, Float64, Mask, UInt16
 from semstab.data.frames import Frame, Intrinsics
 from semstab.data.labels import IGNORE_16BIT, LabelSpace
 from semstab.datasets.files import options as opt
-from semstab.datasets.files.labels import LabelSource, SceneEntry
+from semstab.datasets.files.labels import SEPARATE, LabelSource, SceneEntry
 from semstab.datasets.files.options import Folders, Template, matching_folders
 from semstab.datasets.files.reader import ScenesBelow
 from semstab.datasets.formats.disk import decode_array
@@ -177,7 +177,8 @@ class ScanScene(Scene):
         if dataset.truth is not None:
             truth = LabelSource.of("points", entry.folder, dataset.truth, scans, self._files)
             self._truth = None if truth.first is None else truth
-        templates = dataset.labels if self.options.labels is None else (self.options.labels,)
+        templates = dataset.labels if self.options.labels_root is None else (SEPARATE, *dataset.labels)
+        templates = templates if self.options.labels is None else (self.options.labels,)
         shown = {"scene": entry.below_root, "model": "MODEL", "name": scans[0].name}
         known = [Template("labels", text, ("scene", "model", "name"), ("model", "name")) for text in templates]
         self.label_paths = tuple(str(base / template.filled(**shown)) for template in known)
