@@ -12,7 +12,7 @@ from typing import Any
 import numba as nb
 import numpy as np
 
-from semstab.backends.shared.beliefs import js_term, observe_row, plogp
+from semstab.backends.shared.beliefs import observe_row, plogp
 from semstab.backends.shared.keys import PARTITIONS, mix
 from semstab.backends.shared.pixel_keys import AHEAD, touch
 from semstab.core.compiled import compiled, parallel, serial
@@ -108,7 +108,7 @@ def _observe_voxel(record, nodes, ranges, s, label, weight, first, last, pixels,
     for e in range(first, last):
         s[label[e]] = weight[e] / pixels
     before, after = 1.0 / max(op, 1), 1.0 / (op + 1)
-    top_before = top_after = plogp_before = plogp_after = drift = 0.0
+    top_before = top_after = plogp_before = plogp_between = plogp_after = 0.0
     most_before = most_after = -1.0
     dominant_before = dominant_after = np.int64(0)
     at = np.int64(-2)  # the record itself
@@ -133,8 +133,8 @@ def _observe_voxel(record, nodes, ranges, s, label, weight, first, last, pixels,
             following = np.int64(nodes[at].next)
         top_before, top_after = max(top_before, p), max(top_after, q)
         plogp_before += plogp(p)
+        plogp_between += plogp(0.5 * (p + q))
         plogp_after += plogp(q)
-        drift += js_term(p, q)
         if following < 0:
             break
         at = following
@@ -160,11 +160,11 @@ def _observe_voxel(record, nodes, ranges, s, label, weight, first, last, pixels,
                 most_after, dominant_after = share, lab
             q = share * after
             top_after = max(top_after, q)
+            plogp_between += plogp(0.5 * q)
             plogp_after += plogp(q)
-            drift += js_term(0.0, q)
     out[0] = top_after - top_before
     out[1] = plogp_before - plogp_after
-    out[2] = min(max(drift, 0.0), 1.0) if op > 0 else 0.0
+    out[2] = min(max(0.5 * (plogp_before + plogp_after) - plogp_between, 0.0), 1.0) if op > 0 else 0.0
     out[3], out[4] = dominant_before, dominant_after
 
 

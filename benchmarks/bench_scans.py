@@ -1,11 +1,13 @@
 """CPU time and memory of one LiDAR scan on each backend, beside the same fusion by np.unique.
 
     python benchmarks/bench_scans.py [--points 120000] [--classes 20] [--voxel-size 0.2] [--scans 20] [--rounds 5]
+                                     [--data SEMANTICKITTI]
 
 A scanner of 64 beams drives along a street of walls and boxes at 1.2 m a scan; points err by 2 cm, and 5 % of them have
-a random label. A round fuses all scans into a new map; a number is the median over scans of the median over rounds, of
-user and system time of all threads. 'np.unique' finds a scan's voxels by sorting, and sums its labels, without a map:
-it is the baseline of the ratio.
+a random label. With `--data` the scans are those of a folder of SemanticKITTI, with their true labels. A round fuses
+all scans into a new map; a number is the median over scans of the median over rounds, of user and system time of all
+threads. Backend `numpy` fuses by np.unique: it is the baseline of the ratio. 'np.unique alone' finds a scan's voxels
+and sums their labels so, without a map.
 """
 
 from __future__ import annotations
@@ -25,6 +27,10 @@ import semstab  # noqa: E402
 from semstab import backends  # noqa: E402
 from semstab.backends.shared.association import observe  # noqa: E402
 from semstab.core.types import Float64  # noqa: E402
+from semstab.settings import as_config, resolve  # noqa: E402
+from semstab.task import open_scenes, read, tasks_of  # noqa: E402
+
+ALONE = "np.unique alone"
 
 BEAMS, STEP = 64, 1.2
 LOWEST, HIGHEST = -24.8, 2.0
@@ -64,6 +70,13 @@ def _seen(origin: Float64, rays: Float64, boxes: Float64, K: int) -> tuple[Float
     return distance, label
 
 
+def recorded(root: str) -> tuple[list[semstab.Frame], int]:
+    """The scans of the first sequence in a folder of SemanticKITTI, with true labels, and the number of classes."""
+    config = resolve(as_config({"dataset": {"name": "semantickitti", "options": {"root": root}}, "models": ["gt"]}))
+    (task,) = tasks_of(next(iter(open_scenes(config).values())), config)
+    return [read(task, index, 1) for index in task.indices], len(task.mapping.target)
+
+
 def milliseconds(step: Callable[[semstab.Frame], Any], frames: Sequence[semstab.Frame]) -> list[float]:
     """CPU time of a step on each frame."""
     taken = []
@@ -82,22 +95,26 @@ def main() -> None:
     parser.add_argument("--voxel-size", type=float, default=0.2)
     parser.add_argument("--scans", type=int, default=20)
     parser.add_argument("--rounds", type=int, default=5)
-    parser.add_argument("--backends", nargs="+", default=["numba", "open3d", "torch", "numpy"])
+    parser.add_argument("--data", help="folder of SemanticKITTI, whose scans take the place of the street's")
+    parser.add_argument("--backends", nargs="+", default=["numba", "open3d", "torch"])
     arguments = parser.parse_args()
     size, K = arguments.voxel_size, arguments.classes
-    frames = street(arguments.points, K, arguments.scans)
-    taken: dict[str, list[list[float]]] = {name: [] for name in ("np.unique", *arguments.backends)}
+    if arguments.data:
+        frames, K = recorded(arguments.data)
+    else:
+        frames = street(arguments.points, K, arguments.scans)
+    taken: dict[str, list[list[float]]] = {name: [] for name in ("numpy", ALONE, *arguments.backends)}
     voxels, reports = 0, []
     for _ in range(arguments.rounds + 1):  # the first one is warm-up
-        taken["np.unique"].append(milliseconds(lambda frame: observe(frame, size, K), frames))
-        for name in arguments.backends:
+        taken[ALONE].append(milliseconds(lambda frame: observe(frame, size, K), frames))
+        for name in ("numpy", *arguments.backends):
             backend = backends.create(name, voxel_size=size, num_classes=K)
             taken[name].append(milliseconds(backend.integrate, frames))
             voxels = len(backend.table())
     reports = [float(np.median(np.median(np.array(rounds[1:]), axis=0))) for rounds in taken.values()]
     counts = [int(np.count_nonzero(frame.valid)) for frame in frames]
-    print(f"{arguments.scans} scans of {np.median(counts):,.0f} points, K = {K}, {size:g} m, {voxels:,} voxels")
-    print("| | CPU ms a scan | times as fast as np.unique |\n|---|---:|---:|")
+    print(f"{len(frames)} scans of {np.median(counts):,.0f} points, K = {K}, {size:g} m, {voxels:,} voxels")
+    print("| | CPU ms a scan | times as fast as numpy |\n|---|---:|---:|")
     for name, ms in zip(taken, reports, strict=True):
         print(f"| {name} | {ms:.1f} | {reports[0] / ms:.2f} |")
 

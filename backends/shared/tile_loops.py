@@ -127,19 +127,26 @@ def _words_fused(depth, labels, ignore, ray_a, ray_b, ray_c, a0, b0, c0, ta, tb,
 
 
 @compiled(fastmath={"contract"})
-def _words_of_points_fused(points, depth, labels, ignore, M, ta, tb, tc, face, out):
+def _split(points, x, y, z):
+    """Write the coordinates of points (n, 3) as rows: strides of three keep loops from becoming vector instructions."""
+    for u in range(points.shape[0]):
+        x[u], y[u], z[u] = points[u, 0], points[u, 1], points[u, 2]
+
+
+@compiled(fastmath={"contract"})
+def _words_of_points_fused(x, y, z, depth, labels, ignore, M, ta, tb, tc, face, out):
     """Return the words of points of a scan, and any doubt, as `_words_fused` of pixels; M (3, 3) is R / r."""
     a0, a1, a2, b0, b1, b2 = M[0, 0], M[0, 1], M[0, 2], M[1, 0], M[1, 1], M[1, 2]
     c0, c1, c2 = M[2, 0], M[2, 1], M[2, 2]
     doubt = outside = 0
     for u in range(depth.shape[0]):
         ok = (depth[u] > np.float32(0)) & (depth[u] < np.float32(np.inf)) & (labels[u] != ignore)
-        x = np.float64(points[u, 0]) if ok else 0.0
-        y = np.float64(points[u, 1]) if ok else 0.0
-        z = np.float64(points[u, 2]) if ok else 0.0
-        a: Any = bits_of(x * a0 + (y * a1 + (z * a2 + ta)))
-        b: Any = bits_of(x * b0 + (y * b1 + (z * b2 + tb)))
-        c: Any = bits_of(x * c0 + (y * c1 + (z * c2 + tc)))
+        px = np.float64(x[u]) if ok else 0.0
+        py = np.float64(y[u]) if ok else 0.0
+        pz = np.float64(z[u]) if ok else 0.0
+        a: Any = bits_of(px * a0 + (py * a1 + (pz * a2 + ta)))
+        b: Any = bits_of(px * b0 + (py * b1 + (pz * b2 + tb)))
+        c: Any = bits_of(px * c0 + (py * c1 + (pz * c2 + tc)))
         doubt |= ok & (((a & face) == 0) | ((b & face) == 0) | ((c & face) == 0))
         outside |= (a ^ FROM) | (b ^ FROM) | (c ^ FROM)
         i, j, k = (a << 12) & (-1 << 48), (b >> 4) & (0xFFFF << 32), (c >> 20) & (0xFFFF << 16)
@@ -280,6 +287,19 @@ def find_words(
         )  # fmt: skip
 
 
+@serial
+def _touch_points(points, depth, labels, first, end):
+    """Ask for the stretch of points that comes next."""
+    if first + COLUMNS <= end:
+        for u in range(first, first + COLUMNS, 16):
+            touch(points[u], 0)
+            touch(points[u + 5], 1)
+            touch(points[u + 10], 2)
+            touch(depth, u)
+        touch(labels, first)
+        touch(labels, first + 64)
+
+
 @parallel
 def find_words_of_points(
     points, depth, labels, T, size, origin, corner, columns, M, begin, face, ignore, room, stretches, tables,
@@ -294,6 +314,7 @@ def find_words_of_points(
         run_word, run_end = stretches[thread, 2], stretches[thread, 3]
         own_word = word[band * room : (band + 1) * room]
         own_count = count[band * room : (band + 1) * room]
+        x, y, z = np.empty(COLUMNS, np.float32), np.empty(COLUMNS, np.float32), np.empty(COLUMNS, np.float32)
         n = np.int64(0)
         end = min(depth.shape[0], (band + 1) * POINTS)
         for first in range(band * POINTS, end, COLUMNS):
@@ -301,7 +322,11 @@ def find_words_of_points(
             own = words[: -(-(to - first) // LANES) * LANES + 1]
             own[to - first :] = -1
             some, seen, named = points[first:to], depth[first:to], labels[first:to]
-            if _words_of_points_fused(some, seen, named, ignore, M, begin[0], begin[1], begin[2], face, own):
+            _touch_points(points, depth, labels, to, end)
+            _split(some, x, y, z)
+            if _words_of_points_fused(
+                x, y, z, seen, named, ignore, M, begin[0], begin[1], begin[2], face, own
+            ):  # fmt: skip
                 lost[band] |= exact_keys_of_points(some, seen, named, T, size, ox, oy, oz, ignore, keys)
                 lost[band] |= _words_of_keys(keys, named, corner, own)
             if columns.shape[0]:
