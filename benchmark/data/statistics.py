@@ -247,11 +247,19 @@ class RangeAgreement:
     @property
     def text(self) -> str:
         """Return the one number for people: 'reliable up to 30 m (20 to 50 m)'."""
-        if not self.reliable:
-            return f"reliable at no range (alpha {self.strata[0].alpha.text()} up to {self.strata[0].high:g} m)"
-        ends = "" if self.low == self.high else f" ({self.low:g} to {self.high:g} m)"
-        far = ", the farthest seen" if self.reliable == self.farthest else ""
-        return f"reliable up to {self.reliable:g} m{ends}{far}"
+        return " ".join(filter(None, ("reliable", *self.parts)))
+
+    @property
+    def parts(self) -> tuple[str, str]:
+        """Return the number, and what belongs to it: ('up to 30 m', '(20 to 50 m)')."""
+        if self.reliable:
+            ends = "" if self.low == self.high else f"{self.low:g} to {self.high:g} m"
+            far = "the farthest seen" if self.reliable == self.farthest else ""
+            note = ", ".join(filter(None, (ends, far)))
+            return f"up to {self.reliable:g} m", note and f"({note})"
+        first = next((row for row in self.strata if not math.isnan(row.alpha.value)), self.strata[0])
+        found = f"(alpha {first.alpha.text()} from {first.low:g} to {first.high:g} m)"
+        return f"up to {self.high:g} m at most" if self.high else "at no range", found
 
 
 @dataclass(frozen=True)

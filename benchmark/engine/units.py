@@ -37,7 +37,7 @@ from semstab.task import Task, applies, frame_indices, open_scenes, selected, ta
 
 logger = logging.getLogger("semstab")
 
-FORMAT = 11
+FORMAT = 12
 """Part of every key: raise it with any change of the numbers that a unit's settings and input lead to, and with a
 setting's default."""
 

@@ -141,7 +141,8 @@ def _numbers(
     yield "alpha", "" if math.isnan(alpha) else short(alpha), interval(None if head is None else head.alpha)
     yield "two views agree", mean([stats.agreeing for stats in assessed], "{:.0f} %", 100), "of the spots"
     if one is not None and one.ranges is not None and one.ranges.limited:
-        yield "reliable", f"up to {one.ranges.reliable:g} m", one.ranges.text.partition(" m")[2].strip(" ,")
+        value, note = one.ranges.parts
+        yield "reliable", value, note
     flicker = [record.image_space.compensated_flicker_percent for record in records]
     yield "flicker", mean(flicker, "{:.1f} %"), "of the pixels per frame, motion removed"
     together = pooled(records)

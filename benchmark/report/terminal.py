@@ -50,7 +50,12 @@ CONTRIBUTES = 0.01
 MOST_CLASSES = {1: 5, 2: 3}
 """The number of classes that are listed for each model, by the number of rows above; else 1."""
 
+OF_MAP = "of each map"
+MOST_MAPS = 4
+"""The most maps whose shares are printed beneath the rows; tables and report have all."""
+
 MOST_WARNINGS = 3
+LEVELS = f"  act on labels from alpha {short(LIMITS.stable)} on, with care from {short(LIMITS.usable)}"
 STAGE_NAMES = {
     "read": "reading",
     "check": "data check",
@@ -179,7 +184,7 @@ def _verdict(run: UnitSummary) -> Iterator[str]:
         share, name = nearly_all(statistics.cells.largest_share), statistics.cells.largest_class
         yield f"  {share} of the observations are {name}: agreement does not assess such a map"
     else:
-        yield f"  act on labels from alpha {short(LIMITS.stable)} on, with care from {short(LIMITS.usable)}"
+        yield LEVELS
     if statistics.verdict.level == "undecided":
         levels = ", ".join(f"{name} {short(p)}" for name, p in level_probabilities(alpha).items())
         yield f"  no level has p {short(DECIDED)} ({levels}): more frames decide it"
@@ -266,6 +271,9 @@ def _several(result: Result, records: Sequence[Record], width: int) -> Iterator[
     if any(record.summary.table.recurrent.voxels < ENOUGH for record in records):
         titles = ", ".join(measure.title for measure in headlines())
         yield f"  {titles} -: fewer than {ENOUGH:,} voxels were seen 3 times or more"
+    yield LEVELS
+    if len(records) <= MOST_MAPS and any(record.summary.table.categories for record in records):
+        yield from ("", *_map_shares(records, width))
     yield from _classes(records, width)
     yield from _outlying(records)
     for record in records:
@@ -274,6 +282,20 @@ def _several(result: Result, records: Sequence[Record], width: int) -> Iterator[
             scene = f" in {record.unit.scene}" if len(result.scenes) > 1 else ""
             yield f"  {record.unit.model}{scene}: {ranges.text}"
     yield ""
+
+
+def _map_shares(records: Sequence[Record], width: int) -> Iterator[str]:
+    """Yield a row for each map: how much of it is stable, uncertain, drifting, and seen too rarely to tell."""
+    known = [record for record in records if record.summary.table.categories]
+    rows = [percents([record.summary.table.categories[name] for name in reversed(CATEGORIES)]) for record in known]
+    heads = ("stable", "uncertain", "drifting", "seen less than 3 times")
+    scenes = len({record.unit.scene for record in known}) > 1
+    named = [f"{record.unit.scene}, {record.unit.model}" if scenes else record.unit.model for record in known]
+    names = [_cut(name, width - sum(map(len, heads)) - 2 * len(heads) - 2) for name in named]
+    first = max(map(len, (OF_MAP, *names)))
+    for name, row in ((OF_MAP, heads), *zip(names, rows, strict=True)):
+        cells = (f"{share:>{len(head)}}" for share, head in zip(row, heads, strict=True))
+        yield "  ".join(["", f"{name:<{first}}", *cells])
 
 
 def laid_out(rows: Sequence[Sequence[str]], width: int) -> list[str]:

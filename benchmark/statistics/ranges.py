@@ -8,7 +8,7 @@ import math
 import numpy as np
 
 from semstab.core.types import THIS_SCENE, Float64, Scope
-from semstab.data.statistics import RangeAgreement, RangeStratum
+from semstab.data.statistics import UNKNOWN, RangeAgreement, RangeStratum
 from semstab.statistics.accumulate import sums_of_cells
 from semstab.statistics.intervals import estimate, scope_of
 from semstab.statistics.observations import CellObservations
@@ -19,6 +19,9 @@ EDGES: Float64 = np.array([m * 10.0**e for e in range(-1, 4) for m in (1, 1.5, 2
 
 LEAST_ENTRIES, LEAST_SHARE = 2000, 0.02
 """The least entries of a stratum, and their share in all; a smaller one is joined with the next."""
+
+LEAST_SEEN_TWICE = 200
+"""The least cells that two views saw from a range; of fewer its alpha is not said."""
 
 
 def range_agreement(
@@ -42,8 +45,10 @@ def range_agreement(
         sums = sums_of_cells(own)
         fine = sums.fine
         assert fine is not None
-        alpha = estimate(sums, "alpha", scope=scope_of(sums, scope))
-        strata.append(RangeStratum(low, high, len(own) / len(cells), round(float(fine["voxels"].sum())), alpha))
+        seen_twice = round(float(fine["voxels"].sum()))
+        enough = seen_twice >= LEAST_SEEN_TWICE
+        alpha = estimate(sums, "alpha", scope=scope_of(sums, scope)) if enough else UNKNOWN
+        strata.append(RangeStratum(low, high, len(own) / len(cells), seen_twice, alpha))
     return RangeAgreement(tuple(strata), limits.usable, *_reliable(strata, limits.usable))
 
 
@@ -70,7 +75,7 @@ def _reliable(strata: list[RangeStratum], usable: float) -> tuple[float, float, 
         reached = 0.0
         for stratum, value in zip(strata, values, strict=True):
             if math.isnan(value):
-                continue  # no spot was seen twice from there
+                continue  # hardly a spot was seen twice from there
             if value < usable:
                 break
             reached = stratum.high
