@@ -147,11 +147,8 @@ def _geometry(result: Result) -> str:
     states = [state for state in scenes.values() if isinstance(state, Mapping)] if isinstance(scenes, Mapping) else []
     if not states:
         return ""
-    known = (state.get("error") for state in states)
-    errors = [error for error in known if isinstance(error, float) and math.isfinite(error)]
-    if all(state.get("state") == "sound" for state in states):
-        return f"geometry ok ({100 * max(errors):.2g} %)" if errors else "geometry ok"
-    return "geometry unclear: semstab-bench check"
+    sound = all(state.get("state") == "sound" for state in states)
+    return "geometry ok" if sound else "geometry unclear: semstab-bench check"
 
 
 def _scope(runs: Sequence[UnitSummary]) -> str:
