@@ -74,8 +74,12 @@ def tasks_of(scene: Scene, config: Config, others: Sequence[str] = ()) -> Iterat
     names = selected(config.models, scene.models, scene.by_name, "model", scene.name)
     if not names:
         searched = f"searched {', '.join(scene.label_paths)}; " if scene.label_paths else ""
-        instead = "add them, or predict them: --predict colour-clusters, or --predict FILE.py:NAME"
-        raise DataError(f"{scene.name}: there are no label maps; {searched}{instead}")
+        what, instead = "label maps", "add them, or predict them: --predict colour-clusters, or --predict FILE.py:NAME"
+        if scene.of_scans:
+            what, instead = "labels of its scans", "add those of a model"
+        if scene.ground_truth:
+            instead += f", or measure the ground truth: --model {GROUND_TRUTH}"
+        raise DataError(f"{scene.name}: there are no {what}; {searched}{instead}")
     frames = _chosen_frames(scene, config, [*dict.fromkeys((*names, *others))])
     indices = as_range(frames.indices)
     for model in names:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import shutil
 
 import numpy as np
 import pytest
@@ -190,6 +191,22 @@ def test_the_screen_names_the_scans_that_stand_out_and_the_range(run):
     assert "frames that stand out, flips: " in words
     assert {name for name in ("000001", "000004", "000007") if name in words.split("stand out, flips:")[1]} != set()
     assert "far: reliable up to" in words
+
+
+def test_the_screen_says_why_a_model_that_labels_too_little_is_usable_at_most(street, tmp_path):
+    write_street(tmp_path / "00", street.with_ids(lambda ids, k: np.where(ids == 70, 0, ids)))
+    result = bench("run", "--data", tmp_path, "--model", "gt", "--voxel-size", "0.5", "--out", "out", cwd=tmp_path)
+    assert "USABLE" in result.stdout
+    assert "of the locations have no label in most frames: such a map is usable at most" in result.stdout
+    assert "% of the points change class per scan" in result.stdout
+
+
+def test_scans_without_labels_are_no_images_to_predict_on(street, tmp_path):
+    write_street(tmp_path / "00", street)
+    shutil.rmtree(tmp_path / "00/predictions")
+    result = bench("run", "--data", tmp_path, cwd=tmp_path, code=2)
+    assert "00: there are no labels of its scans; searched " in result.stderr
+    assert "add those of a model, or measure the ground truth: --model gt" in result.stderr
 
 
 def test_strata_by_range_tell_a_model_that_is_worse_far_away(run):

@@ -87,6 +87,16 @@ class ImageSpace:
     self_vc16: float = math.nan
     edge_recall: float = math.nan
 
+    @property
+    def of_scans(self) -> bool:
+        """Return whether it is of scans: their points meet in space alone, the pixels of images in the image, too."""
+        return math.isnan(self.flicker_percent) and not math.isnan(self.compensated_flicker_percent)
+
+    @property
+    def changing(self) -> str:
+        """Return what flicker is a share of, and how often: 'pixels per frame', 'points per scan'."""
+        return "points per scan" if self.of_scans else "pixels per frame"
+
 
 @dataclass(frozen=True)
 class ClipMean:

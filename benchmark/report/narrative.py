@@ -165,7 +165,7 @@ def _suspicions(record: Record) -> Iterator[str]:
         return
     if statistics.cells is not None and statistics.cells.labelled < LIMITS.labelled:
         missing = f"{1 - statistics.cells.labelled:.0%} of the locations have no label in most frames"
-        yield f"{missing}; a pixel without a label cannot flicker"
+        yield f"{missing}; what has no label cannot flicker"
     if recall < LEAST_RECALL and record.unit.model != GROUND_TRUTH:
         yield (
             f"only {recall:.0%} of the edges of depth have a border of labels near them: the labels may be coarse,"

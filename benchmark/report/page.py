@@ -144,7 +144,7 @@ def _numbers(
         value, note = one.ranges.parts
         yield "reliable", value, note
     flicker = [record.image_space.compensated_flicker_percent for record in records]
-    yield "flicker", mean(flicker, "{:.1f} %"), "of the pixels per frame, motion removed"
+    yield "flicker", mean(flicker, "{:.1f} %"), f"of the {records[0].image_space.changing}, motion removed"
     together = pooled(records)
     yield "seen 3 times or more", f"{100 * together.recurrent.share:.0f} %", f"of {together.voxels:,} voxels"
     enough = together.recurrent.voxels >= ENOUGH
@@ -254,8 +254,9 @@ def _reduced(image: UInt8, most: int) -> UInt8:
 def _timeline(records: Sequence[Record], colors: Mapping[str, int]) -> Iterator[dict[str, str]]:
     """Yield flicker, and how often a frame stands alone beyond its null, by frame."""
     series = {r.unit.model: read_series(r.series) for r in records if r.series is not None and r.series.exists()}
+    what = records[0].image_space.changing.partition(" ")[0]
     for columns, title, unit in (
-        (("compensated_flicker_percent",), "Flicker", "flicker, % of the pixels"),
+        (("compensated_flicker_percent",), "Flicker", f"flicker, % of the {what}"),
         (("lone_percent", "lone_null_percent"), "Frames that stand alone", "% of the places, less null"),
     ):
         lines = []

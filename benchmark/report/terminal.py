@@ -182,6 +182,9 @@ def _verdict(run: UnitSummary) -> Iterator[str]:
         yield f"  {share} of the observations are {name}: agreement does not assess such a map"
     else:
         yield LEVELS
+    silent = 0.0 if statistics.cells is None else 1 - statistics.cells.labelled
+    if statistics.verdict.level == "usable" and alpha.value >= LIMITS.stable and silent > 1 - LIMITS.labelled:
+        yield f"  {_percent(silent)} of the locations have no label in most frames: such a map is usable at most"
     if statistics.verdict.level == "undecided":
         levels = ", ".join(f"{name} {short(p)}" for name, p in level_probabilities(alpha).items())
         yield f"  no level has p {short(DECIDED)} ({levels}): more frames decide it"
@@ -196,7 +199,8 @@ def _verdict(run: UnitSummary) -> Iterator[str]:
 def _flicker(record: Record) -> Iterator[str]:
     compensated = record.image_space.compensated_flicker_percent
     if not math.isnan(compensated):
-        yield f"  flicker  {compensated:.1f} % of the pixels change class per frame (motion removed)"
+        what, _, often = record.image_space.changing.partition(" ")
+        yield f"  flicker  {compensated:.1f} % of the {what} change class {often} (motion removed)"
 
 
 def _interval(estimate: Estimate, scale: float = 1.0) -> str:
