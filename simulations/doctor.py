@@ -160,6 +160,33 @@ def camera(factor: float = 1.0, right: float = 0.0) -> Callable[[Frames], Frames
     return lambda frames: [replace(f, intrinsics=K) for f in frames]
 
 
+SWAPPED = Intrinsics(CAMERA.fx, CAMERA.fy, CAMERA.cy, CAMERA.cx)
+SHARES = Intrinsics(CAMERA.fx / W, CAMERA.fy / H, CAMERA.cx / W, CAMERA.cy / H)
+
+
+def depth(change: Callable[[np.ndarray], np.ndarray]) -> Callable[[Frames], Frames]:
+    """Return a mistake that changes every depth image."""
+    return lambda frames: [replace(f, depth=np.ascontiguousarray(change(f.depth))) for f in frames]
+
+
+def rotation(change: Callable[[np.ndarray], np.ndarray]) -> Callable[[Frames], Frames]:
+    """Return a mistake that changes every rotation, and leaves the centres."""
+
+    def changed(T: np.ndarray) -> np.ndarray:
+        out = T.copy()
+        out[:3, :3] = change(T[:3, :3])
+        return out
+
+    return lambda frames: [replace(f, T_wc=changed(f.T_wc)) for f in frames]
+
+
+def reordered(R: np.ndarray, order: Sequence[int]) -> np.ndarray:
+    """Return the rotation whose quaternion, x y z w, has these numbers of the right one."""
+    from scipy.spatial.transform import Rotation
+
+    return np.asarray(Rotation.from_quat(Rotation.from_matrix(R).as_quat()[list(order)]).as_matrix())
+
+
 def resized(labels: np.ndarray) -> np.ndarray:
     small = cv2.resize(labels, (W // 2, H // 2), interpolation=cv2.INTER_NEAREST)
     return cv2.resize(small, (W, H), interpolation=cv2.INTER_LINEAR)
@@ -200,6 +227,14 @@ MISTAKES = (
             "frame 11 does not fit"),
     Mistake("labels of one frame upside down", one(lambda f: replace(f, labels=f.labels[::-1].copy())),
             "the map of frame 11 "),
+    Mistake("depth mirrored left to right", depth(lambda d: d[:, ::-1]), "depth images mirrored left to right"),
+    Mistake("depth upside down", depth(lambda d: d[::-1]), "depth images upside down"),
+    Mistake("depth turned by 180 degrees", depth(lambda d: d[::-1, ::-1]), "depth images turned by 180"),
+    Mistake("rotations transposed", rotation(lambda R: R.T), "transposed rotations"),
+    Mistake("quaternions w x y z read as x y z w", rotation(lambda R: reordered(R, (3, 0, 1, 2))), "w x y z that are"),
+    Mistake("quaternions x y z w read as w x y z", rotation(lambda R: reordered(R, (1, 2, 3, 0))), "x y z w that are"),
+    Mistake("cx and cy swapped", lambda fs: [replace(f, intrinsics=SWAPPED) for f in fs], "cx and cy swapped"),
+    Mistake("intrinsics divided by the size", lambda fs: [replace(f, intrinsics=SHARES) for f in fs], "as shares of"),
     Mistake("none", lambda frames: frames, "nothing"),
 )  # fmt: skip
 

@@ -246,7 +246,7 @@ class Assessment:
             return fit
         measured = min([fit, *self._measured_scale(fit)], key=lambda one: one.error)
         factor = self.reading.usual_factor(measured.convention.factor)
-        (known,) = _fits(self.sample, fit.convention, np.array([factor]))
+        (known,) = fits_of(self.sample, fit.convention, np.array([factor]))
         return measured if measured.clearly_beats(known) else known
 
     def _may_refute(self, fit: Fit) -> bool:
@@ -269,7 +269,7 @@ class Assessment:
 
     def _scale_is_told(self, fit: Fit) -> bool:
         """Return whether depth ten times as long and as short fits clearly worse: not where the camera hardly moves."""
-        others = _fits(self.sample, fit.convention, fit.convention.factor * np.array([0.1, 10]))
+        others = fits_of(self.sample, fit.convention, fit.convention.factor * np.array([0.1, 10]))
         return all(fit.clearly_beats(other) for other in others)
 
     def _stands_out(self, fit: Fit) -> bool:
@@ -306,9 +306,9 @@ class Assessment:
 
         The first ones lie between those of the search, the others nearer.
         """
-        coarse = _fits(self.sample, near.convention, near.convention.factor * np.power(10.0, np.arange(-12, 13) / 72))
+        coarse = fits_of(self.sample, near.convention, near.convention.factor * np.power(10.0, np.arange(-12, 13) / 72))
         best = min(coarse, key=lambda fit: (math.isnan(fit.error), fit.error)).convention
-        fine = _fits(self.sample, best, best.factor * np.power(10.0, np.arange(-10, 11) / 720))
+        fine = fits_of(self.sample, best, best.factor * np.power(10.0, np.arange(-10, 11) / 720))
         return [fit for fit in (*coarse, *fine) if fit.convention != near.convention]
 
     def _refuted(self, best: Fit) -> Verdict:
@@ -366,10 +366,11 @@ def _all_fits(sample: Sample, reading: Reading, thorough: bool) -> Iterator[Fit]
     for convention in alternatives(sample.configured, reading.ratios):
         known_camera = convention.ratio == (1.0, 1.0)
         factors = (FINE if thorough or convention == sample.configured else DECADES) if known_camera else one
-        yield from _fits(sample, convention, factors)
+        yield from fits_of(sample, convention, factors)
 
 
-def _fits(sample: Sample, convention: Convention, factors: Float64) -> list[Fit]:
+def fits_of(sample: Sample, convention: Convention, factors: Float64) -> list[Fit]:
+    """Return the fit under a convention with each of the factors (F,) on depth."""
     errors = sample.errors(convention, factors)
     pooled = np.concatenate(errors, axis=1) if errors else np.empty((len(factors), 0))
     points = np.isfinite(pooled).sum(axis=1)

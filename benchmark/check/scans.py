@@ -31,6 +31,7 @@ from semstab.check.coverage import (
     suggested_size,
 )
 from semstab.check.geometry import Fit, Verdict
+from semstab.check.readings import first_number_last, last_number_first
 from semstab.check.reprojection import Pair, clusters, frames_at, motion, pairs_within, reader
 from semstab.core.arrays import evenly
 from semstab.core.types import Float32, Float64, Int64, Mask
@@ -105,26 +106,6 @@ def _lidar_to_camera(T: Float64) -> Float64:
     return TO_CAMERA @ T @ np.linalg.inv(TO_CAMERA)
 
 
-def _first_number_last(T: Float64) -> Float64:
-    """Return the pose of the quaternion w x y z that was read as x y z w."""
-    from scipy.spatial.transform import Rotation
-
-    turned = T.copy()
-    w, x, y, z = Rotation.from_matrix(T[:3, :3]).as_quat()
-    turned[:3, :3] = Rotation.from_quat([x, y, z, w]).as_matrix()
-    return turned
-
-
-def _last_number_first(T: Float64) -> Float64:
-    """Return the pose of the quaternion x y z w that was read as w x y z."""
-    from scipy.spatial.transform import Rotation
-
-    turned = T.copy()
-    x, y, z, w = Rotation.from_matrix(T[:3, :3]).as_quat()
-    turned[:3, :3] = Rotation.from_quat([w, x, y, z]).as_matrix()
-    return turned
-
-
 def _scaled(factor: float) -> Callable[[Float64], Float64]:
     def of(T: Float64) -> Float64:
         scaled = T.copy()
@@ -182,8 +163,8 @@ READINGS = (
         {("coordinates", "world"): "coordinates: sensor"},
         "carry the points into the axes of the sensor once",
     ),
-    PoseReading("quaternions w x y z", _first_number_last, {}, "write quaternions as x y z w"),
-    PoseReading("quaternions x y z w", _last_number_first, {}, "write quaternions as w x y z"),
+    PoseReading("quaternions w x y z", first_number_last, {}, "write quaternions as x y z w"),
+    PoseReading("quaternions x y z w", last_number_first, {}, "write quaternions as w x y z"),
     PoseReading("poses in millimetres", _scaled(0.001), {}, "divide the positions of the poses by 1000"),
     PoseReading("poses in kilometres", _scaled(1000.0), {}, "multiply the positions of the poses by 1000"),
     PoseReading("angles in degrees, read as radians", _turned(math.pi / 180), {}, "convert the angles to radians"),

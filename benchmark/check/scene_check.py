@@ -27,6 +27,7 @@ from semstab.check.geometry import Verdict, assess, shifts_and_turns
 from semstab.check.histogram import Histogram, Tally
 from semstab.check.intrinsics import with_intrinsics
 from semstab.check.labels import LabelFindings, check_labels
+from semstab.check.mistakes import with_mistakes
 from semstab.check.no_depth import with_invalid_depth
 from semstab.check.precision import with_precision
 from semstab.check.registration import assess_surface, match_images, notes
@@ -379,7 +380,9 @@ class Inspection:
         if self.scene.surface is not None:
             return assess_surface(match_images(self.scene, sample.views, sample.pairs), len(sample.views))
         how = self.reading(options)
-        verdict = assess(sample, how, thorough=thorough)
+        verdict = with_mistakes(assess(sample, how, thorough=thorough), sample)
+        if verdict.state == "unsound":
+            return verdict
         timed = with_lateness(verdict, self.scene, sample, how)
         verdict = with_intrinsics(verdict, sample, how) if timed == verdict else timed
         verdict = with_precision(verdict, sample)

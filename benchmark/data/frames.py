@@ -337,7 +337,10 @@ class Frame:
         if np.abs(R).max() > 2 or np.abs(R.T @ R - np.eye(3)).max() > RIGID_TOLERANCE:
             raise DataError(f"{where}: the rotation is not orthonormal, {_in_line(R)}; does it hold a scale?")
         if np.linalg.det(R) < 0:
-            raise DataError(f"{where}: the rotation mirrors (determinant -1), {_in_line(R)}; check camera_axes")
+            raise DataError(
+                f"{where}: the rotation mirrors (determinant -1), {_in_line(R)}; no setting mends that: an axis has the"
+                " wrong sign, as where left-handed coordinates (Unity, Unreal, CARLA) are taken as they are; convert it"
+            )
         return T
 
     def _checked_mask(self, name: str, mask: npt.NDArray[Any]) -> Mask:
