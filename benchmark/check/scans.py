@@ -236,6 +236,18 @@ class ScanSample:
         distance, nearest = self._clouds[pair[1]].tree.query(points @ R.T + t)
         return Met(distance, np.linalg.norm(points, axis=1), nearest)
 
+    def sought(self, position: int) -> Float64:
+        """Return (m, 3) the points of a scan that are sought in others."""
+        return self._clouds[position].sought
+
+    def points(self, position: int) -> Float64:
+        """Return (n, 3) all points of a scan that have a range."""
+        return self._clouds[position].points
+
+    def tree(self, position: int) -> Any:
+        """Return a search tree of these points."""
+        return self._clouds[position].tree
+
     @property
     def ranges(self) -> list[Float32]:
         """Return for each scan the ranges (n,) of its points that have one, metres."""

@@ -33,6 +33,7 @@ from semstab.check.precision import with_precision
 from semstab.check.registration import assess_surface, match_images, notes
 from semstab.check.reprojection import Sample, View, clusters, frames_at, label_source, pairs_within, reader
 from semstab.check.scans import ScanCoverage, ScanSample, assess_scans, quick_sample_of_scans
+from semstab.check.sweep import with_sweep
 from semstab.check.timing import with_lateness
 from semstab.config import Config
 from semstab.core.arrays import evenly
@@ -206,7 +207,7 @@ def _check_scans(
 ) -> SceneCheck:
     """Check a scene of scans: their poses, what they share, voxels, and the ids of their labels."""
     sample = ScanSample(scene, indices, first, clusters(len(indices), SCAN_CLUSTERS), fused=FUSED_FRAMES)
-    verdict, coverage = assess_scans(sample), ScanCoverage(sample)
+    verdict, coverage = with_sweep(assess_scans(sample), sample), ScanCoverage(sample)
     scans, ranges = [*sample.scans.values()], sample.ranges
     p5, p50, p95 = np.percentile(np.concatenate(ranges), (5, 50, 95)) if sum(map(len, ranges)) else (np.nan,) * 3
     valid = float(np.mean([len(own) / scan.depth.size for own, scan in zip(ranges, scans, strict=True)]))
@@ -278,7 +279,8 @@ def quick_sample(
     """Return the verdict of `quick_check`, and the frames that it looked at; None where there are not two."""
     verdict, sample = Verdict("unclear", "it takes two frames to tell whether depth and poses agree"), None
     if scene.of_scans:
-        return assess_scans(quick_sample_of_scans(scene, indices)), None
+        scans = quick_sample_of_scans(scene, indices)
+        return with_sweep(assess_scans(scans), scans), None
     for count, points, thorough in ((1, QUICK_POINTS, False), (CLUSTERS, POINTS, True)):
         inspection = Inspection(scene, indices, None, clusters(len(indices), count), points, passing_over=True)
         if len(inspection.views) < 2:

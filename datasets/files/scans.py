@@ -29,6 +29,7 @@ from semstab.datasets.files.reader import ScenesBelow
 from semstab.datasets.formats.disk import decode_array
 from semstab.datasets.formats.images import Read
 from semstab.datasets.geometry.cameras import LARGEST_COORDINATE, UP_AXES, to_camera_to_world
+from semstab.datasets.geometry.sweeps import Sweep, deskewed, motion_in_sweep
 from semstab.datasets.scene import GROUND_TRUTH, Scene, fingerprint, listed
 from semstab.errors import ConfigError, DataError
 
@@ -58,6 +59,11 @@ class ScanOptions(Settings):
     min_range: opt.Positive | None = Field(None, description="metres up to which points are left out: the own vehicle")
     max_range: opt.Positive | None = Field(None, description="metres from which on points are left out")
     up_axis: opt.UpAxis = None
+    deskew: Sweep | None = Field(
+        None,
+        description="take the sensor's motion in a sweep out of the points, by their azimuth: how the sweep turns, and"
+        " the degrees from x to y at which it begins; the pose is that of its middle",
+    )
 
 
 @dataclass(frozen=True, eq=False)
@@ -295,6 +301,8 @@ class ScanScene(Scene):
         for index in indices:
             scan = self._scan(index)
             digest.update(scan.name.encode() + b"\0" + scan.pose.tobytes() + self._files.digest(scan.points))
+            if self.options.deskew is not None:
+                digest.update(self._motion(index).tobytes())
             for each in (source, self._truth):
                 file = None if each is None else each.file(scan)
                 digest.update(b"" if file is None else self._files.digest(file))
@@ -333,6 +341,8 @@ class ScanScene(Scene):
         with np.errstate(over="ignore", invalid="ignore"):  # numbers beyond float32 are no valid points
             if self._dataset.in_world:
                 points = (points - scan.pose[:3, 3]) @ scan.pose[:3, :3]
+            if self.options.deskew is not None:
+                points = deskewed(points.astype(np.float64), self._motion(index), self.options.deskew)
             points = points.astype(np.float32, copy=False)
             depth = np.sqrt((points.astype(np.float64) ** 2).sum(axis=1)).astype(np.float32)
         if near > 0 or far < math.inf:
@@ -344,6 +354,11 @@ class ScanScene(Scene):
             index=int(index), points=points, depth=depth, T_wc=scan.pose, labels=labels, mask=moving,
             timestamp=scan.timestamp, files=known | dict(files),
         )  # fmt: skip
+
+    def _motion(self, index: int) -> Float64:
+        """Return (6,) the motion in a scan's sweep."""
+        before, after = (self._scans[k].pose if 0 <= k < len(self) else None for k in (index - 1, index + 1))
+        return motion_in_sweep(before, self._scans[index].pose, after)
 
     def _source(self, model: str) -> LabelSource:
         """Return the files of a label source; raises ConfigError if there is none of that name."""
