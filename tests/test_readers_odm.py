@@ -11,6 +11,7 @@ import struct
 from pathlib import Path
 
 import cv2
+import dataset_writers as ds
 import looking_down as down
 import numpy as np
 import pytest
@@ -20,6 +21,7 @@ from PIL import Image
 from posed_scene import fails
 from scipy.spatial.transform import Rotation
 
+from semstab.backends import create
 from semstab.config import FrameSelection
 from semstab.data.georeference import Georeference, wkt
 from semstab.datasets import open_dataset
@@ -776,6 +778,62 @@ def test_the_real_flight_in_a_turned_frame_lies_where_it_lay(brighton, tmp_path,
         assert np.mean((ours.depth > 0) != (theirs.depth > 0)) < 3e-4
         gap = here.georeference.projected(seen(ours, both)) - there.georeference.projected(seen(theirs, both))
         assert np.quantile(np.abs(gap), 0.999) < 0.001
+
+
+@pytest.mark.parametrize("write", [ds.write_nvm, ds.write_bundle])
+def test_the_real_flight_exported_by_opensfm_has_the_voxels_of_its_project(brighton, tmp_path, write) -> None:
+    casts = {"casts": False, "images": brighton / "color"}
+    project = open_dataset("odm", {"root": brighton / "odm"} | casts).scene("odm")
+    folder = tmp_path / "flight"
+    shutil.copytree(brighton / "odm", folder)
+    for path in (folder, *folder.rglob("*")):
+        path.chmod(0o755)
+    (folder / "opensfm/undistorted/reconstruction.json").unlink()
+    first = project.geometry(0)
+    poses = {f"{project.frame_name(k)}.JPG.tif": np.linalg.inv(project.T_wc(k)) for k in range(len(project))}
+    write(folder / "opensfm", poses, first.intrinsics.fx)
+    exported = open_dataset("odm", {"root": folder} | casts).scene("flight")
+    tables = []
+    for scene in (project, exported):
+        backend = create("numba", voxel_size=1.0, num_classes=2)
+        for k in (0, 3, 5, 11):
+            backend.integrate(scene.geometry(k).every(3))
+        tables.append(backend.table())
+    theirs, ours = tables
+    assert len(theirs) > 1000
+    np.testing.assert_array_equal(ours.index, theirs.index)
+    np.testing.assert_array_equal(ours.op, theirs.op)
+    assert np.abs(ours.pixels - theirs.pixels).sum() < 1e-5 * theirs.pixels.sum()
+
+
+def test_an_nvm_of_images_that_distort_is_refused_with_its_line(tmp_path) -> None:
+    folder = tmp_path / "field"
+    ds.write_exported(folder, [down.frame(k) for k in range(3)], "nvm")
+    path = folder / "opensfm/undistorted/reconstruction.nvm"
+    lines = path.read_text().splitlines()
+    at = next(k for k, line in enumerate(lines) if "DJI_0001" in line)
+    lines[at] = lines[at].removesuffix(" 0 0") + " -0.1 0"
+    path.write_text("\n".join(lines) + "\n")
+    fails(DataError, f"reconstruction.nvm: line {at + 1}: the camera distorts; undistort the images", opened, folder)
+
+
+@pytest.mark.parametrize("radial", [(-0.1, 0.0), (0.0, 0.02)])
+def test_a_bundle_of_images_that_distort_is_of_the_photographs(tmp_path, radial) -> None:
+    """Labels lie on the photographs, as those of a reconstruction.json with the same lens."""
+    camera = PINHOLE | {"k1": radial[0], "k2": radial[1]}
+    shots = {f"{name}.JPG": shot(down.frame(k), "c") for k, name in enumerate(NAMES)}
+    scenes = []
+    for kind in ("json", "bundle"):
+        folder = write_project(tmp_path / kind, camera, undistorted=False)
+        if kind == "bundle":
+            (folder / "opensfm/reconstruction.json").unlink()
+            poses = {name: np.linalg.inv(down.frame(k).T_wc) for k, name in enumerate(shots)}
+            ds.write_bundle(folder / "opensfm", poses, down.K.fx, radial)
+        scenes.append(opened(folder))
+    for k in range(3):
+        theirs, ours = (scene.geometry(k) for scene in scenes)
+        np.testing.assert_allclose(ours.T_wc, theirs.T_wc, atol=1e-6)
+        np.testing.assert_allclose(ours.depth, theirs.depth, rtol=1e-4)
 
 
 def seen(frame, mask: np.ndarray) -> np.ndarray:
