@@ -91,6 +91,7 @@ REGISTRY = Registry(
         "record3d": Entry("semstab.datasets.record3d:Record3D", "EXR and JPG sequences of the app Record3D"),
         "arkitscenes": Entry("semstab.datasets.arkitscenes:ArkitScenes", "ARKitScenes, raw data"),
         "tartanair": Entry("semstab.datasets.tartanair:TartanAir", "TartanAir: simulated flights, NED poses"),
+        "syndrone": Entry("semstab.datasets.syndrone:Syndrone", "Syndrone: flights simulated by CARLA"),
         "semantickitti": Entry(
             "semstab.datasets.semantickitti:SemanticKitti", "SemanticKITTI: LiDAR scans, a class a point"
         ),
@@ -141,7 +142,7 @@ def open_dataset(name: str, options: dict[str, Any] | BaseModel, run_folder: Pat
 RECOGNISED = (
     "odm", "metashape", "pix4d", "realitycapture", "uavscenes", "hololens", "tum", "seven_scenes", "replica", "scannet",
     "semantickitti", "nuscenes", "kitti360", "tartanair", "stray_scanner", "polycam", "record3d", "arkitscenes",
-    "transforms_json", "colmap", "bag_scans", "bag", "posed_folder", "points_folder",
+    "syndrone",     "transforms_json", "colmap", "bag_scans", "bag", "posed_folder", "points_folder",
 )  # fmt: skip
 """Formats that a folder is recognised as: the one whose scenes lie highest, of these the first."""
 

@@ -252,6 +252,27 @@ def write_tartanair(folder: Path, frames: Sequence[Frame], side: str = "left") -
     return names
 
 
+def write_syndrone(folder: Path, frames: Sequence[Frame]) -> list[str]:
+    """As its generator writes it: depth of 16 bits up to 1000 m, which is sky, and poses of CARLA, left-handed."""
+    names = [f"{k:05d}" for k in range(len(frames))]
+    for name, frame in zip(names, frames, strict=True):
+        metres = np.where(frame.depth > 0, frame.depth.astype(float), 1000.0)
+        save(folder / f"depth/{name}.png", np.round(metres * 65535 / 1000).astype(np.uint16))
+        save(folder / f"rgb/{name}.png", frame.color)
+        save(folder / f"semantic/{name}.png", frame.labels)
+        R, (x, y, z) = frame.T_wc[:3, :3] * [[1], [-1], [1]], frame.T_wc[:3, 3]
+        right, down, forward = R.T
+        angles = {
+            "pitch": np.arcsin(forward[2]), "yaw": np.arctan2(forward[1], forward[0]),
+            "roll": np.arctan2(-right[2], -down[2]),
+        }  # fmt: skip
+        path = folder / f"camera/{name}.json"
+        path.parent.mkdir(parents=True, exist_ok=True)
+        degrees = {key: float(np.degrees(value)) for key, value in angles.items()}
+        path.write_text(json.dumps({"x": float(x), "y": float(-y), "z": float(z)} | degrees))
+    return names
+
+
 def write_colmap(folder: Path, frames: Sequence[Frame], *, binary: bool = False, model: str = "sparse") -> list[str]:
     """A dense workspace with a PINHOLE camera, and images whose points are there, or not."""
     names = [f"cam 0/{k:04d}" for k in range(len(frames))]
@@ -617,6 +638,7 @@ FORMATS = {
     "arkitscenes": Format("arkitscenes", write_arkitscenes, 1000),
     "bag, sqlite3": Format("bag", write_rosbag2, 1000),
     "bag, MCAP": Format("bag", functools.partial(write_rosbag2, container="MCAP"), 1000),
+    "syndrone": Format("syndrone", write_syndrone, 65.535, {"intrinsics": camera_option}),
     "tartanair": Format("tartanair", write_tartanair, None, {"intrinsics": camera_option}),
     "tartanair, V2": Format(
         "tartanair", functools.partial(write_tartanair, side="lcam_front"), None, {"intrinsics": camera_option}

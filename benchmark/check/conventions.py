@@ -19,7 +19,7 @@ POSES = ("camera_to_world", "world_to_camera")
 AXES = tuple(CAMERA_AXES)
 KINDS = ("planar", "ray")
 
-KNOWN_SCALES = (256.0, 1000.0, 4000.0, 5000.0, 6553.5, *(10.0**k for k in range(-6, 7)))
+KNOWN_SCALES = (65.535, 256.0, 1000.0, 4000.0, 5000.0, 6553.5, *(10.0**k for k in range(-6, 7)))
 """Units of depth in a metre that datasets use."""
 
 SNAP = 0.1
