@@ -91,7 +91,7 @@ def test_a_run_of_version_0_3_is_read_with_a_warning(old_run, caplog):
 def test_what_is_shown_of_it_has_no_alpha(old_run):
     out, result = old_run
     done = bench("show", out, cwd=out.parent, columns=100)
-    (row,) = (line for line in done.stdout.splitlines() if line.split()[:1] == ["sim-soft"])
+    row, *_ = (line for line in done.stdout.splitlines() if line.split()[:1] == ["sim-soft"])
     assert row.split()[1:4] == ["no", "verdict", "-"]
     assert "stable than" not in done.stdout
     for table in tables(semstab.load_result(out)):

@@ -101,9 +101,10 @@ def _principal_swapped(view: View, _: Convention) -> View:
 
 
 ANEW = "no setting mends it: write the files anew"
+OR_LEFT_HANDED = f"{ANEW}, or convert the poses where these are left-handed (Unity, Unreal), which looks alike"
 MISTAKES = (
-    Mistake("depth images mirrored left to right", _mirrored(1), ANEW),
-    Mistake("depth images upside down", _mirrored(0), ANEW),
+    Mistake("depth images mirrored left to right", _mirrored(1), OR_LEFT_HANDED),
+    Mistake("depth images upside down", _mirrored(0), OR_LEFT_HANDED),
     Mistake("depth images turned by 180 degrees", _mirrored(0, 1), ANEW),
     Mistake("poses with transposed rotations", _of_file(_transposed), "transpose the rotation (3, 3) of each"),
     Mistake("quaternions w x y z that are read as x y z w", _of_file(first_number_last), "write them as x y z w"),

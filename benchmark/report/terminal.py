@@ -51,7 +51,7 @@ MOST_CLASSES = {1: 5, 2: 3}
 """The number of classes that are listed for each model, by the number of rows above; else 1."""
 
 OF_MAP = "of each map"
-MOST_MAPS = 4
+MOST_MAPS = 2
 """The most maps whose shares are printed beneath the rows; tables and report have all."""
 
 MOST_WARNINGS = 3
@@ -113,6 +113,7 @@ def _one(result: Result, record: Record, width: int) -> Iterator[str]:
         low, drifting, uncertain, stable = percents([shares[name] for name in CATEGORIES])
         yield f"  map  {stable} stable  {uncertain} uncertain  {drifting} drifting  {low} seen less than 3 times"
     yield from _flicker(record)
+    yield ""
     yield from _classes([record], width)
     yield from _outlying([record])
     if recurrent.voxels >= ENOUGH:
@@ -274,7 +275,7 @@ def _several(result: Result, records: Sequence[Record], width: int) -> Iterator[
         yield f"  {titles} -: fewer than {ENOUGH:,} voxels were seen 3 times or more"
     yield LEVELS
     if len(records) <= MOST_MAPS and any(record.summary.table.categories for record in records):
-        yield from ("", *_map_shares(records, width))
+        yield from ("", *_map_shares(records, width), "")
     yield from _classes(records, width)
     yield from _outlying(records)
     for record in records:
@@ -370,7 +371,6 @@ def _classes(records: Sequence[Record], width: int) -> Iterator[str]:
             of_map, of_all = f"{100 * shares.get(key, 0.0):.0f} %", f"{100 * disagreement:.0f} %"
             rows.append((f"  {label}", short(alpha), others.get(key, ""), of_map, of_all))
     if rows:
-        yield ""
         room = width - CLASS_COLUMNS
         first = max(LEAST_CLASS, min(room * 2 // 3, max(len(row[0]) for row in rows)))
         second = max(len(CONFUSED), min(room - first, max(len(row[2]) for row in rows)))
