@@ -6,7 +6,7 @@ github.com/PRBonn/semantic-kitti-api, config/semantic-kitti.yaml.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any, Literal
 
@@ -108,9 +108,9 @@ class SemanticKitti(ScanDataset[SemanticKittiOptions]):
         """Return the learning map as a table."""
         return self._table
 
-    def moving(self, ids: npt.NDArray[np.integer[Any]]) -> Mask | None:
+    def moving(self, ids: Callable[[], npt.NDArray[np.integer[Any]]]) -> Mask | None:
         """Return the points of ids 252 to 259, where they are to be left out."""
-        return None if self.options.moving == "keep" else np.isin(ids, MOVING)
+        return None if self.options.moving == "keep" else np.isin(ids(), MOVING)
 
 
 def _table(options: SemanticKittiOptions) -> UInt16:

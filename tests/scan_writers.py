@@ -202,12 +202,7 @@ def write_cloud(path: Path, points: np.ndarray, walls: np.ndarray) -> None:
     if path.suffix == ".npy":
         np.save(path, points)
     elif path.suffix == ".ply":
-        head = f"ply\nformat binary_little_endian 1.0\nelement vertex {len(points)}\n"
-        head += "property uchar extra\n" + "".join(f"property float {axis}\n" for axis in "xyz") + "end_header\n"
-        rows = np.zeros(len(points), [("extra", "u1"), *((axis, "<f4") for axis in "xyz")])
-        for axis, values in zip("xyz", points.T, strict=True):
-            rows[axis] = values
-        path.write_bytes(head.encode() + rows.tobytes())
+        write_ply(path, points, label=walls.astype(np.uint8))
     else:
         import laspy
 
@@ -216,6 +211,17 @@ def write_cloud(path: Path, points: np.ndarray, walls: np.ndarray) -> None:
         las.x, las.y, las.z = points.T
         las.classification = walls
         las.write(path)
+
+
+def write_ply(path: Path, points: np.ndarray, **properties: np.ndarray) -> None:
+    """A binary PLY file, with these properties before x, y, z, and one that nothing reads."""
+    words = {"uint8": "uchar", "int32": "int", "float32": "float"}
+    columns = {"extra": np.zeros(len(points), np.uint8), **properties, **dict(zip("xyz", points.T, strict=True))}
+    columns |= {axis: columns[axis].astype(np.float32) for axis in "xyz"}
+    rows = np.rec.fromarrays([*columns.values()], names=[*columns])
+    head = [f"property {words[values.dtype.name]} {name}" for name, values in columns.items()]
+    head = ["ply", "format binary_little_endian 1.0", f"element vertex {len(points)}", *head, "end_header", ""]
+    save_bytes(path, "\n".join(head).encode() + rows.tobytes())
 
 
 def predict_points(folder: Path, name: str, walls: np.ndarray) -> None:
@@ -268,7 +274,7 @@ def of_points(suffix: str, *, in_world: bool = False) -> ScanFormat:
     write = functools.partial(write_points, suffix=suffix, in_world=in_world)
     return ScanFormat(
         "points_folder", write, predict_points, tuple("abcdef"), f"points/{{}}{suffix}", "labels/net/{}.npy",
-        truth=suffix in (".las", ".laz"), options=options,
+        truth=suffix != ".npy", options=options,
     )  # fmt: skip
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import tracemalloc
+from concurrent.futures import ThreadPoolExecutor
 
 import bag_writer as bags
 import numpy as np
@@ -16,6 +17,7 @@ from posed_scene import fails
 from scipy.spatial.transform import Rotation
 
 from semstab.datasets import open_dataset, recognise
+from semstab.datasets.bag.reading import OpenBag
 from semstab.errors import ConfigError, DataError
 
 pytest.importorskip("rosbags")
@@ -370,3 +372,19 @@ def test_memory_does_not_grow_with_the_bag(tmp_path):
 
     peak(2)
     assert peak(24) < peak(6) + 20_000 * 27
+
+
+@pytest.mark.parametrize("options", [{}, {"label_source": "gt"}], ids=["model", "truth"])
+def test_a_cloud_with_classes_is_read_once(options, tmp_path, scans, monkeypatch):
+    """For its points, its classes and its digest; other topics and threads have messages of their own."""
+    scene = opened(write(tmp_path, scans), **options)
+    taken, message = [], OpenBag.message
+    monkeypatch.setattr(OpenBag, "message", lambda bag, topic, place: taken.append(place) or message(bag, topic, place))
+    model = options.get("label_source", "label")
+    with ThreadPoolExecutor(2) as pool:
+        labels = pool.map(lambda k: scene.frame(k, model).labels[0], range(sw.COUNT))
+        for found, scan in zip(labels, scans, strict=True):
+            np.testing.assert_array_equal(found, scan.walls)
+    assert len(taken) == len({*taken}) == sw.COUNT
+    scene.digest(range(sw.COUNT), model)
+    assert len(taken) == 2 * sw.COUNT

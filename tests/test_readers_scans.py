@@ -534,3 +534,71 @@ def test_clouds_that_hold_something_else_are_named(clouds):
     fails(DataError, "is the same frame; delete one of the two", read_points, clouds)
     path.unlink()
     fails(DataError, "scan 8.ply: not a PLY file", read_points(clouds).frame, 0, "net")
+
+
+# --- points_folder, PLY with classes
+
+
+@pytest.fixture
+def plys(tmp_path):
+    """Returns a function that writes all clouds with the walls as a property, and opens them."""
+
+    def written(name="label", dtype=np.uint8, change=lambda walls: walls, **options):
+        sw.write_predicted(SCANS["points_folder, PLY"], tmp_path)
+        for k, scan in enumerate(sw.scans()):
+            walls = {name: change(scan.walls.astype(dtype))} if name else {}
+            sw.write_ply(tmp_path / f"points/scan {8 + k}.ply", scan.points, **walls)
+        return sw.opened(SCANS["points_folder, PLY"], tmp_path, **options)
+
+    return written
+
+
+@pytest.mark.parametrize(
+    "name", ["label", "Class", "classification", "scalar_Label", "scalar_Classification", "sem_class"]
+)
+@pytest.mark.parametrize("dtype", [np.uint8, np.int32, np.float32])
+def test_classes_in_ply_files_are_the_truth(plys, name, dtype):
+    scene = plys(name, dtype)
+    np.testing.assert_array_equal(scene.frame(2, "gt").labels[0], sw.scans()[2].walls)
+    np.testing.assert_array_equal(scene.frame(2, "gt").points[0], sw.scans()[2].points)
+    np.testing.assert_array_equal(scene.frame(2, "net").labels[0], sw.predicted(sw.scans()[2]))
+
+
+def test_the_property_of_classes_in_ply_files_may_be_named(plys):
+    assert not plys("mine").ground_truth
+    assert not plys("label", label_field="").ground_truth
+    np.testing.assert_array_equal(plys("mine", label_field="mine").frame(0, "gt").labels[0], sw.scans()[0].walls)
+    said = "scan 8.ply: has no property 'mina', option label_field; did you mean 'mine'"
+    fails(DataError, said, plys("mine", label_field="mina").frame, 0, "gt")
+
+
+def test_a_property_that_holds_no_classes_is_refused_and_nan_is_none(plys):
+    lost = np.arange(sw.POINTS) == 7
+    frame = plys("scalar_Label", np.float32, lambda walls: np.where(lost, np.float32("nan"), walls)).frame(0, "gt")
+    np.testing.assert_array_equal(frame.labels[0] == 65535, lost)
+    scene = plys("label", np.float32, lambda walls: walls + np.float32(0.25))
+    scene.frame(0, "net")
+    fails(DataError, "scan 8.ply: the field 'label' holds .*25, which is no class", scene.frame, 0, "gt")
+
+
+def test_a_ply_file_without_classes_among_others_is_named(plys, tmp_path):
+    scene = plys()
+    sw.write_ply(tmp_path / "points/scan 9.ply", sw.scans()[1].points)
+    scene.frame(1, "net")
+    fails(
+        DataError,
+        r"scan 9.ply: no property is one of classes \(label, .*; name it by label_field",
+        scene.frame,
+        1,
+        "gt",
+    )
+
+
+def test_ply_files_may_hold_predictions(plys, tmp_path):
+    plys("")
+    shutil.rmtree(tmp_path / "labels")
+    for k, scan in enumerate(sw.scans()):
+        sw.write_ply(tmp_path / f"labels/own/scan {8 + k}.ply", scan.points, label=scan.walls.astype(np.int32))
+    scene = sw.opened(SCANS["points_folder, PLY"], tmp_path)
+    assert (scene.models, scene.ground_truth) == (("own",), False)
+    np.testing.assert_array_equal(scene.frame(1, "own").labels[0], sw.scans()[1].walls)

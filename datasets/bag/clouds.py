@@ -12,15 +12,12 @@ import numpy as np
 import numpy.typing as npt
 
 from semstab.config import nearest
-from semstab.data.labels import IGNORE_16BIT
+from semstab.datasets.files.scans import LABEL_FIELDS, classes_in
 from semstab.datasets.formats.disk import AGAIN
 from semstab.errors import DataError
 
 CLOUD = "sensor_msgs/PointCloud2"
 AXES = ("x", "y", "z")
-LABEL_FIELDS = ("label", "class", "semantic", "sem_class")
-"""Names of a field of classes; the first one that is there counts."""
-
 TYPES = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 8: "f8"}
 """Types of numbers, by PointField.datatype."""
 
@@ -54,17 +51,7 @@ def classes_of(message: Any, name: str, where: str) -> npt.NDArray[np.int64]:
     Raises:
         DataError: If there is no such field, or it holds no whole numbers, with `where`.
     """
-    values = field_of(message, name, where)
-    if values.dtype.kind != "f":
-        return values.astype(np.int64)
-    values = np.where(np.isnan(values), IGNORE_16BIT, values)
-    bad = ~((np.abs(values) <= IGNORE_16BIT) & (values == np.rint(values)))
-    if bad.any():
-        raise DataError(
-            f"{where}: the field '{name}' holds {values[bad][0]:g}, which is no class from 0 to {IGNORE_16BIT}; set"
-            " label_field to one of classes, not of scores"
-        )
-    return values.astype(np.int64)
+    return classes_in(field_of(message, name, where), name, where)
 
 
 def field_of(message: Any, name: str, where: str) -> npt.NDArray[Any]:

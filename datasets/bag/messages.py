@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import threading
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -62,6 +63,9 @@ class Messages(Folders):
 
     def __init__(self, bag: OpenBag, folders: Sequence[Folder], frames: Sequence[str]) -> None:
         super().__init__()
+        topics = [each.topic for each in folders]
+        self._shared = {topic for topic in topics if topics.count(topic) > 1}
+        self._last = threading.local()
         self._bag = bag
         self._topics = {str(each.path): each for each in folders}
         self._index: Mapping[str, int] = {name: k for k, name in enumerate(frames)}
@@ -89,11 +93,19 @@ class Messages(Folders):
         if (found := self._found(path)) is None:
             return super().read(path)
         folder, place = found
-        return folder.content(self._bag.message(folder.topic, place), str(path))
+        return folder.content(self._message(folder.topic, place), str(path))
 
     def digest(self, path: Path) -> bytes:
         """Return a hash of the same."""
         return super().digest(path) if self._found(path) is None else digest(self.read(path))
+
+    def _message(self, topic: str, place: Place) -> Any:
+        """Return a message; of a topic that is several folders each thread keeps its last one for the next file."""
+        if topic not in self._shared:
+            return self._bag.message(topic, place)
+        if getattr(self._last, "key", None) != (topic, place):
+            self._last.message, self._last.key = self._bag.message(topic, place), (topic, place)
+        return self._last.message
 
     def _found(self, path: Path) -> tuple[Folder, Place] | None:
         folder, name = os.path.split(path)

@@ -29,7 +29,7 @@ SUFFIXES: Mapping[Kind, tuple[str, ...]] = {
     "labels": images.LABEL_SUFFIXES,
     "scores": images.SCORE_SUFFIXES,
     "masks": images.MASK_SUFFIXES,
-    "points": (".label", ".bin", ".npy", ".las", ".laz"),
+    "points": (".label", ".bin", ".npy", ".las", ".laz", ".ply"),
 }
 LOSSY_SUFFIXES = (".jpg", ".jpeg", ".JPG", ".JPEG")
 DEFAULTS: Mapping[Kind, str] = {"labels": "labels/{model}/{name}", "scores": "scores/{model}/{name}"}

@@ -8,7 +8,7 @@ import logging
 import math
 import os
 from abc import abstractmethod
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -40,6 +40,9 @@ PLACES = {"root", "labels_root", "incomplete", "taxonomy", "taxonomies", "classe
 
 NO_ID = IGNORE_16BIT - 1
 """The mark in a table of ids for one that is not in it."""
+
+LABEL_FIELDS = ("label", "class", "semantic", "sem_class")
+"""Names of a column of classes in a cloud; the first one that is there counts."""
 
 CALIBRATED = 0.01
 """How far the rotation of a calibration may be from orthonormal: it has few digits in some files."""
@@ -141,8 +144,8 @@ class ScanDataset(ScenesBelow[Options]):
         """Return a table (65536,) from ids of that source's files to its taxonomy's, where they differ; NO_ID: none."""
         return None
 
-    def moving(self, ids: npt.NDArray[np.integer[Any]]) -> Mask | None:
-        """Return the points (N,) that move by their true ids, where the format says so."""
+    def moving(self, ids: Callable[[], npt.NDArray[np.integer[Any]]]) -> Mask | None:
+        """Return the points (N,) that move by their true ids, which `ids` reads, where the format says so."""
         return None
 
 
@@ -274,7 +277,7 @@ class ScanScene(Scene):
             )
         stored = self._dataset.ids(file, self._files.read)
         truth = None if self._truth is None else self._truth.file(scan)
-        moving = None if truth is None else self._dataset.moving(self._dataset.ids(truth, self._files.read))
+        moving = None if truth is None else self._dataset.moving(lambda: self._dataset.ids(truth, self._files.read))
         files = {"labels": str(file), "mask": str(truth)}
         return self._framed(index, self._labels(model, stored, file), files, moving)
 
@@ -412,6 +415,24 @@ def floats_of(path: Path, data: bytes, columns: int) -> Float32:
             " format?"
         )
     return np.frombuffer(data, "<f4").reshape(-1, columns)
+
+
+def classes_in(values: npt.NDArray[Any], name: str, where: str) -> npt.NDArray[np.int64]:
+    """Return the classes (N,) that a column of a cloud holds; NaN is no class.
+
+    Raises:
+        DataError: If they are no whole numbers, with the column's name and `where`.
+    """
+    if values.dtype.kind != "f":
+        return values.astype(np.int64)
+    values = np.where(np.isnan(values), IGNORE_16BIT, values)
+    bad = ~((np.abs(values) <= IGNORE_16BIT) & (values == np.rint(values)))
+    if bad.any():
+        raise DataError(
+            f"{where}: the field '{name}' holds {values[bad][0]:g}, which is no class from 0 to {IGNORE_16BIT}; set"
+            " label_field to one of classes, not of scores"
+        )
+    return values.astype(np.int64)
 
 
 def ids_of(path: Path, data: bytes) -> npt.NDArray[np.integer[Any]]:
