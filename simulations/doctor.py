@@ -233,7 +233,7 @@ MISTAKES = (
     Mistake("rotations transposed", rotation(lambda R: R.T), "transposed rotations"),
     Mistake("quaternions w x y z read as x y z w", rotation(lambda R: reordered(R, (3, 0, 1, 2))), "w x y z that are"),
     Mistake("quaternions x y z w read as w x y z", rotation(lambda R: reordered(R, (1, 2, 3, 0))), "x y z w that are"),
-    Mistake("cx and cy swapped", lambda fs: [replace(f, intrinsics=SWAPPED) for f in fs], "cx and cy swapped"),
+    Mistake("cx and cy exchanged", lambda fs: [replace(f, intrinsics=SWAPPED) for f in fs], "cx and cy exchanged"),
     Mistake("intrinsics divided by the size", lambda fs: [replace(f, intrinsics=SHARES) for f in fs], "as shares of"),
     Mistake("none", lambda frames: frames, "nothing"),
 )  # fmt: skip

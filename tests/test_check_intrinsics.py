@@ -13,7 +13,6 @@ from command_line import bench
 from posed_writer import write_posed
 
 from semstab.check import quick_check
-from semstab.check.intrinsics import Camera
 from semstab.datasets import open_dataset
 
 NAMES = [f"{k:03d}" for k in range(doctor.FRAMES)]
@@ -34,6 +33,14 @@ def test_a_focal_length_that_is_too_small_is_named_with_the_one_that_fits(seed) 
     fx = float(text.split("fx = ")[1].split(",")[0])
     assert fx == pytest.approx(doctor.CAMERA.fx, rel=0.08)
     assert found.state == ("unsound" if text == found.text else "sound")
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_a_principal_point_that_is_off_is_not_taken_for_another_size_of_the_image(seed) -> None:
+    found = verdict(seed, doctor.camera(right=doctor.W / 10))
+    (text,) = (text for text in (found.text, *found.remarks) if "cx is" in text)
+    assert float(text.split("cx = ")[1].split(",")[0]) == pytest.approx(doctor.CAMERA.cx, abs=5)
+    assert not found.mend
 
 
 @pytest.mark.parametrize("seed", range(4))
@@ -59,20 +66,6 @@ def test_the_command_refuses_them_and_says_which_fit(tmp_path) -> None:
         text = " ".join((done.stdout + done.stderr).split())
         assert "the focal length is" in text
         assert "correct the intrinsics" in text
-
-
-def test_exchanged_coordinates_are_undone_before_anything_is_shifted() -> None:
-    camera = Camera(swapped=True)
-    view = next(iter(_views()))
-    K = camera.of(view).camera
-    assert (K.cx, K.cy) == (view.camera.cy, view.camera.cx)
-    assert Camera(factor=1.1, right=0.1).of(view).camera.cx == pytest.approx(view.camera.cx + 0.1 * doctor.W)
-
-
-def _views():
-    from semstab.check.reprojection import View
-
-    return [View.of(frame, 100) for frame in doctor.scene(0)[:1]]
 
 
 @pytest.mark.parametrize("name", ["apc_shelf", "hololens", "livingroom", "brighton"])

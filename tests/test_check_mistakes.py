@@ -16,7 +16,7 @@ from semstab.check.reprojection import Sample, View
 
 NAMES = [
     "depth mirrored left to right", "depth upside down", "depth turned by 180 degrees", "rotations transposed",
-    "quaternions w x y z read as x y z w", "quaternions x y z w read as w x y z", "cx and cy swapped",
+    "quaternions w x y z read as x y z w", "quaternions x y z w read as w x y z", "cx and cy exchanged",
     "intrinsics divided by the size",
 ]  # fmt: skip
 PLANTED = {mistake.name: mistake for mistake in doctor.MISTAKES}

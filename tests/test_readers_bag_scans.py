@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import dataclasses
+import sqlite3
 import tracemalloc
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import closing
 
 import bag_writer as bags
 import numpy as np
@@ -332,6 +334,16 @@ def test_a_damaged_cloud_is_one_line(container, change, said, tmp_path, scans):
     scene = opened(write(tmp_path, scans, damaged(change), container))
     scene.frame(0, "label")
     fails(DataError, rf"run.*:{CLOUDS}.*/1305031102100000000.npy: .*{said}", scene.frame, 1, "label")
+
+
+def test_clouds_that_the_bag_counts_but_has_not_are_one_line(tmp_path, scans):
+    bag = write(tmp_path, scans, container="sqlite3")
+    (file,) = bag.glob("*.db3")
+    with closing(sqlite3.connect(file)) as table:
+        table.execute("DELETE FROM messages WHERE topic_id IN (SELECT id FROM topics WHERE name = ?)", (CLOUDS,))
+        table.commit()
+    with pytest.raises(DataError, match=f"run, {CLOUDS}: holds no message that can be read; record the bag again"):
+        opened(bag)
 
 
 def test_clouds_without_a_point_are_left_out(tmp_path, scans, caplog):

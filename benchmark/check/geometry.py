@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any, Literal
@@ -286,8 +286,7 @@ class Assessment:
         errors = [
             self.sample.errors(one.convention, np.array([one.convention.factor])) for one in (fit, self.configured)
         ]
-        rows = [[(float(median_of_seen(e)[0]), int(np.isfinite(e).sum())) for e in es] for es in errors]
-        return [a < b for (a, m), (b, n) in zip(*rows, strict=True) if min(m, n) >= PAIR_POINTS]
+        return pairs_won(*errors)
 
     def _moves_alike(self, fit: Fit, other: Fit) -> bool:
         """Return whether two conventions give the same motion between the frames.
@@ -379,6 +378,12 @@ def fits_of(sample: Sample, convention: Convention, factors: Float64) -> list[Fi
         Fit(dataclasses.replace(convention, factor=f), median, n / max(1, pooled.shape[1]), n)
         for f, median, n in zip(factors.tolist(), medians.tolist(), points.tolist(), strict=True)
     ]
+
+
+def pairs_won(errors: Sequence[Float64], others: Sequence[Float64]) -> list[bool]:
+    """Return for each pair of frames where both see enough whether the first has the lower median of errors (1, N)."""
+    rows = [[(float(median_of_seen(e)[0]), int(np.isfinite(e).sum())) for e in each] for each in (errors, others)]
+    return [a < b for (a, m), (b, n) in zip(*rows, strict=True) if min(m, n) >= PAIR_POINTS]
 
 
 def _one_hypothesis(fit: Fit, other: Fit) -> bool:

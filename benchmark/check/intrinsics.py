@@ -39,21 +39,17 @@ REFUSED = 0.5
 
 @dataclass(frozen=True)
 class Camera:
-    """A change of the intrinsics: a factor on the focal lengths, and a shift of the principal point in widths.
-
-    swapped: cx and cy are exchanged first.
-    """
+    """A change of the intrinsics: a factor on the focal lengths, and a shift of the principal point in widths."""
 
     factor: float = 1.0
     right: float = 0.0
     down: float = 0.0
-    swapped: bool = False
 
     def of(self, view: View) -> View:
         """Return a view with the changed intrinsics."""
         K, width = view.camera, view.size[0]
-        cx, cy = (K.cy, K.cx) if self.swapped else (K.cx, K.cy)
-        changed = Intrinsics(K.fx * self.factor, K.fy * self.factor, cx + self.right * width, cy + self.down * width)
+        cx, cy = K.cx + self.right * width, K.cy + self.down * width
+        changed = Intrinsics(K.fx * self.factor, K.fy * self.factor, cx, cy)
         return dataclasses.replace(view, camera=changed)
 
 
@@ -75,15 +71,13 @@ class CameraFit:
     def text(self) -> str:
         """Return the finding, with the intrinsics that mend it."""
         what = []
-        if self.camera.swapped:
-            what.append("cx and cy are exchanged")
         if (factor := self.camera.factor) != 1:
             share = abs(1 / factor - 1)
             what.append(f"the focal length is {share:.0%} too {'small' if factor > 1 else 'large'}")
         if moved := [
             f"{side} is {abs(pixels):.0f} pixels too {'small' if pixels > 0 else 'large'}"
             for side, pixels in (("cx", self.K.cx - self.before.cx), ("cy", self.K.cy - self.before.cy))
-            if abs(pixels) >= 1 and not self.camera.swapped
+            if abs(pixels) >= 1
         ]:
             what.append(" and ".join(moved))
         K = self.K
@@ -129,9 +123,7 @@ def fitted(sample: Sample) -> CameraFit | None:
     present = _errors(sample, Camera())
     if not middle(present) > MIN_GAIN:
         return None
-    starts = [Camera(), *([Camera(swapped=True)] if _is_off_centre(sample) else [])]
-    best = min((_fit(sample, start) for start in starts), key=lambda camera: mean_log(_errors(sample, camera)))
-    best = _simplest(sample, best)
+    best = _simplest(sample, _fit(sample))
     errors = _errors(sample, best)
     if best == Camera() or middle(errors) > GOOD or not clearly_lower(errors, present):
         return None
@@ -141,8 +133,8 @@ def fitted(sample: Sample) -> CameraFit | None:
     return CameraFit(best, best.of(first).camera, first.camera, middle(errors), middle(present))
 
 
-def _fit(sample: Sample, start: Camera) -> Camera:
-    best, spread = start, 1.0
+def _fit(sample: Sample) -> Camera:
+    best, spread = Camera(), 1.0
     for _ in range(ROUNDS):
         for tried in (_focal_lengths, _to_the_right, _down):
             best = min((best, *tried(best, spread)), key=lambda camera: mean_log(_errors(sample, camera)))
@@ -180,13 +172,6 @@ def _simplest(sample: Sample, best: Camera) -> Camera:
         if small or middle(_errors(sample, without)) <= SIMPLER * middle(_errors(sample, simpler)):
             simpler = without
     return simpler
-
-
-def _is_off_centre(sample: Sample) -> bool:
-    """Return whether cx and cy may be exchanged: each is nearer to the middle of the other side."""
-    first = next(iter(sample.views.values()))
-    (width, height), K = first.size, first.camera
-    return abs(K.cx - height / 2) + abs(K.cy - width / 2) < abs(K.cx - width / 2) + abs(K.cy - height / 2)
 
 
 def _scaled(sample: Sample, factor: float) -> Float64:

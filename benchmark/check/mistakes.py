@@ -12,9 +12,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from semstab.check.conventions import Convention
-from semstab.check.geometry import GOOD, LEAST_PAIRS, PAIR_POINTS, WON_PAIRS, Fit, Verdict, fits_of
-from semstab.check.readings import first_number_last, last_number_first
-from semstab.check.reprojection import Sample, View, median_of_seen
+from semstab.check.geometry import GOOD, LEAST_PAIRS, WON_PAIRS, Fit, Verdict, fits_of, pairs_won
+from semstab.check.quaternions import first_number_last, last_number_first
+from semstab.check.reprojection import Sample, View
 from semstab.core.types import Float64
 from semstab.datasets.geometry.cameras import CAMERA_AXES
 
@@ -25,12 +25,14 @@ LEAST_FOCAL = 8.0
 """Pixels; a shorter focal length is one divided by the image's size."""
 
 
-LEAST_OFFSET = 8.0
-"""Pixels between cx and cy from which on it can be told that they are swapped."""
-
-
 def _in_pixels_already(view: View) -> bool:
     return bool(view.camera.fx >= LEAST_FOCAL)
+
+
+def _is_off_centre(view: View) -> bool:
+    """Return whether cx and cy may be exchanged: each is nearer to the middle of the other side."""
+    (W, H), K = view.size, view.camera
+    return abs(K.cx - H / 2) + abs(K.cy - W / 2) < abs(K.cx - W / 2) + abs(K.cy - H / 2)
 
 
 @dataclass(frozen=True)
@@ -72,7 +74,7 @@ def _of_file(change: Callable[[Float64], Float64]) -> Callable[[View, Convention
     """Return how to read poses whose matrices in the file, (4, 4), would be others."""
 
     def mended(view: View, configured: Convention) -> View:
-        file = view.pose(configured, configured)
+        file = view.T_wc.copy()
         file[:3, :3] = file[:3, :3] @ CAMERA_AXES[configured.axes].T
         inverse = configured.pose == "world_to_camera"
         file = change(np.linalg.inv(file).astype(np.float64) if inverse else file)
@@ -95,11 +97,12 @@ def _in_pixels(view: View, _: Convention) -> View:
     return dataclasses.replace(view, camera=dataclasses.replace(camera, fx=fx, fy=fy, cx=cx, cy=cy))
 
 
-def _principal_swapped(view: View, _: Convention) -> View:
+def _exchanged(view: View, _: Convention) -> View:
     camera = dataclasses.replace(view.camera, cx=view.camera.cy, cy=view.camera.cx)
     return dataclasses.replace(view, camera=camera)
 
 
+ONE = np.array([1.0])
 ANEW = "no setting mends it: write the files anew"
 OR_LEFT_HANDED = f"{ANEW}, or convert the poses where these are left-handed (Unity, Unreal), which looks alike"
 MISTAKES = (
@@ -110,10 +113,10 @@ MISTAKES = (
     Mistake("quaternions w x y z that are read as x y z w", _of_file(first_number_last), "write them as x y z w"),
     Mistake("quaternions x y z w that are read as w x y z", _of_file(last_number_first), "write them as w x y z"),
     Mistake(
-        "intrinsics with cx and cy swapped",
-        _principal_swapped,
-        "swap them",
-        lambda view: _in_pixels_already(view) and abs(view.camera.cx - view.camera.cy) >= LEAST_OFFSET,
+        "intrinsics with cx and cy exchanged",
+        _exchanged,
+        "exchange them",
+        lambda view: _in_pixels_already(view) and _is_off_centre(view),
     ),
     Mistake(
         "intrinsics as shares of the image's size",
@@ -128,42 +131,25 @@ def with_mistakes(verdict: Verdict, sample: Sample) -> Verdict:
     """Return the verdict, or that the files hold a mistake, where depth agrees far better without it."""
     if not sample.views or not sample.pairs or not verdict.fits:
         return verdict
-    possible = [mistake for mistake in MISTAKES if all(mistake.applies(view) for view in sample.views.values())]
-    best, fit = min(((one, _fit(_mended(sample, one))) for one in possible), key=lambda each: _order(each[1]))
-    configured = verdict.fits[0][1]
+    configured, tried = verdict.fits[0][1], list[tuple[Fit, Sample, Mistake]]()
+    for mistake in MISTAKES:
+        if all(mistake.applies(view) for view in sample.views.values()):
+            views = {position: mistake.mended(view, sample.configured) for position, view in sample.views.items()}
+            mended = dataclasses.replace(sample, views=views)
+            (fit,) = fits_of(mended, sample.configured, ONE)
+            tried.append((fit, mended, mistake))
+    fit, mended, best = min(tried, key=lambda each: (not each[0].has_evidence, each[0].error))
     others = [other for _, other in verdict.fits if other.has_evidence]
     if not fit.has_evidence or fit.error > GOOD or not all(fit.clearly_beats(other) for other in others):
         return verdict
-    if configured.has_evidence and fit.error > BETTER * configured.error:
-        return verdict
-    if configured.has_evidence and not _wins(_mended(sample, best), sample):
-        return verdict
+    if configured.has_evidence:
+        errors = (each.errors(sample.configured, ONE) for each in (mended, sample))
+        won = pairs_won(*errors)
+        if fit.error > BETTER * configured.error or len(won) < LEAST_PAIRS or np.mean(won) < WON_PAIRS:
+            return verdict
     now = f"reprojects with {configured.error:.1%} error" if configured.has_evidence else "hardly reprojects at all"
     text = f"{best.name}, as it seems: depth {now}, but with {fit.error:.2%} without this mistake; {best.mend}"
     return dataclasses.replace(
         verdict, state="unsound", text=text, mend=(), undetermined=(), reason="",
         fits=(verdict.fits[0], (f"without {best.name}", fit), *verdict.fits[1:]),
     )  # fmt: skip
-
-
-def _mended(sample: Sample, mistake: Mistake) -> Sample:
-    views = {position: mistake.mended(view, sample.configured) for position, view in sample.views.items()}
-    return dataclasses.replace(sample, views=views)
-
-
-def _fit(sample: Sample) -> Fit:
-    (fit,) = fits_of(sample, sample.configured, np.array([1.0]))
-    return fit
-
-
-def _order(fit: Fit) -> tuple[bool, float]:
-    return not fit.has_evidence, fit.error
-
-
-def _wins(mended: Sample, sample: Sample) -> bool:
-    """Return whether the error is lower in nearly all pairs of frames that both see."""
-    one = np.array([1.0])
-    both = [[error[0] for error in each.errors(each.configured, one)] for each in (mended, sample)]
-    enough = [pair for pair in zip(*both, strict=True) if min(np.isfinite(e).sum() for e in pair) >= PAIR_POINTS]
-    won = [bool(median_of_seen(a) < median_of_seen(b)) for a, b in enough]
-    return len(won) >= LEAST_PAIRS and sum(won) >= WON_PAIRS * len(won)

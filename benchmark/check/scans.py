@@ -31,7 +31,7 @@ from semstab.check.coverage import (
     suggested_size,
 )
 from semstab.check.geometry import Fit, Verdict
-from semstab.check.readings import first_number_last, last_number_first
+from semstab.check.quaternions import first_number_last, last_number_first
 from semstab.check.reprojection import Pair, clusters, frames_at, motion, pairs_within, reader
 from semstab.core.arrays import evenly
 from semstab.core.types import Float32, Float64, Int64, Mask

@@ -382,9 +382,9 @@ class Inspection:
         if self.scene.surface is not None:
             return assess_surface(match_images(self.scene, sample.views, sample.pairs), len(sample.views))
         how = self.reading(options)
-        verdict = with_mistakes(assess(sample, how, thorough=thorough), sample)
-        if verdict.state == "unsound":
-            return verdict
+        verdict = assess(sample, how, thorough=thorough)
+        if (mistaken := with_mistakes(verdict, sample)) != verdict:
+            return mistaken
         timed = with_lateness(verdict, self.scene, sample, how)
         verdict = with_intrinsics(verdict, sample, how) if timed == verdict else timed
         verdict = with_precision(verdict, sample)

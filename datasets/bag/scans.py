@@ -122,7 +122,8 @@ class RecordedScans:
     def __init__(self, bag: OpenBag, options: BagScanOptions) -> None:
         self._bag, self._options = bag, options
         self._topic, others = _topic_of(bag, options)
-        first = bag.first(self._topic)
+        if (first := bag.first(self._topic)) is None:
+            raise DataError(f"{bag.path}, {self._topic}: holds no message that can be read; record the bag again")
         self._field = self._field_of(first)
         self._frame = options.sensor_frame or bare(first.header.frame_id)
         self._poses = SensorPoses(bag, options, "sensor", "clouds")
