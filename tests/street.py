@@ -25,7 +25,8 @@ class Street:
     poses: list
 
     @classmethod
-    def made(cls, seed):
+    def made(cls, seed, rows=ROWS, turn=0.03, sideways=0.1):
+        """A drive that turns by so many radians a scan, and moves by so many metres to the left."""
         rng = np.random.default_rng(seed)
         boxes = []
         for side in (-1, 1):
@@ -38,14 +39,14 @@ class Street:
             for x in np.arange(-24, 50, 13.0):
                 y = side * 4.0
                 boxes.append(((x, y - 0.9, -2), (x + 4, y + 0.9, -0.5), 10))
-        up, at = np.meshgrid(np.radians(np.linspace(8, -24, ROWS)), np.radians(np.arange(0, 360, 360 / COLUMNS)))
+        up, at = np.meshgrid(np.radians(np.linspace(8, -24, rows)), np.radians(np.arange(0, 360, 360 / COLUMNS)))
         rays = np.stack([np.cos(up) * np.cos(at), np.cos(up) * np.sin(at), np.sin(up)], axis=-1).reshape(-1, 3)
         scans, ids, poses = [], [], []
         for k in range(SCANS):
-            turn = 0.03 * k
+            cos, sin = np.cos(turn * k), np.sin(turn * k)
             pose = np.eye(4)
-            pose[:2, :2] = [[np.cos(turn), -np.sin(turn)], [np.sin(turn), np.cos(turn)]]
-            pose[:3, 3] = 1.2 * k, 0.1 * k, 0.0
+            pose[:2, :2] = [[cos, -sin], [sin, cos]]
+            pose[:3, 3] = 1.2 * k, sideways * k, 0.0
             distance, label = _cast(pose[:3, 3], rays @ pose[:3, :3].T, boxes)
             hit = distance < 45
             scans.append((rays[hit] * (distance[hit] + rng.normal(0, 0.01, hit.sum()))[:, None]).astype(np.float32))

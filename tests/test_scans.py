@@ -144,6 +144,32 @@ def test_a_mistake_of_the_poses_is_named_with_the_option_that_mends_it(name, fol
     assert mend in checked.verdict.text
 
 
+@pytest.mark.parametrize("rows", [16, 24, 64])
+def test_a_straight_drive_is_sound_though_rings_meet_best_where_nothing_moves(rows, tmp_path):
+    for seed in range(3):
+        write_street(tmp_path / f"{seed}/00", Street.made(seed, rows=rows, turn=0.0, sideways=0.0))
+        verdict = checked_street(tmp_path / f"{seed}")
+        assert verdict.state == "sound", verdict.text
+        assert not {"poses in millimetres", "inverse poses"} & {*verdict.undetermined}
+
+
+@pytest.mark.parametrize("rows", [16, 24, 64])
+@pytest.mark.parametrize("turn", [0.0, 0.03])
+def test_positions_of_another_unit_are_named_in_straight_drives_too(rows, turn, tmp_path):
+    for factor, name in ((0.001, "poses in kilometres"), (1000.0, "poses in millimetres")):
+        made = Street.made(1, rows=rows, turn=turn, sideways=0.0)
+        poses = [np.block([[T[:3, :3], factor * T[:3, 3:]], [T[3:]]]) for T in made.poses]
+        write_street(tmp_path / f"{factor}/00", Street(made.scans, made.ids, poses))
+        verdict = checked_street(tmp_path / f"{factor}")
+        assert verdict.state == "unsound"
+        assert f"with {name}; " in verdict.text
+
+
+def checked_street(root):
+    (checked,) = check(load_config({"dataset": {"name": "semantickitti", "options": {"root": str(root)}}}))
+    return checked.verdict
+
+
 @pytest.mark.parametrize("coordinates", ["sensor", "world"])
 def test_points_in_the_world_are_told_from_those_in_the_axes_of_the_sensor(street, coordinates, tmp_path):
     """At UTM coordinates too, where each error is a tiny share of the distance from the origin."""

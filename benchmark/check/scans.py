@@ -1,7 +1,7 @@
 """The check of a scene of scans: whether they lie on each other by their poses, and how else they would.
 
-A point of one scan is carried by the poses into the axes of another, where its nearest point is sought; the distance,
-divided by the point's range, is its error. Each other reading of the poses is assessed in the same way.
+A point of one scan is carried by the poses into the axes of another; its distance from the surface there, divided by
+the point's range, is its error. Each other reading of the poses is assessed in the same way.
 """
 
 from __future__ import annotations
@@ -33,6 +33,7 @@ from semstab.check.coverage import (
 from semstab.check.geometry import Fit, Verdict
 from semstab.check.quaternions import first_number_last, last_number_first
 from semstab.check.reprojection import Pair, clusters, frames_at, motion, pairs_within, reader
+from semstab.check.surfaces import LEAST_RANGE, Surfaces
 from semstab.core.arrays import evenly
 from semstab.core.types import Float32, Float64, Int64, Mask
 from semstab.data.frames import Frame
@@ -40,7 +41,13 @@ from semstab.datasets import Scene
 from semstab.errors import DataError
 
 QUERIES = 2000
-"""Points of a scan that are sought in another one."""
+"""Points of a scan that are sought in another one, ..."""
+
+JUDGED = 4
+"""... every so many of them beside surfaces, under each reading of the poses."""
+
+EXACT = 1e-5
+"""The least error: a smaller one is that of the arithmetic."""
 
 TO_CAMERA = np.array([[0.0, -1, 0, 0], [0, 0, -1, 0], [1, 0, 0, 0], [0, 0, 0, 1]])
 """From the axes of a LiDAR (x forward, y left, z up) to those of a camera beside it (x right, y down, z forward)."""
@@ -56,9 +63,6 @@ ALIKE = 1.1
 
 APART = 4.0
 """They lie so many times as far from each other as the points of one scan do, at least: sparse scans err more."""
-
-LEAST_RANGE = 0.1
-"""Metres; a point may be at the sensor itself."""
 
 FAR = 20_000.0
 """Metres beyond which no scanner sees half of its points."""
@@ -226,27 +230,20 @@ class ScanSample:
 
     @cached_property
     def met(self) -> dict[Pair, Met]:
-        """Points of each pair's first scan in its second one, under the configured reading."""
-        return {pair: self.met_under(pair, lambda T: T) for pair in self.pairs}
+        """Points of each pair's first scan in its second one."""
+        return {pair: self._met(pair) for pair in self.pairs}
 
-    def met_under(self, pair: Pair, of: Callable[[Float64], Float64]) -> Met:
-        """Seek points of the pair's first scan in its second one, under another reading of the poses."""
-        R, t = motion(*(of(self.scans[position].T_wc) for position in pair))
+    def _met(self, pair: Pair) -> Met:
+        R, t = motion(*(self.scans[position].T_wc for position in pair))
         points = self._clouds[pair[0]].sought
         distance, nearest = self._clouds[pair[1]].tree.query(points @ R.T + t)
         return Met(distance, np.linalg.norm(points, axis=1), nearest)
 
-    def sought(self, position: int) -> Float64:
-        """Return (m, 3) the points of a scan that are sought in others."""
-        return self._clouds[position].sought
-
-    def points(self, position: int) -> Float64:
-        """Return (n, 3) all points of a scan that have a range."""
-        return self._clouds[position].points
-
-    def tree(self, position: int) -> Any:
-        """Return a search tree of these points."""
-        return self._clouds[position].tree
+    def surfaces(self, pair: Pair, of: Callable[[Float64], Float64] = lambda T: T, every: int = 1) -> Surfaces:
+        """Seek points of the pair's first scan beside surfaces of its second one, under a reading of the poses."""
+        here, there = (self._clouds[position] for position in pair)
+        R, t = motion(*(of(self.scans[position].T_wc) for position in pair))
+        return Surfaces.of(here.sought[::every], there.points, there.tree, R, t)
 
     @property
     def ranges(self) -> list[Float32]:
@@ -343,12 +340,12 @@ def assess_scans(sample: ScanSample) -> Verdict:
         advice = "carry them into its axes" if mend is None else f"set {mend} (--option coordinates={other})"
         text = f"points lie {away / 1000:,.0f} km from their sensor, as in the axes of the world; {advice}"
         return Verdict("unsound", text, () if mend is None else (mend,))
-    errors = {"as configured": [met.error for met in sample.met.values()]}
     others = [each for each in READINGS if each.applies(*sample.places)]
-    errors |= {each.name: [sample.met_under(pair, each.of).error for pair in pairs] for each in others}
+    readings = {"as configured": lambda T: T, **{each.name: each.of for each in others}}
+    errors = {name: [sample.surfaces(pair, of, JUDGED).error for pair in pairs] for name, of in readings.items()}
     fits = {name: _fit(own) for name, own in errors.items()}
-    configured, now = fits["as configured"], np.array([np.median(own) for own in errors["as configured"]])
-    wins = {name: float(np.mean([np.median(own) for own in errors[name]] < now)) for name in errors}
+    configured, now = fits["as configured"], np.array([_typical(own) for own in errors["as configured"]])
+    wins = {name: float(np.mean([_typical(own) for own in errors[name]] < now)) for name in errors}
     best = min(others, key=lambda each: fits[each.name].error)
     better = fits[best.name].error <= BETTER * configured.error and wins[best.name] >= WON
     shown = sorted(fits.items(), key=lambda item: (item[0] != "as configured", item[1].error))[:5]
@@ -361,25 +358,37 @@ def assess_scans(sample: ScanSample) -> Verdict:
         mend = next((text for (key, now_), text in best.mends.items() if settings.get(key) == now_), None)
         advice = f"set {mend} (--option {mend.replace(': ', '=')})" if mend else best.otherwise
         text = (
-            f"scans do not lie on each other: the nearest point of another scan is {configured.error:.1%} of the range"
-            f" away, and {fits[best.name].error:.2%} with {best.name}; {advice}"
+            f"scans do not lie on each other: points are typically {configured.error:.1%} of their range from the"
+            f" surfaces of another scan, and {fits[best.name].error:.2%} with {best.name}; {advice}"
         )
         return Verdict("unsound", text, () if mend is None else (mend,), **about)
-    if configured.error > HOPELESS and sample.between > APART * sample.spacing:
+    nearest = float(np.median(np.concatenate([met.error for met in sample.met.values()])))
+    if nearest > HOPELESS and sample.between > APART * sample.spacing:
         text = (
-            f"scans do not lie on each other: the nearest point of another scan is {configured.error:.1%} of the range"
-            " away, with every reading of the poses; check the order of poses and scans"
+            f"scans do not lie on each other: the nearest point of another scan is {nearest:.1%} of the range away, and"
+            " no reading of the poses explains it; check the order of poses and scans"
         )
         return Verdict("unsound", text, **about)
     open_ = tuple(each.name for each in others if fits[each.name].error <= ALIKE * configured.error)
-    text = f"scans lie on each other: the nearest point of another scan is {configured.error:.2%} of the range away"
-    reason = "the sensor hardly moves" if open_ else ""
+    text = (
+        f"scans lie on each other: points are typically {configured.error:.2%} of their range from the surfaces of"
+        " another scan"
+    )
+    reason = "the sensor hardly moves or turns" if open_ else ""
     return Verdict("sound", text, undetermined=open_, reason=reason, **about)
 
 
 def _fit(errors: Sequence[Float64]) -> Fit:
     every = np.concatenate(errors)
-    return Fit(Convention(), float(np.median(every)), float(np.mean(every <= CONSISTENT)), len(every))
+    told = every[np.isfinite(every)]
+    share = float(np.mean(told <= CONSISTENT)) if len(told) else 0.0
+    return Fit(Convention(), _typical(every), share, len(told))
+
+
+def _typical(errors: Float64) -> float:
+    """Return the geometric mean of errors (n,): some points lie on no surface of the other scan; inf where none is."""
+    told = errors[np.isfinite(errors)]
+    return float(np.exp(np.log(np.maximum(told, EXACT)).mean())) if len(told) else math.inf
 
 
 # What a check reports beside the verdict.
