@@ -8,6 +8,8 @@ from pathlib import Path
 import doctor
 import numpy as np
 import pytest
+from command_line import bench
+from posed_writer import write_posed
 
 from semstab.check import quick_check
 from semstab.datasets import open_dataset
@@ -38,6 +40,18 @@ def test_the_map_of_one_frame_is_named() -> None:
     assert any(
         PLANTED["labels of one frame upside down"].said in line for line in lines("labels of one frame upside down")
     )
+
+
+@pytest.mark.parametrize("wrong", ["net", "other"])
+def test_check_names_the_map_of_each_model(wrong, tmp_path) -> None:
+    frames = doctor.scene(0)
+    upside_down = PLANTED["labels of one frame upside down"].plant(frames)
+    models = {name: upside_down if name == wrong else frames for name in ("net", "other")}
+    names = [f"{k:03d}" for k in range(len(frames))]
+    folder = write_posed(tmp_path / "room", names, models, scale=None, classes=list(doctor.SPACE.classes))
+    text = " ".join(bench("check", "--data", folder, cwd=tmp_path).stdout.split())
+    assert text.count("is it of another frame?") == 1
+    assert f"labels of {wrong}: the map of frame 011 " in text
 
 
 def test_poses_that_jump_are_refused_with_the_parts_to_fuse() -> None:

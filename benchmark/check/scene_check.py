@@ -177,7 +177,10 @@ def check_scene(scene: Scene, config: Config, told: Sequence[str] = ()) -> Scene
     )
     sample, how = inspection.sample(config.dataset.options), inspection.reading(config.dataset.options)
     verdict = inspection.verdict(config.dataset.options, thorough=True)
-    findings = tuple(label_findings(scene, indices, models, LABEL_RUNS)) if verdict.state != "unsound" else ()
+    findings, others = tuple[LabelFindings, ...](), tuple[str, ...]()
+    if verdict.state != "unsound":
+        findings = tuple(label_findings(scene, indices, models, LABEL_RUNS))
+        others = tuple(inspection.misplaced_maps(config.dataset.options, models[1:]))
     checked = SceneCheck(
         scene=scene.name,
         frames=len(scene),
@@ -194,6 +197,7 @@ def check_scene(scene: Scene, config: Config, told: Sequence[str] = ()) -> Scene
         notes=(
             *told,
             *verdict.remarks,
+            *others,
             *(line for each in findings for line in each.remarks),
             *notes(scene, [inspection.views[at] for at in sorted(inspection.views)], inspection.tally.model),
             *begun,
@@ -392,6 +396,13 @@ class Inspection:
             return verdict  # rendering its frames takes longer than fusing them
         neighbours = Neighbours(self.scene, self.indices, self.source, how.convention, self.views)
         return with_continuity(verdict, neighbours, neighbours.spread(how.size, thorough=thorough))
+
+    def misplaced_maps(self, options: Mapping[str, Any], models: Sequence[str]) -> Iterator[str]:
+        """Yield a line on single label maps of other models that do not agree with those of the frames beside them."""
+        how = self.reading(options)
+        for model in models if self.scene.surface is None else ():
+            neighbours = Neighbours(self.scene, self.indices, model, how.convention)
+            yield from neighbours.said_of_labels(neighbours.chain(neighbours.spread(how.size, thorough=True)))
 
     def depth(self) -> Depth:
         """Return the depth of all frames that were read."""
