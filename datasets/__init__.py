@@ -92,6 +92,12 @@ REGISTRY = Registry(
         "arkitscenes": Entry("semstab.datasets.arkitscenes:ArkitScenes", "ARKitScenes, raw data"),
         "tartanair": Entry("semstab.datasets.tartanair:TartanAir", "TartanAir: simulated flights, NED poses"),
         "syndrone": Entry("semstab.datasets.syndrone:Syndrone", "Syndrone: flights simulated by CARLA"),
+        "midair": Entry(
+            "semstab.datasets.midair:MidAir",
+            "Mid-Air: flights simulated low over land",
+            "pip install 'semstab[midair]'",
+            ("h5py",),
+        ),
         "semantickitti": Entry(
             "semstab.datasets.semantickitti:SemanticKitti", "SemanticKITTI: LiDAR scans, a class a point"
         ),
@@ -142,7 +148,7 @@ def open_dataset(name: str, options: dict[str, Any] | BaseModel, run_folder: Pat
 RECOGNISED = (
     "odm", "metashape", "pix4d", "realitycapture", "uavscenes", "hololens", "tum", "seven_scenes", "replica", "scannet",
     "semantickitti", "nuscenes", "kitti360", "tartanair", "stray_scanner", "polycam", "record3d", "arkitscenes",
-    "syndrone", "transforms_json", "colmap", "bag_scans", "bag", "posed_folder", "points_folder",
+    "syndrone", "midair", "transforms_json", "colmap", "bag_scans", "bag", "posed_folder", "points_folder",
 )  # fmt: skip
 """Formats that a folder is recognised as: the one whose scenes lie highest, of these the first."""
 

@@ -71,6 +71,17 @@ import bag_writer, dataset_writers
 bag_writer.write_bag(Path("flight"), "ROS 1", lambda ros: bag_writer.records(ros, dataset_writers.source(1000)))
 """
 
+RECORDS = """
+import h5py, numpy as np
+with h5py.File("sensor_records.hdf5", "w") as records:
+    truth = records.create_group("trajectory_0000/groundtruth")
+    truth["position"], truth["attitude"] = np.zeros((8, 3)), np.eye(4)[[0] * 8]
+"""
+
+MIDAIR = """from pathlib import Path
+    from semstab.datasets.midair import read_flight
+    print(len(read_flight(Path("sensor_records.hdf5").absolute(), "trajectory_0000")[0]), "poses")"""
+
 CLUSTER = """
 import subprocess, sys
 if __name__ == "__main__":
@@ -173,6 +184,12 @@ USES = {
         (("-m", "semstab", "check", "flight.bag"),),
         "/camera/aligned_depth_to_color/image_raw",
         prepare=FLIGHT.format(tests=str(fresh.SOURCE / "tests")),
+    ),
+    "midair": Use(
+        "the poses of a `sensor_records.hdf5`",
+        (("-c", CALL.format(call=MIDAIR)),),
+        "8 poses",
+        prepare=RECORDS,
     ),
     "pandas": Use(
         "`semstab.load(RUN).summary`",

@@ -273,6 +273,23 @@ def write_syndrone(folder: Path, frames: Sequence[Frame]) -> list[str]:
     return names
 
 
+def write_midair(folder: Path, frames: Sequence[Frame], flight: str = "trajectory_0000") -> list[str]:
+    """A flight, with planar depth in half floats, and records of which each fourth is that of an image."""
+    import h5py
+
+    names = [f"{flight}/{k:06d}" for k in range(len(frames))]
+    poses = np.full((4 * len(frames), 7), 0.5)
+    for k, (name, frame) in enumerate(zip(names, frames, strict=True)):
+        save(folder / f"depth/{name}.PNG", frame.depth.astype(np.float16).view(np.uint16))
+        save(folder / f"color_left/{name}.JPEG", frame.color)
+        T = with_axes(frame.T_wc, "ned")
+        poses[4 * k] = [*T[:3, 3], *np.roll(quaternion(T[:3, :3]), 1)]
+    with h5py.File(folder / "sensor_records.hdf5", "a") as records:
+        truth = records.create_group(f"{flight}/groundtruth")
+        truth["position"], truth["attitude"] = poses[:, :3], poses[:, 3:]
+    return names
+
+
 def write_colmap(folder: Path, frames: Sequence[Frame], *, binary: bool = False, model: str = "sparse") -> list[str]:
     """A dense workspace with a PINHOLE camera, and images whose points are there, or not."""
     names = [f"cam 0/{k:04d}" for k in range(len(frames))]
@@ -597,7 +614,8 @@ Writer = Callable[[Path, Sequence[Frame]], list[str]]
 class Format:
     """A dataset: its name, its writer, the depth scale that it stores (None: floats), and options that it needs.
 
-    `sizes_in_images`: the size of an image stands in no other file.
+    `sizes_in_images`: the size of an image stands in no other file. `floats`: it stores floats, which hold what the
+    scale says. `within`: what the name of a scene has after those of its folders.
     """
 
     dataset: str
@@ -605,6 +623,8 @@ class Format:
     scale: float | None
     options: dict[str, object] = dataclasses.field(default_factory=dict)
     sizes_in_images: bool = False
+    floats: bool = False
+    within: str = ""
 
 
 def camera_option() -> list[float]:
@@ -638,6 +658,14 @@ FORMATS = {
     "arkitscenes": Format("arkitscenes", write_arkitscenes, 1000),
     "bag, sqlite3": Format("bag", write_rosbag2, 1000),
     "bag, MCAP": Format("bag", functools.partial(write_rosbag2, container="MCAP"), 1000),
+    "midair": Format(
+        "midair",
+        write_midair,
+        256,
+        {"intrinsics": camera_option, "depth_kind": "planar"},
+        floats=True,
+        within="-trajectory_0000",
+    ),
     "syndrone": Format("syndrone", write_syndrone, 65.535, {"intrinsics": camera_option}),
     "tartanair": Format("tartanair", write_tartanair, None, {"intrinsics": camera_option}),
     "tartanair, V2": Format(

@@ -50,7 +50,7 @@ def copied(written, tmp_path):
 def test_files_give_the_voxels_of_their_source(form, written):
     folder, names, frames = written
     scene = ds.opened(form, folder.parents[1])
-    assert (scene.name, len(scene), scene.models) == ("room-seq 1", ds.COUNT, ("net",))
+    assert (scene.name, len(scene), scene.models) == (f"room-seq 1{form.within}", ds.COUNT, ("net",))
     assert scene.label_space("net").classes == tuple(ds.CLASSES)
     found = [scene.frame(index, "net") for index in range(ds.COUNT)]
     for ours, theirs, name in zip(found, frames, names, strict=True):
@@ -68,7 +68,7 @@ def test_files_give_the_voxels_of_their_source(form, written):
 def test_the_scenes_folder_can_be_the_root(form, written):
     folder, _, frames = written
     scene = ds.opened(form, folder)
-    assert scene.name == "seq 1"
+    assert scene.name == f"seq 1{form.within}"
     np.testing.assert_allclose(scene.T_wc(ds.COUNT - 1), frames[-1].T_wc, rtol=0, atol=1e-12)
 
 
@@ -104,8 +104,8 @@ def test_depth_along_the_ray_becomes_planar(form, written):
 
 def test_invalid_values_and_far_depth_are_left_out(form, written):
     folder, _, frames = written
-    scale = form.scale or 1
-    value = float(np.rint(frames[0].depth[3, 5] * scale)) if form.scale else float(frames[0].depth[3, 5])
+    scale = None if form.floats else form.scale
+    value = float(np.rint(frames[0].depth[3, 5] * scale)) if scale else float(frames[0].depth[3, 5])
     near = ds.opened(form, folder, invalid_depth=[value], max_depth=5.0).depth(0)
     expected = np.where((frames[0].depth >= 5) | (frames[0].depth == frames[0].depth[3, 5]), 0, frames[0].depth)
     np.testing.assert_array_equal(near, expected)
@@ -166,11 +166,11 @@ def test_the_camera_of_7_scenes_is_that_of_its_file(tmp_path, above):
 # --- opening reads no image
 
 
-IMAGES = {".png", ".jpg", ".npy", ".tif"}
+IMAGES = {".png", ".jpg", ".jpeg", ".npy", ".tif"}
 
 
 def is_image(path: Path) -> bool:
-    return path.suffix in IMAGES or "depth_maps" in path.parts
+    return path.suffix.lower() in IMAGES or "depth_maps" in path.parts
 
 
 UNREAD = [name for name, form in ds.FORMATS.items() if form.dataset != "bag" and not form.sizes_in_images]

@@ -165,7 +165,8 @@ def stored_depth(
         camera: Gives the intrinsics of the depth image of a shape.
     """
     scale = options.depth_scale or frame.depth_scale
-    depth = FORMATS.get(frame.depth.suffix.lower(), read_depth)(frame.depth, scale, read)
+    reader = frame.depth_reader or FORMATS.get(frame.depth.suffix.lower(), read_depth)
+    depth = reader(frame.depth, scale, read)
     if np.isnan(depth[0, 0]) and np.isnan(depth).all():  # one frame that saw nothing ends no run; it is counted
         depth = np.zeros_like(depth)
     for value in options.invalid_depth:

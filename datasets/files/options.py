@@ -5,7 +5,7 @@ from __future__ import annotations
 import logging
 import os
 import re
-from collections.abc import Collection
+from collections.abc import Callable, Collection
 from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
 from typing import Annotated, Literal, Self
@@ -14,8 +14,10 @@ from pydantic import Field, PositiveInt, model_validator
 
 from semstab.config import Settings
 from semstab.core.files import file_digest
+from semstab.core.types import Float32
 from semstab.datasets import GROUND_TRUTH
 from semstab.datasets.formats.disk import natural, read_bytes, subfolders
+from semstab.datasets.formats.images import Read
 from semstab.datasets.geometry.cameras import Camera, Poses
 from semstab.datasets.geometry.lenses import Lens
 from semstab.errors import ConfigError, DataError
@@ -247,6 +249,9 @@ class Folders:
 
 # The files of a frame.
 
+DepthReader = Callable[[Path, float | None, Read], Float32]
+"""Gives depth (H, W) in metres of a file, of units in a metre, and of what reads its content."""
+
 
 @dataclass(frozen=True, eq=False, slots=True)
 class FrameSource:
@@ -266,6 +271,7 @@ class FrameSource:
         aliases: Other names that its label maps may have.
         color: The file that it has, or would have; None where that is not known.
         depth_scale: Units in a metre, where the dataset's own files say so.
+        depth_reader: Reads the depth file, where its suffix does not say how.
         timestamp: Seconds.
         confidence: Image of how sure each pixel's depth is; pixels below `least_confidence` have none.
     """
@@ -283,6 +289,7 @@ class FrameSource:
     aliases: tuple[str, ...] = ()
     color: Path | None = None
     depth_scale: float | None = None
+    depth_reader: DepthReader | None = None
     timestamp: float | None = None
     confidence: Path | None = None
     least_confidence: int = 0

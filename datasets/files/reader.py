@@ -104,7 +104,7 @@ class FileDataset(ScenesBelow[Options]):
         """
         entry = self.entry(name)
         options = self.settled(entry.folder)
-        frames = with_poses_of(tuple(self.frames(entry.folder)), options.pose_shift or 0)
+        frames = with_poses_of(tuple(self.frames_of_scene(entry)), options.pose_shift or 0)
         for frame in frames:
             inside(entry.folder, entry.folder, frame.name, str(frame.pose_file))  # files of predictions have its name
         if not frames:
@@ -169,6 +169,10 @@ class FileDataset(ScenesBelow[Options]):
     def class_ids(self) -> Mapping[str, UInt16]:
         """Return by label source a table (65536,) from its files' ids to those of its taxonomy, where they differ."""
         return {}
+
+    def frames_of_scene(self, entry: SceneEntry) -> Iterable[FrameSource]:
+        """Return the frames of a scene, by default all of its folder. Raises what `frames` raises."""
+        return self.frames(entry.folder)
 
     @abstractmethod
     def frames(self, folder: Path) -> Iterable[FrameSource]:

@@ -200,7 +200,7 @@ def stored(frame: Frame, scale: float | None) -> Frame:
 
 
 def described(root: Path) -> tuple[Path, ...]:
-    suffixes = (".txt", ".json", ".yaml", ".bin", ".db3", ".mcap", ".xml", ".csv", ".pincam", ".traj")
+    suffixes = (".txt", ".json", ".yaml", ".bin", ".hdf5", ".db3", ".mcap", ".xml", ".csv", ".pincam", ".traj")
     return tuple(sorted(p for p in root.rglob("*") if p.suffix in suffixes and "depth_maps" not in p.parts))
 
 
