@@ -24,6 +24,7 @@ if TYPE_CHECKING:
     from semstab.report.saved_run import load
     from semstab.settings import load_config, load_study
     from semstab.statistics.acceptance import AcceptanceThresholds
+    from semstab.videos import run_videos
 
 __version__ = "0.4.0"
 
@@ -60,6 +61,7 @@ __all__ = [
     "relabel",
     "run",
     "run_study",
+    "run_videos",
     "statistics",
 ]  # fmt: skip
 
@@ -71,7 +73,7 @@ _HOMES = {
     "FusedResult": "online", "TemporalStability": "online", "compare": "comparison.writing", "fuse": "online",
     "export": "exports", "gate": "comparison.gate", "load": "report.saved_run",
     "load_config": "settings", "load_result": "engine.folder", "load_study": "settings", "relabel": "exports.relabel",
-    "run": "api", "run_study": "api",
+    "run": "api", "run_study": "api", "run_videos": "videos",
 }  # fmt: skip
 """The module of each public name; other public names are modules."""
 

@@ -41,7 +41,7 @@ from semstab.datasets.formats.images import MILLIMETRES
 from semstab.datasets.geometry.cameras import UP_AXES
 from semstab.datasets.posed_folder import SETTINGS_FILE
 from semstab.errors import ConfigError, DataError
-from semstab.task import frame_indices, selected
+from semstab.task import frame_indices, require_posed, selected
 
 __all__ = ["Converted", "convert", "convert_scene"]
 
@@ -315,6 +315,7 @@ def convert(
 
 def convert_scene(scene: Scene, config: Config, path: Path, depth_error: float, progress: Reporter) -> Converted:
     """Write one scene; see `convert`."""
+    require_posed(scene)
     if scene.of_scans:
         raise DataError(f"{scene.name}: holds scans, and a posed folder holds images; scans are read as they are")
     known = (*scene.models, *scene.by_name)

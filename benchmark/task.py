@@ -54,15 +54,28 @@ class Task:
         return self.scene.digest([*self.indices], self.model)
 
 
-def open_scenes(config: Config, run_folder: Path | None = None) -> dict[str, Scene]:
+def open_scenes(config: Config, run_folder: Path | None = None, *, posed: bool = True) -> dict[str, Scene]:
     """Open the scenes that a configuration selects, by name, for a run in that folder; no image is read.
 
     Raises:
-        ConfigError, DataError: If there is no such scene, or its files contradict each other.
+        ConfigError, DataError: If there is no such scene, its files contradict each other, or it has no depth and poses
+            where they must be `posed`.
     """
     dataset = open_dataset(config.dataset.name, config.dataset.options, run_folder)
     names = selected(config.scenes, dataset.scenes, (), "scene", config.dataset.name)
-    return {name: dataset.scene(name) for name in names}
+    scenes = {name: dataset.scene(name) for name in names}
+    for scene in scenes.values() if posed else ():
+        require_posed(scene)
+    return scenes
+
+
+def require_posed(scene: Scene) -> None:
+    """Raise ConfigError where frames of a scene have no depth and poses, so that nothing can be fused."""
+    if not scene.posed:
+        raise ConfigError(
+            f"{scene.name}: a video, without depth and poses; `semstab-bench run --dataset video` measures its flicker,"
+            " all else needs a map"
+        )
 
 
 def tasks_of(scene: Scene, config: Config, others: Sequence[str] = ()) -> Iterator[Task]:

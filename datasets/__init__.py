@@ -108,6 +108,7 @@ REGISTRY = Registry(
             "folders points/ (LAS, LAZ, PLY, NPY), pose/ and labels/MODEL/, one file a scan",
         ),
         "hololens": Entry("semstab.datasets.hololens:HoloLens", "DeepVideoMVS and HoloLens: poses.txt and K.txt"),
+        "video": Entry("semstab.datasets.video:Video", "images in a row without depth and poses: folders, video files"),
     },
 )
 
@@ -163,6 +164,9 @@ POINTS = {
 FILES = (".bag", ".mcap", ".db3")
 """Suffixes of files that are a scene each."""
 
+VIDEOS = (".mp4", ".avi", ".mov", ".mkv", ".webm", ".m4v", ".mpg", ".mpeg")
+"""Suffixes of video files."""
+
 
 def recognise(root: Path) -> tuple[str, str]:
     """Return the dataset that a folder of scenes, or a file, belongs to, and the reason in words.
@@ -171,8 +175,13 @@ def recognise(root: Path) -> tuple[str, str]:
         DataError: If it is none; of an empty folder it is a `posed_folder`, whose reader says what is missing, with the
             nearest formats, and the files that these miss.
     """
+    if root.is_file() and root.suffix.lower() in VIDEOS:
+        return "video", "a video file: flicker in the image alone"
     if root.is_file() and root.suffix.lower() not in FILES:
-        raise DataError(f"{root}: a file, but no bag ({', '.join(FILES)}); give the folder of a scene, or above scenes")
+        raise DataError(
+            f"{root}: a file, but no bag ({', '.join(FILES)}) and no video ({', '.join(VIDEOS)}); give the folder of a"
+            " scene, or above scenes"
+        )
     if is_run(root):
         raise DataError(f"{root}: a finished run, no scene; semstab-bench show {root} says what it found")
     near, fits = list[tuple[float, str]](), list[tuple[int, int, str, str]]()
@@ -192,16 +201,28 @@ def recognise(root: Path) -> tuple[str, str]:
     if fits:
         return min(fits)[2:]
     listed = " or ".join(text for _, text in sorted(near)[:3])
+    _refuse_points(root, listed)
+    images_of: Any = REGISTRY.load("video").images_of
+    if images_of(root) is not None:
+        raise DataError(
+            f"{root}: holds images, without the depth and poses of a format that is recognised"
+            f"{f' (the nearest are {listed}; name it with --dataset NAME)' if listed else ''}; --dataset video measures"
+            " their flicker without a map"
+        )
+    if not near:
+        return "posed_folder", ""
+    raise DataError(f"{root}: no format is recognised; the nearest are {listed}; name it with --dataset NAME")
+
+
+def _refuse_points(root: Path, nearest: str) -> None:
+    """Raise DataError where a folder holds points in a layout that no reader has."""
     for what, pattern in POINTS.items():
         for depth in range(4):
             if (found := next(root.glob("*/" * depth + pattern), None)) is not None:
                 where = found.parent.relative_to(root.parent)
                 raise DataError(
                     f"{root}: holds {what} ({where}), in no layout of scans that is read"
-                    f"{f', the nearest is {listed}' if near else ''}; lay them out as one, with poses"
+                    f"{f', the nearest is {nearest}' if nearest else ''}; lay them out as one, with poses"
                     " (docs/datasets.md#scans), or, where a camera was beside, make depth images of them"
                     " (docs/tutorials/lidar-camera.md)"
                 )
-    if not near:
-        return "posed_folder", ""
-    raise DataError(f"{root}: no format is recognised; the nearest are {listed}; name it with --dataset NAME")

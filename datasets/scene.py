@@ -71,6 +71,7 @@ class Scene(ABC):
         images_elsewhere: Whether option images may name another folder of images, and does not.
         of_scans: Whether its frames are scans of points, not images.
         made: Whether it is simulated, so that each frame has the pose that it was rendered from.
+        posed: Whether its frames have depth and a pose, so that they can be fused.
     """
 
     name: str
@@ -93,6 +94,7 @@ class Scene(ABC):
     images_elsewhere: bool = False
     of_scans: bool = False
     made: bool = False
+    posed: bool = True
 
     @abstractmethod
     def __len__(self) -> int:

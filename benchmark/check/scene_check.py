@@ -43,7 +43,7 @@ from semstab.data.frames import Frame
 from semstab.data.labels import LabelSpace
 from semstab.datasets import Scene, open_dataset
 from semstab.errors import DataError
-from semstab.task import frame_indices, selected
+from semstab.task import frame_indices, require_posed, selected
 
 SCHEMA = 2
 """Version of the file that --json writes."""
@@ -156,6 +156,7 @@ def check(config: Config) -> Iterator[SceneCheck]:
     dataset = open_dataset(config.dataset.name, config.dataset.options)
     for name in selected(config.scenes, dataset.scenes, (), "scene", config.dataset.name):
         scene = dataset.scene(name)
+        require_posed(scene)
         changed, gaps = with_invalid_depth(config, {name: scene})
         if gaps:
             scene = open_dataset(changed.dataset.name, changed.dataset.options).scene(name)

@@ -22,6 +22,7 @@ from semstab.errors import ConfigError, DataError
 if TYPE_CHECKING:
     from semstab.config import Config
     from semstab.engine import Executor, Observer
+    from semstab.engine.videos import VideoObserver
 
 
 DISAGREE = 3
@@ -87,6 +88,7 @@ def run(
 
     from semstab.predict.predictor import parse_predictors
     from semstab.settings import filtered_config, load_config, predicted_config
+    from semstab.videos import is_video
 
     named = {
         "backends": backend, "scenes": scene, "models": model, "taxonomy": taxonomy, "voxel_size": voxel_size,
@@ -110,7 +112,42 @@ def run(
     if device is not None:
         loaded = _on_device(loaded, device)
     out = out or Path("runs") / datetime.now().astimezone().strftime("%Y-%m-%d_%H-%M-%S")
+    if is_video(loaded):
+        if jobs > 1 or scheduler is not None:
+            raise ConfigError("--jobs and --scheduler: videos are measured in one process; leave them out")
+        measure_videos(loaded, out, rerun, report, overwrite=overwrite, quiet=quiet)
+        return
     execute(loaded, out, executor_of(jobs, scheduler), rerun, report, overwrite=overwrite, quiet=quiet, verbose=verbose)
+
+
+def measure_videos(config: Config, out: Path, rerun: str | None, report: str, *, overwrite: bool, quiet: bool) -> None:
+    """Measure flicker of videos, print the answer, and write the results."""
+    began = time.monotonic()
+    from rich.console import Console
+
+    from semstab.report.videos import NEEDS, VideoProgress, screen
+    from semstab.videos import run_videos
+
+    if report not in ("on", "off"):
+        raise ConfigError(f"--report {report}: write on or off")
+    observers: list[VideoObserver] = [VideoProgress(Console(stderr=True, quiet=quiet))]
+    if rerun != "off":
+        from semstab.recording import Target, VideoRecording
+
+        observers.append(VideoRecording(Target.parse(rerun, out / "recording.rrd")))
+    try:
+        result = run_videos(
+            config, out=out, observers=observers, command=sys.argv, report=report == "on", overwrite=overwrite
+        )
+    finally:
+        for observer in observers:
+            observer.close()
+    lines = [*screen(result), *textwrap.wrap(f"note: {NEEDS}", 80, initial_indent="  ", subsequent_indent="    ")]
+    lines.append(f"  {time.monotonic() - began:.0f} s")
+    for name, file in (("report", out / "report.html"), ("viewer", out / "recording.rrd")):
+        if file.exists():
+            lines.append(f"  {name}  {file if name == 'report' else f'rerun {file}'}")
+    print_lines([*lines, f"  more    {out}"], quiet=quiet)
 
 
 def study(

@@ -55,6 +55,9 @@ logger = logging.getLogger("semstab")
 LAYOUT = "# semstab, folder layout 4"
 """First line of config.yaml: a folder that begins otherwise is of another version."""
 
+VIDEO_LAYOUT = "# semstab, video folder 1"
+"""The first line of the settings of a run over videos, which has no map."""
+
 EARLIER_LAYOUT = "# semstab, folder layout 3"
 """The first line of version 0.3, whose results are read for one version."""
 
@@ -353,6 +356,8 @@ def load_result(folder: str | Path) -> Result:
     path = folder / "summary.json"
     if not os.path.lexists(folder):
         raise DataError(f"{folder}: there is no such folder; give the folder of a finished run")
+    if _is_of_videos(folder):
+        raise DataError(f"{folder}: a run over videos, without a map; {folder / 'report.html'} and tables/ have it")
     if _is_earlier(folder, (LAYOUT, EARLIER_LAYOUT)):
         raise DataError(f"{folder}: holds results of an earlier version of semstab; run it again, into another folder")
     content = read_json(path)
@@ -399,6 +404,8 @@ def _claimed(path: Path) -> dict[str, Any] | None:
         return None
     if not path.is_dir():
         raise ConfigError(f"{path}: is a file; name a folder")
+    if _is_of_videos(path):
+        raise ConfigError(f"{path}: holds a run over videos; choose another folder")
     if _is_earlier(path):
         raise ConfigError(f"{path}: holds results of an earlier version of semstab; choose another folder")
     if (path / SETTINGS).exists():
@@ -412,8 +419,16 @@ def _claimed(path: Path) -> dict[str, Any] | None:
 def _is_earlier(folder: Path, layouts: Collection[str] = (LAYOUT,)) -> bool:
     if (folder / "study.yaml").exists() or not (folder / SETTINGS).exists():
         return (folder / "study.yaml").exists()
+    return _layout_of(folder) not in layouts
+
+
+def _is_of_videos(folder: Path) -> bool:
+    return (folder / SETTINGS).is_file() and _layout_of(folder) == VIDEO_LAYOUT
+
+
+def _layout_of(folder: Path) -> str:
     with (folder / SETTINGS).open(encoding="utf-8", errors="replace") as lines:
-        return lines.readline(200).rstrip("\n") not in layouts
+        return lines.readline(200).rstrip("\n")
 
 
 def _first_change(old: Mapping[str, Any], new: Mapping[str, Any], prefix: str = "") -> str | None:

@@ -23,6 +23,7 @@ from semstab.data.measures import dominant, mean, measures, vss
 from semstab.data.parquet import Tile
 from semstab.data.records import EVENTS, FRAMES, OBSERVATIONS, OVERVIEW, SUMS, TRUTH, VOXELS, FrameQuality, UnitContent
 from semstab.data.results import RECURRENT, STAGES, Agreement, ReducedScores, Unit, UnitSummary, slug
+from semstab.data.videos import LonePicture
 from semstab.data.voxels import VoxelTable
 from semstab.datasets import Scene
 from semstab.engine.live_maps import LiveMap, Stream
@@ -32,7 +33,7 @@ from semstab.engine.tiles import TILE_OBSERVATIONS, TileResult
 from semstab.errors import DataError
 from semstab.metrics import compare
 from semstab.metrics.agreement import rows_of
-from semstab.metrics.image_space import PICTURED, ImageSpaceMeter, LonePicture
+from semstab.metrics.image_space import PICTURED, ImageSpaceMeter, lone_picture, picture_arrays
 from semstab.metrics.summary import TableSums
 from semstab.metrics.up_axis import estimate_up
 from semstab.statistics import Analysis, CellObservations, MapSample, analyse
@@ -324,8 +325,8 @@ def pictures_of_outlying(task: Task, config: Config, analysis: Analysis | None) 
         at = task.indices.index(each.frame)
         start = min(max(at - 1, 0), len(task.indices) - 3)
         others = [read(task, task.indices[k], config.pixel_stride) for k in range(start, start + 3) if k != at]
-        pictures.append(LonePicture.of(read(task, each.frame, config.pixel_stride, color=True), others))
-    return LonePicture.arrays(pictures)
+        pictures.append(lone_picture(read(task, each.frame, config.pixel_stride, color=True), others))
+    return picture_arrays(pictures)
 
 
 def written(start: Start, savers: Savers) -> tuple[dict[str, str], dict[str, bytes]]:

@@ -200,12 +200,9 @@ SCHEMA = 1
 REPORTED_PACKAGES = ("numpy", "open3d", "opencv-python-headless", "pyarrow", "rerun-sdk", "trimesh")
 
 
-def manifest(plan: Plan, units: UnitResults, executor: str, command: Sequence[str]) -> dict[str, Any]:
-    """Return the content of manifest.json: versions, digests of the inputs, seconds by stage, peak memory, counts."""
-    contents, before, failed = units.contents, units.finished_before, len(units.errors)
+def origin(config: Config, command: Sequence[str]) -> dict[str, Any]:
+    """Return versions, the command line, and the peak of memory so far."""
     peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss  # in kB on Linux, bytes on macOS
-    computed = [each for each in plan.every() if each.identity in contents]
-    counts = {"units": len(contents) + failed, "kept": before, "computed": len(contents) - before, "failed": failed}
     return {
         "schema": SCHEMA,
         "semstab": _version("semstab"),
@@ -213,14 +210,24 @@ def manifest(plan: Plan, units: UnitResults, executor: str, command: Sequence[st
         "platform": platform.platform(),
         "packages": {name: _version(name) for name in REPORTED_PACKAGES},
         "command": list(command),
-        "seed": plan.config.dataset.options.get("seed"),
+        "seed": config.dataset.options.get("seed"),
+        "peak_memory_bytes": peak if sys.platform == "darwin" else 1024 * peak,
+    }
+
+
+def manifest(plan: Plan, units: UnitResults, executor: str, command: Sequence[str]) -> dict[str, Any]:
+    """Return the content of manifest.json: versions, digests of the inputs, seconds by stage, peak memory, counts."""
+    contents, before, failed = units.contents, units.finished_before, len(units.errors)
+    computed = [each for each in plan.every() if each.identity in contents]
+    counts = {"units": len(contents) + failed, "kept": before, "computed": len(contents) - before, "failed": failed}
+    return {
+        **origin(plan.config, command),
         "inputs": {
             f"{each.unit.scene}/{each.unit.model}": contents[each.identity].input
             for each in computed
             if each.variation.sweep in (BASE, REGIONS)
         },
         "seconds": dict(units.watch.seconds),
-        "peak_memory_bytes": peak if sys.platform == "darwin" else 1024 * peak,
         "units": counts | {"executor": executor},
         "geometry": {scene: verdict.summary() for scene, verdict in units.geometry.items()},
         "depth_from": {name: scene.depth_from for name, scene in plan.scenes.items() if scene.depth_from},

@@ -4,18 +4,24 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
 from semstab.core.arrays import Rows
-from semstab.core.types import Mask, UInt8
+from semstab.core.types import Mask
 from semstab.data.frames import Frame
 from semstab.data.measures import mean
 from semstab.data.records import ImageSpace
-from semstab.metrics.flicker import SelfConsistency, VideoConsistency, changed_pixels, compensated_flicker
+from semstab.data.videos import LonePicture
+from semstab.metrics.flicker import (
+    CompensatedFlicker,
+    SelfConsistency,
+    VideoConsistency,
+    changed_pixels,
+    compensated_flicker,
+)
 from semstab.pixels.edges import depth_edges, label_edges
 
 CLIPS = (8, 16)
@@ -60,8 +66,8 @@ class ImageSpaceMeter:
         """Add the next frame, and its truth in the same label space if there is any; return compensated flicker."""
         sample, true = frame.within(SIDE), None if truth is None else truth.within(SIDE)
         flicker, share = math.nan, math.nan
-        if self._previous is not None:  # each pixel of the sample is looked up in the whole frame before
-            pair = compensated_flicker(self._previous, sample, voxel_size=self._voxel_size)
+        if self._previous is not None:
+            pair = self.between(self._previous, frame, sample)
             flicker, share = pair.flicker_percent, pair.share
         self._previous = frame
         if frame.is_scan:
@@ -72,55 +78,50 @@ class ImageSpaceMeter:
             each.skip() if true is None else each.add(sample.predicted, sample.valid & true.valid, true.predicted)
             for each in self._by_truth
         ]
-        recall = math.nan if len(self.rows) % EDGES_EVERY else edge_recall(sample)
-        self.rows.append((flicker, share, *by_truth, *by_itself, recall))
+        self.rows.append((flicker, share, *by_truth, *by_itself, self.recall(sample)))
         return flicker
+
+    def between(self, previous: Frame, frame: Frame, sample: Frame) -> CompensatedFlicker:
+        """Return flicker of the sample's pixels, each of which is looked up in the whole frame before."""
+        return compensated_flicker(previous, sample, voxel_size=self._voxel_size)
+
+    def recall(self, sample: Frame) -> float:
+        """Return the edge recall of some frames, NaN of the others."""
+        return math.nan if len(self.rows) % EDGES_EVERY else edge_recall(sample)
 
     def result(self, flicker_percent: float) -> ImageSpace:
         """Return means over the frames so far, in addition to the flicker of the unit's summary."""
         return ImageSpace(flicker_percent, **{name: mean(self.rows.column(k)) for k, name in enumerate(COLUMNS)})
 
 
-@dataclass(frozen=True, eq=False)
-class LonePicture:
-    """A frame as a small picture, with the pixels at which it stands alone.
-
-    Attributes:
-        frame: Its index.
-        labels: (h, w) rows 0..K-1, and above where a pixel has none.
-        alone: (h, w) pixels whose label differs from that of each other frame, which all see the same surface point.
-        color: (h, w, 3) its image; None where there is none.
-    """
-
-    frame: int
-    labels: npt.NDArray[Any]
-    alone: Mask
-    color: UInt8 | None
-
-    @classmethod
-    def of(cls, frame: Frame, others: Sequence[Frame]) -> LonePicture:
-        """Hold a frame against others, with the camera's motion removed."""
-        sample = frame.every(-(-max(frame.shape) // SIDE))
-        some = _thumbnail(sample.shape)
-        alone = np.logical_and.reduce([changed_pixels(other, sample) for other in others])
-        color = None if frame.color is None else frame.color[_thumbnail(frame.color.shape)]
-        return cls(frame.index, sample.predicted[some], alone[some], color)
-
-    @staticmethod
-    def arrays(pictures: Sequence[LonePicture]) -> dict[str, npt.NDArray[Any]]:
-        """Return pictures as arrays (n, ...) by name, those with the size of the first; colour where all have it."""
-        same = [own for own in pictures if own.labels.shape == pictures[0].labels.shape]
-        if not same:
-            return {}
-        arrays = {"lone_frames": np.array([own.frame for own in same])}
-        arrays |= {"lone_labels": np.stack([own.labels for own in same])}
-        arrays |= {"lone_alone": np.stack([own.alone for own in same])}
-        images = [own.color for own in same if own.color is not None]
-        alike = len(images) == len(same) and len({image.shape for image in images}) == 1
-        return arrays | ({"lone_color": np.stack(images)} if alike else {})
+def lone_picture(frame: Frame, others: Sequence[Frame]) -> LonePicture:
+    """Hold a frame against others, with the camera's motion removed."""
+    sample = frame.every(-(-max(frame.shape) // SIDE))
+    alone = np.logical_and.reduce([changed_pixels(other, sample) for other in others])
+    return picture_of(frame, sample, alone)
 
 
-def _thumbnail(shape: tuple[int, ...]) -> tuple[slice, slice]:
+def picture_of(frame: Frame, sample: Frame, alone: Mask) -> LonePicture:
+    """Return a frame, a sample of its pixels, and those of them that stand alone (H, W), as a small picture."""
+    some = thumbnail(sample.shape)
+    color = None if frame.color is None else frame.color[thumbnail(frame.color.shape)]
+    return LonePicture(frame.index, sample.predicted[some], alone[some], color)
+
+
+def picture_arrays(pictures: Sequence[LonePicture]) -> dict[str, npt.NDArray[Any]]:
+    """Return pictures as arrays (n, ...) by name, those with the size of the first; colour where all have it."""
+    same = [own for own in pictures if own.labels.shape == pictures[0].labels.shape]
+    if not same:
+        return {}
+    arrays = {"lone_frames": np.array([own.frame for own in same])}
+    arrays |= {"lone_labels": np.stack([own.labels for own in same])}
+    arrays |= {"lone_alone": np.stack([own.alone for own in same])}
+    images = [own.color for own in same if own.color is not None]
+    alike = len(images) == len(same) and len({image.shape for image in images}) == 1
+    return arrays | ({"lone_color": np.stack(images)} if alike else {})
+
+
+def thumbnail(shape: tuple[int, ...]) -> tuple[slice, slice]:
     """Return every n-th pixel of both axes, so that at most THUMBNAIL are left of the longer one."""
     every = slice(None, None, -(-max(shape[:2]) // THUMBNAIL))
     return every, every

@@ -84,20 +84,24 @@ def _by_depth(frame: Frame, following: Frame) -> Motion:
 
 
 def _by_images(frame: Frame, following: Frame) -> Motion:
-    images = _image(frame), _image(following)
+    images = image_of(frame, frame.shape), image_of(following, following.shape)
     forward = image_flow(*images)
     return forward, ~occluded(forward, image_flow(*images[::-1]))
 
 
-def _image(frame: Frame) -> UInt8:
-    """Return the colour at the pixels of the labels, (H, W, 3)."""
+def image_of(frame: Frame, shape: tuple[int, int]) -> UInt8:
+    """Return the frame's colour at (H, W) pixels, (H, W, 3).
+
+    Raises:
+        DataError: If it has none.
+    """
     import cv2
 
     if frame.color is None:
         raise DataError(f"{frame.where('color')}: there is no image for optical flow; use --video-measures depth")
-    if frame.color.shape[:2] == frame.shape:
+    if frame.color.shape[:2] == shape:
         return frame.color
-    return np.asarray(cv2.resize(frame.color, frame.shape[::-1], interpolation=cv2.INTER_AREA), dtype=np.uint8)
+    return np.asarray(cv2.resize(frame.color, shape[::-1], interpolation=cv2.INTER_AREA), dtype=np.uint8)
 
 
 def _overlap(metric: TemporalConsistency) -> WarpedOverlap:

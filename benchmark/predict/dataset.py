@@ -202,7 +202,7 @@ class PredictedScene(Scene):
         self.sources = inner.sources
         self.folder = inner.folder
         self.settings_file = inner.settings_file
-        self.made = inner.made
+        self.made, self.posed = inner.made, inner.posed
         self.skips_incomplete, self.images_elsewhere = inner.skips_incomplete, inner.images_elsewhere
         self._inner = inner
         self._dataset = dataset

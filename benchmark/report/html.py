@@ -11,8 +11,9 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import numpy.typing as npt
 
-from semstab.core.types import UInt8
+from semstab.core.types import Int64, Mask, UInt8
 from semstab.report.charts import colors_css
 from semstab.report.figures.style import COLUMN, DPI, Figure
 from semstab.report.tables.table import ARROWS, Table, relations, sections
@@ -127,6 +128,29 @@ def jpeg(image: UInt8) -> str:
     data = io.BytesIO()
     Image.fromarray(np.ascontiguousarray(image)).save(data, "JPEG", quality=80)
     return _url(data.getvalue(), "jpeg")
+
+
+def lone_pictures(
+    color: UInt8 | None, labels: npt.NDArray[Any], alone: Mask, palette: npt.ArrayLike
+) -> list[tuple[str, str]]:
+    """Return a frame as named images: its colour (h, w, 3), its labels (h, w), and the pixels where it stands alone.
+
+    Labels are rows of the palette (K, 3), and above where there is none.
+    """
+    classes = np.asarray(palette, np.uint8).reshape(-1, 3)
+    shades = np.vstack([classes, np.full((1, 3), 128, np.uint8)])
+    faded = np.tile(160 + 0.35 * shades.mean(axis=1, keepdims=True), 3).astype(np.uint8)
+    marked = np.vstack([faded, np.array([[213, 94, 0]], np.uint8)])
+    rows = np.minimum(labels.astype(np.int64), len(classes))
+    pictures = [] if color is None else [("image", jpeg(color))]
+    return [
+        *pictures, ("labels", _indexed(rows, shades)), ("alone", _indexed(np.where(alone, len(shades), rows), marked)),
+    ]  # fmt: skip
+
+
+def _indexed(index: Int64, palette: UInt8) -> str:
+    """Return a PNG of indices (H, W) into colours."""
+    return png(index.astype(np.uint8), palette) if len(palette) <= 256 else png(palette[index])
 
 
 def _url(data: bytes, kind: str) -> str:

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from semstab.core.palette import KINDS
-from semstab.core.types import Int64, UInt8
+from semstab.core.types import UInt8
 from semstab.data.measures import SBD, VSS, dominant, headlines, measures
 from semstab.data.records import OVERVIEW, Failure, Record, Result
 from semstab.data.results import slug
@@ -23,7 +23,7 @@ from semstab.report.charts import Line, dot_chart, line_chart, sample
 from semstab.report.figures.maps import Overview, Views
 from semstab.report.figures.topdown import FromAbove
 from semstab.report.filter_study import advice, filter_studies, of_interest
-from semstab.report.html import filled, jpeg, png, table_block
+from semstab.report.html import filled, jpeg, lone_pictures, png, table_block
 from semstab.report.means import ENOUGH, by_model, describe, levels, over_recurrent, pooled, swept
 from semstab.report.narrative import not_assessed, noted, notes, outlying_line, warnings
 from semstab.report.ranking import answers
@@ -281,22 +281,12 @@ def _lone(record: Record, overview: Overview | None) -> Iterator[dict[str, Any]]
     found = None if record.statistics is None else record.statistics.outlying_frames
     if overview is None or overview.lone is None or found is None:
         return
-    lone, K, named = overview.lone, len(overview.palette), {each.frame: each for each in found.frames}
-    palette = np.vstack([overview.palette, np.full((1, 3), 128, np.uint8)])
-    faded = np.tile(160 + 0.35 * palette.mean(axis=1, keepdims=True), 3).astype(np.uint8)
-    marked = np.vstack([faded, np.array([[213, 94, 0]], np.uint8)])
+    lone, named = overview.lone, {each.frame: each for each in found.frames}
     for k, frame in enumerate(lone.frames.tolist()):
-        own, labels = named[frame], np.minimum(lone.labels[k].astype(np.int64), K)
-        pictures = [] if lone.color is None else [("image", jpeg(lone.color[k]))]
-        pictures.append(("labels", _indexed(labels, palette)))
-        pictures.append(("alone", _indexed(np.where(lone.alone[k], K + 1, labels), marked)))
+        own, color = named[frame], None if lone.color is None else lone.color[k]
         shares = f"alone at {100 * own.share:.0f} % of its places, other frames there at {100 * own.null:.0f} %"
+        pictures = lone_pictures(color, lone.labels[k], lone.alone[k], overview.palette)
         yield {"title": f"{record.unit.model}, {own.name}: {shares}", "pictures": pictures}
-
-
-def _indexed(index: Int64, palette: UInt8) -> str:
-    """Return a PNG of indices (H, W) into colours."""
-    return png(index.astype(np.uint8), palette) if len(palette) <= 256 else png(palette[index])
 
 
 DISAGREES = 0.02

@@ -502,7 +502,11 @@ class ProgressBar(Observer):
             if scene.placed is not None:
                 self.notes.append(f"{scene.name}: {scene.placed}")
         missing = units.keys() - finished.keys()
-        self.bar.update(self.work, total=sum(units[identity].frames for identity in missing))
+        self.begin(sum(units[identity].frames for identity in missing))
+
+    def begin(self, frames: int) -> None:
+        """Show the bar, of so many frames."""
+        self.bar.update(self.work, total=frames)
         if self.bar.console.is_interactive:
             self.bar.start()
 

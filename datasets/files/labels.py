@@ -14,7 +14,7 @@ import numpy as np
 from semstab.config import nearest
 from semstab.core.types import UInt16
 from semstab.data.labels import IGNORE_16BIT, LabelSpace, ignore_id
-from semstab.datasets.files.options import FileOptions, Folders, FrameSource, Template, inside, matching_folders
+from semstab.datasets.files.options import Folders, LabelOptions, Template, inside, matching_folders
 from semstab.datasets.formats import images
 from semstab.datasets.formats.images import Read, Size
 from semstab.datasets.geometry.lenses import Labels, Scores
@@ -92,7 +92,7 @@ class LabelSource:
                 return file
         return None
 
-    def lossy(self, frames: Sequence[FrameSource]) -> Path | None:
+    def lossy(self, frames: Sequence[Named]) -> Path | None:
         """Return the JPEG of the first frame that has one in the place of a label map."""
         bare = self.template.removesuffix(".png")
         places = (self.base / bare.replace("{name}", frame.name) for frame in frames)
@@ -107,9 +107,9 @@ class LabelSource:
 
 
 def find_sources(
-    options: FileOptions,
+    options: LabelOptions,
     entry: SceneEntry,
-    frames: Sequence[FrameSource],
+    frames: Sequence[Named],
     folders: Folders,
     own: Mapping[str, Path],
 ) -> dict[str, LabelSource]:
@@ -161,7 +161,7 @@ def find_sources(
     return sources
 
 
-def label_paths(options: FileOptions, entry: SceneEntry, frames: Sequence[FrameSource]) -> list[str]:
+def label_paths(options: LabelOptions, entry: SceneEntry, frames: Sequence[Named]) -> list[str]:
     """Return the paths of label maps and scores of the first frame, with MODEL for any name."""
     values = {"scene": entry.below_root, "model": "MODEL", "name": frames[0].name if frames else "NAME"}
     base = options.labels_root or entry.folder
@@ -172,7 +172,7 @@ def label_paths(options: FileOptions, entry: SceneEntry, frames: Sequence[FrameS
     ]
 
 
-def _stated(kind: Kind, options: FileOptions) -> dict[str | None, Template]:
+def _stated(kind: Kind, options: LabelOptions) -> dict[str | None, Template]:
     """Return the template of each model that has one of its own, or that of all, under None."""
     stated = options.labels if kind == "labels" else options.scores
     if isinstance(stated, dict):
@@ -206,9 +206,9 @@ class LabelMaps:
 
     def __init__(
         self,
-        options: FileOptions,
+        options: LabelOptions,
         entry: SceneEntry,
-        frames: Sequence[FrameSource],
+        frames: Sequence[Named],
         class_ids: Mapping[str, UInt16],
         folders: Folders,
         own: Mapping[str, Path],
@@ -248,7 +248,7 @@ class LabelMaps:
             raise ConfigError(f"{self._folder}: model '{model}' is not there; {hint}")
         return known[model]
 
-    def file(self, frame: FrameSource, model: str) -> Path:
+    def file(self, frame: Named, model: str) -> Path:
         """Return the file of a frame.
 
         Raises:
@@ -340,6 +340,6 @@ class LabelMaps:
             scores = np.where(ignored[..., None], scores.dtype.type(0), scores)
         return scores
 
-    def mask_file(self, frame: FrameSource) -> Path | None:
+    def mask_file(self, frame: Named) -> Path | None:
         """Return the mask of a frame, where it has one."""
         return None if self._masks is None else self._masks.file(frame)

@@ -68,8 +68,8 @@ ZERO_IS_VOID: dict[str, tuple[int, ...]] = {GROUND_TRUTH: (0,)}
 """`void_ids` of a dataset whose ground truth has 0 where there is no label."""
 
 
-class FileSettings(Settings):
-    """The settings by which files are read; a reader replaces the defaults that its format fixes.
+class LabelSettings(Settings):
+    """The settings by which label maps are read.
 
     Templates hold {scene} (the scene's folder below root), {model} and {name} (the frame's name); without a suffix
     they find any that can be read.
@@ -88,6 +88,22 @@ class FileSettings(Settings):
     taxonomies: dict[str, str] = Field({}, description="taxonomies of single label sources; gt is the ground truth")
     void_ids: VoidIds = Field({})
     masks: str | None = Field(None, description="template of masks of the scene: PNGs with 0 where a thing moves")
+
+    @model_validator(mode="after")
+    def _one_label_space(self) -> Self:
+        if self.classes is not None and self.taxonomy is not None:
+            raise ValueError("give classes or taxonomy, not both")
+        return self
+
+
+class LabelOptions(LabelSettings):
+    """Options of label maps of a dataset of files."""
+
+    labels_root: Path | None = Field(None, description="folder of label maps and scores, if not the scene's own")
+
+
+class FileSettings(LabelSettings):
+    """The settings by which files are read; a reader replaces the defaults that its format fixes."""
 
     depth_scale: DepthScale = None
     depth_kind: DepthKind = "planar"
@@ -110,9 +126,7 @@ class FileSettings(Settings):
     frames_per_second: Positive | None = Field(None, description="for time stamps from 0 s, where there are none")
 
     @model_validator(mode="after")
-    def _one_label_space(self) -> Self:
-        if self.classes is not None and self.taxonomy is not None:
-            raise ValueError("give classes or taxonomy, not both")
+    def _placed_in_a_system(self) -> Self:
         if self.offset is not None and self.crs is None:
             raise ValueError("give crs with offset")
         if self.linear is not None and self.crs is None:
@@ -120,12 +134,11 @@ class FileSettings(Settings):
         return self
 
 
-class FileOptions(FileSettings):
+class FileOptions(FileSettings, LabelOptions):
     """Options of any dataset of files: their paths, and the conventions by which they are read."""
 
     root: Path = Field(description="a scene's folder, or the folder above scenes")
     incomplete: Literal["error", "skip"] = Field("error", description="a selected frame without depth, pose or labels")
-    labels_root: Path | None = Field(None, description="folder of label maps and scores, if not the scene's own")
     surface: Path | None = Field(
         None, description="mesh, cloud (LAS, LAZ, PLY) or height raster (GeoTIFF) that depth is cast from"
     )

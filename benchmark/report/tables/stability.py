@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 
 from semstab.config import BACKENDS, SHARED
 from semstab.data.measures import SBD, VSS, measures
@@ -314,7 +314,7 @@ _NUMBERS = (
 )
 _WHAT = (
     "Pixel flicker is the share of the pixels valid in two consecutive sampled frames whose label changes. Flicker is"
-    " the same share after the earlier map is warped by depth and pose, without occluded pixels, so that camera motion"
+    " the same share after the earlier map is warped by {motion}, without occluded pixels, so that {motion_of}"
     " does not count; co-visible is the share of the valid pixels that the warped map reaches. VC8 and VC16 are video"
     " consistency: of the pixels whose ground truth stays the same through a clip of 8 or 16 frames, the share whose"
     " prediction stays the same. Without truth they are of all pixels that are valid throughout the clip."
@@ -326,11 +326,21 @@ _REGIONS = (
 
 def flicker(result: Result) -> list[Table]:
     """Return flicker by model, and scene by scene (paper, Frame-wise Temporal Semantic Flicker)."""
-    methods = _by_method(result)
+    regions = dict.fromkeys(row.model for row in result.regions)
+    what = _WHAT.format(motion="depth and pose", motion_of="camera motion")
+    return flicker_tables(_by_method(result), what + (_REGIONS.format(names=", ".join(regions)) if regions else ""))
+
+
+def flicker_of_videos(methods: Mapping[str, Mapping[str, ImageSpace]]) -> list[Table]:
+    """Return flicker of videos without depth and poses, by model and scene: with the motion removed by flow."""
+    motion = "optical flow between the images (OpenCV's DIS)"
+    return flicker_tables(methods, _WHAT.format(motion=motion, motion_of="motion of the camera and of things"))
+
+
+def flicker_tables(methods: Mapping[str, Mapping[str, ImageSpace]], what: str) -> list[Table]:
+    """Return flicker of each model by scene, and of all scenes; `what` explains the numbers."""
     if not methods:
         return []
-    regions = dict.fromkeys(row.model for row in result.regions)
-    what = _WHAT + (_REGIONS.format(names=", ".join(regions)) if regions else "")
     macro = tuple((name, *_numbers(scenes.values())) for name, scenes in methods.items())
     columns, caption = (
         (Column("method", "Method"), *_NUMBERS),

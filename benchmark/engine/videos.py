@@ -1,0 +1,180 @@
+"""Flicker of videos without depth and poses: all models are measured in one pass over the images."""
+
+from __future__ import annotations
+
+import contextlib
+import math
+from collections.abc import Iterator, Mapping, Sequence
+
+import numpy as np
+
+from semstab.config import Config
+from semstab.core.prefetch import prefetch
+from semstab.data.frames import Frame
+from semstab.data.measures import mean
+from semstab.data.statistics import OutlyingFrames
+from semstab.data.videos import LonePicture, VideoRecord, VideoResult, VideoRow
+from semstab.datasets import Scene
+from semstab.errors import DataError
+from semstab.metrics import flicker_percent
+from semstab.metrics.image_space import PICTURED
+from semstab.metrics.video_flicker import Flows, VideoFlickerMeter, video_picture
+from semstab.metrics.video_measures import VideoMeter
+from semstab.statistics.frame_disagreement import LoneDisagreement, outlying_frames
+from semstab.task import Task, read, tasks_of, truth_task
+
+
+class VideoObserver:
+    """An observer of a run over videos; override what is of interest."""
+
+    def run_started(self, frames: int) -> None:
+        """Take note that so many frames are to be measured, those of each model."""
+
+    def frame_measured(self, task: Task, frame: Frame, numbers: Mapping[str, float]) -> None:
+        """Take note of a frame of a model, whose labels are rows of the task's classes, and its numbers by column."""
+
+    def run_finished(self, result: VideoResult) -> None:
+        """Take note of the result."""
+
+    def close(self) -> None:
+        """Take note of the end, also after an interruption."""
+
+
+def measured_videos(
+    config: Config, scenes: Mapping[str, Scene], observers: Sequence[VideoObserver]
+) -> Iterator[VideoRecord]:
+    """Yield the record of each model on each video.
+
+    Raises:
+        ConfigError, DataError: If labels, images or classes are missing or do not fit.
+    """
+    tasks = [_tasks(scene, config) for scene in scenes.values()]
+    for observer in observers:
+        observer.run_started(sum(len(task.indices) for own in tasks for task in own))
+    for own in tasks:
+        yield from _measured(own, config, observers)
+
+
+def _tasks(scene: Scene, config: Config) -> list[Task]:
+    own = config.model_copy(update={"frames": config.scene_frames.get(scene.name, config.frames)})
+    tasks = list(tasks_of(scene, own))
+    if len(tasks[0].indices) < 2:
+        raise DataError(f"{scene.name}: a single frame is selected; flicker takes two; change 'frames'")
+    return tasks
+
+
+def _measured(tasks: Sequence[Task], config: Config, observers: Sequence[VideoObserver]) -> list[VideoRecord]:
+    """Return the records of the models on one video, whose images are decoded once."""
+    indices, flows = tasks[0].indices, Flows()
+    meters = [_Meter(task, config, flows) for task in tasks]
+
+    def decoded(index: int) -> list[tuple[Frame, Frame | None]]:
+        return [(read(meter.task, index, config.pixel_stride, color=True), meter.true(index)) for meter in meters]
+
+    with contextlib.ExitStack() as stack:
+        for task in tasks:
+            stack.enter_context(task.scene.reading([*indices], task.model))
+        fetched = prefetch(decoded, indices, threads=config.threads, size=lambda each: sum(f.nbytes for f, _ in each))
+        for each in stack.enter_context(contextlib.closing(fetched)):
+            for meter, (frame, truth) in zip(meters, each.item, strict=True):
+                numbers = meter.add(frame, truth)
+                for observer in observers:
+                    observer.frame_measured(meter.task, frame, numbers)
+    return [meter.record() for meter in meters]
+
+
+class _Meter:
+    """The measures of a model on a video."""
+
+    def __init__(self, task: Task, config: Config, flows: Flows) -> None:
+        self.task, self._truth = task, truth_task(task)
+        self._stride = config.pixel_stride
+        self._meter = VideoFlickerMeter(flows)
+        flow = config.video_measures
+        if flow == "depth":
+            raise DataError(f"{task.scene.name}: a video has no depth; use --video-measures dis")
+        self._video = None if flow is None else VideoMeter(len(task.mapping.target), flow)
+        self._flicker: list[float] = []
+        self._times: list[float] = []
+        self._pixels = np.zeros(len(task.mapping.target), np.int64)
+        self._previous: Frame | None = None
+
+    def true(self, index: int) -> Frame | None:
+        """Return the ground truth of a frame, where there is any."""
+        if self._truth is None or self._truth.scene.missing(index, [self._truth.model]):
+            return None
+        return read(self._truth, index, self._stride)
+
+    def add(self, frame: Frame, truth: Frame | None) -> dict[str, float]:
+        """Add the next frame; return its numbers."""
+        alike = self._previous is not None and self._previous.shape == frame.shape
+        flicker = flicker_percent(self._previous, frame) if alike and self._previous is not None else math.nan
+        compensated = self._meter.add(frame, truth)
+        if self._video is not None:
+            self._video.add(frame, truth)
+        self._flicker.append(flicker)
+        labelled = frame.predicted[frame.valid]
+        self._pixels += np.bincount(labelled, minlength=len(self._pixels))[: len(self._pixels)]
+        self._times.append(math.nan if frame.timestamp is None else frame.timestamp)
+        self._previous = frame
+        return {"flicker_percent": flicker, "compensated_flicker_percent": compensated}
+
+    def record(self) -> VideoRecord:
+        """Return the measures of all frames."""
+        task, frame = self.task, self._previous
+        assert frame is not None
+        if not (total := self._pixels.sum()):
+            raise DataError(
+                f"{task.scene.name}, {task.model}: no pixel of {len(task.indices)} frames has a label; check the ignore"
+                " id and the taxonomy"
+            )
+        share, largest = self._pixels / total, int(self._pixels.argmax())
+        outlying, alone = self._outlying(), {own.frame: 100 * own.share for own in self._meter.lone}
+        named = {each.frame for each in outlying.frames}
+        rows = self._meter.rows.table()
+        height, width = frame.shape if frame.color is None else frame.color.shape[:2]
+        return VideoRecord(
+            scene=task.scene.name,
+            model=task.model,
+            frames=len(task.indices),
+            size=(width, height),
+            classes=tuple(task.mapping.target.classes),
+            image_space=self._meter.result(mean(np.array(self._flicker))),
+            outlying=outlying,
+            video_measures=None if self._video is None else self._video.result(),
+            largest_class=task.mapping.target.classes[largest],
+            largest_share=float(share[largest]),
+            effective_classes=float(1 / (share**2).sum()),
+            input=task.digest,
+            pictures=tuple(self._pictures(outlying)),
+            colors=tuple(task.mapping.target.colors),
+            rows=tuple(
+                VideoRow(
+                    index, self._times[k], self._flicker[k], rows[k, 0], rows[k, 1], alone.get(index, math.nan),
+                    index in named, task.scene.frame_name(index),
+                )
+                for k, index in enumerate(task.indices)
+            ),
+        )  # fmt: skip
+
+    def _pictures(self, outlying: OutlyingFrames) -> Iterator[LonePicture]:
+        """Yield the frames that stand out most as pictures; they are read once more, with those beside them."""
+        indices = [*self.task.indices]
+        for each in outlying.frames[:PICTURED]:
+            at = indices.index(each.frame)
+            before, frame, after = (
+                read(self.task, index, self._stride, color=True) for index in indices[at - 1 : at + 2]
+            )
+            if before.shape == frame.shape == after.shape:
+                yield video_picture(frame, [before, after])
+
+    def _outlying(self) -> OutlyingFrames:
+        known = [own for own in self._meter.lone if own.pixels]
+        share = np.array([own.share for own in known], np.float64)
+        found = LoneDisagreement(
+            np.array([own.frame for own in known], np.int64),
+            np.array([own.pixels for own in known], np.int64),
+            share,
+            np.full(len(share), share.mean() if len(share) else math.nan),
+        )
+        return outlying_frames(found, len(known), name=self.task.scene.frame_name)

@@ -1,0 +1,236 @@
+"""Videos without depth and poses: flicker by optical flow, frames that stand out, files, and what needs a map."""
+
+from __future__ import annotations
+
+import csv
+import json
+
+import cv2
+import numpy as np
+import pytest
+from command_line import bench
+
+import semstab
+from semstab.datasets import open_dataset, recognise
+from semstab.errors import ConfigError, DataError
+from semstab.metrics.video_flicker import Motion, VideoFlickerMeter, lone_pixels
+
+H, W, STEP, COUNT = 96, 128, 3, 20
+CLASSES = ["left", "right", "thing"]
+
+
+def texture(seed=0):
+    """A wide image with something to follow at every place, and its classes, of which each column has one."""
+    rng = np.random.default_rng(seed)
+    noise = cv2.GaussianBlur(rng.normal(0, 1, (H, W + STEP * COUNT)), (0, 0), 1.5)
+    grey = np.clip(128 + 90 * noise / noise.std() / 2, 0, 255).astype(np.uint8)
+    labels = np.zeros(grey.shape, np.uint8)
+    labels[:, W:] = 1
+    labels[30:60, 60:90] = 2
+    return np.repeat(grey[..., None], 3, axis=2), labels
+
+
+def views(seed=0):
+    """A camera that moves to the right by STEP pixels a frame."""
+    image, labels = texture(seed)
+    return [(image[:, k * STEP : k * STEP + W], labels[:, k * STEP : k * STEP + W]) for k in range(COUNT)]
+
+
+def write(folder, wrong=(), images="images"):
+    """Images, right labels, and those of a model that gives another class to a block of some frames."""
+    for k, (image, labels) in enumerate(views()):
+        flipped = labels.copy()
+        if k in wrong:
+            flipped[10:60, 20:90] = 1
+        files = {images: image, "labels/right": labels, "labels/flips": flipped}
+        for name, content in files.items():
+            (folder / name).mkdir(parents=True, exist_ok=True)
+            assert cv2.imwrite(str(folder / name / f"{k:04d}.png"), content)
+    return folder
+
+
+def options(folder, **more):
+    return {"dataset": {"name": "video", "options": {"root": str(folder), "classes": CLASSES, **more}}}
+
+
+def frames(folder):
+    scene = open_dataset("video", {"root": folder, "classes": CLASSES}).scene(folder.name)
+    return [scene.frame(k, "right") for k in range(len(scene))]
+
+
+def test_the_motion_is_removed(tmp_path) -> None:
+    """Every frame is the one before, moved: no label changes at what is seen, though many do in place."""
+    result = semstab.run_videos(options(write(tmp_path / "clip")))
+    right = next(record for record in result.records if record.model == "right")
+    assert right.image_space.flicker_percent > 3
+    assert right.image_space.compensated_flicker_percent < 0.4
+    assert right.image_space.compensated_share > 0.9
+    assert (result.scenes, set(result.models)) == (("clip",), {"right", "flips"})
+
+
+def test_flicker_is_the_share_of_what_changed(tmp_path) -> None:
+    """A block of a static image has another class in every second frame."""
+    image, labels = (each[:, :W] for each in texture())
+    for k in range(6):
+        (tmp_path / "labels/net").mkdir(parents=True, exist_ok=True)
+        cv2.imwrite(str(tmp_path / f"{k}.png"), image)
+        own = labels.copy()
+        own[:24] = k % 2
+        cv2.imwrite(str(tmp_path / f"labels/net/{k}.png"), own)
+    (record,) = semstab.run_videos(options(tmp_path)).records
+    assert record.image_space.flicker_percent == pytest.approx(25)
+    assert record.image_space.compensated_flicker_percent == pytest.approx(25)
+    assert record.image_space.compensated_share == 1
+    assert [row.lone_percent for row in record.rows[1:-1]] == [pytest.approx(25)] * 4
+    assert np.isnan([record.rows[0].lone_percent, record.rows[-1].lone_percent]).all()
+
+
+def test_the_frames_that_are_wrong_stand_out_and_not_those_beside_them(tmp_path) -> None:
+    result = semstab.run_videos(options(write(tmp_path / "clip", wrong=(5, 12))))
+    flips, right = (next(r for r in result.records if r.model == name) for name in ("flips", "right"))
+    assert sorted(each.name for each in flips.outlying.frames) == ["0005", "0012"]
+    assert right.outlying.frames == ()
+    assert [row.name for row in flips.rows if row.outlying] == ["0005", "0012"]
+    assert {picture.frame for picture in flips.pictures} == {5, 12}
+
+
+def test_a_pixel_stands_alone_where_both_neighbours_agree(tmp_path) -> None:
+    first, middle, last = frames(write(tmp_path / "clip"))[:3]
+    still = Motion(np.arange(H * W).reshape(H, W), np.ones((H, W), bool))
+    own = lone_pixels(middle, [(first, still), (last, still)])
+    a, b, c = first.labels, middle.labels, last.labels
+    assert own.pixels == H * W
+    assert own.share == pytest.approx(np.mean((a == c) & (a != b)))
+
+
+def test_a_change_of_the_size_begins_anew(tmp_path) -> None:
+    meter, (one, two) = VideoFlickerMeter(), frames(write(tmp_path / "clip"))[:2]
+    meter.add(one, None)
+    assert np.isnan(meter.add(two.every(2), None))
+    assert np.isfinite(meter.add(two.every(2), None))
+    assert meter.lone == []
+
+
+def test_a_run_writes_what_it_found(tmp_path) -> None:
+    folder = write(tmp_path / "clip", wrong=(5, 12))
+    words = "run", "--dataset", "video", "--data", folder, "--option", f"classes=[{','.join(CLASSES)}]", "--out", "out"
+    done = bench(*words, "--video-measures", "dis", cwd=tmp_path, report=True, recording=True)
+    text = " ".join(done.stdout.split())
+    assert "least flicker first: 1. right, 2. flips" in text
+    assert "frames that stand out, flips: 2 of 18, 0005 0012" in text
+    assert "need depth and poses" in text
+    out = tmp_path / "out"
+    rows = list(csv.DictReader((out / "frames/clip__flips.csv").read_text().splitlines()))
+    assert [row["name"] for row in rows if row["outlying"] == "1"] == ["0005", "0012"]
+    assert len(rows) == COUNT
+    summary = json.loads((out / "summary.json").read_text())
+    assert {record["model"] for record in summary["records"]} == {"right", "flips"}
+    assert (out / "tables/flicker.csv").read_text().count("\n") == 3
+    assert {path.stem for path in (out / "tables").glob("*.md")} == {"flicker", "frames", "video_measures"}
+    page = (out / "report.html").read_text()
+    assert "Least flicker first" in page
+    assert "flips, 0005: alone at" in page
+    assert (out / "recording.rrd").stat().st_size > 10_000
+    bench(*words, "--video-measures", "dis", cwd=tmp_path)
+    refused = bench(*words, cwd=tmp_path, code=2)
+    assert "holds another run; choose another --out, or --overwrite" in refused.stderr
+    bench(*words, "--overwrite", cwd=tmp_path)
+    for command in ("show", "compare"):
+        other = [out] if command == "show" else [out, out]
+        assert bench(command, *other, cwd=tmp_path, code=2).stderr.count("\n") == 1
+
+
+def test_a_video_file_is_recognised_and_predicted_on(tmp_path) -> None:
+    film = cv2.VideoWriter(str(tmp_path / "clip.avi"), cv2.VideoWriter_fourcc(*"MJPG"), 10, (W, H))
+    for image, _ in views():
+        film.write(image)
+    film.release()
+    assert recognise(tmp_path / "clip.avi")[0] == "video"
+    scene = open_dataset("video", {"root": tmp_path / "clip.avi"}).scene("clip")
+    assert len(scene) == COUNT
+    np.testing.assert_allclose(scene.timestamps, np.arange(COUNT) / 10)
+    one = scene.color(7)
+    assert np.abs(one.astype(int) - views()[7][0]).mean() < 8
+    assert [scene.frame_name(k) for k in (0, 12)] == ["000000", "000012"]
+    for index in (19, 3, 4, 2):
+        np.testing.assert_array_equal(scene.color(index), scene.color(index))
+    done = bench(tmp_path / "clip.avi", "--predict", "colour-clusters", "--out", "out", cwd=tmp_path)
+    assert "20 frames of 128x96" in done.stdout
+    assert len(list((tmp_path / "out/predictions/clip/labels/colour-clusters").glob("*.png"))) == COUNT
+
+
+def test_a_model_of_one_class_is_not_ranked(tmp_path) -> None:
+    folder = write(tmp_path / "clip", wrong=(5,))
+    for k in range(COUNT):
+        (folder / "labels/blind").mkdir(exist_ok=True)
+        cv2.imwrite(str(folder / f"labels/blind/{k:04d}.png"), np.zeros((H, W), np.uint8))
+    words = "--dataset", "video", "--data", folder, "--option", f"classes=[{','.join(CLASSES)}]", "--out", "out"
+    done = bench("run", *words, cwd=tmp_path, report=True)
+    assert "least flicker first: 1. right, 2. flips\n" in done.stdout
+    assert "uninformative: all of the labels of blind are left" in done.stdout
+    assert "uninformative: all of the labels of blind" in (tmp_path / "out/report.html").read_text()
+
+
+@pytest.mark.parametrize("images", ["", "images", "rgb"])
+def test_images_are_found_beside_their_labels(images, tmp_path) -> None:
+    write(tmp_path / "clip", images=images)
+    dataset = open_dataset("video", {"root": tmp_path / "clip", "classes": CLASSES})
+    assert dataset.scenes == ("clip",)
+    assert set(dataset.scene("clip").models) == {"right", "flips"}
+    assert open_dataset("video", {"root": tmp_path, "classes": CLASSES}).scenes == ("clip",)
+
+
+@pytest.mark.parametrize("images", ["", "images"])
+def test_a_folder_of_images_alone_names_the_dataset(images, tmp_path) -> None:
+    write(tmp_path / "clip", images=images)
+    with pytest.raises(DataError, match=r"clip: holds images, without the depth and poses .*--dataset video measures"):
+        recognise(tmp_path / "clip")
+
+
+def test_what_needs_a_map_says_so(tmp_path) -> None:
+    folder = write(tmp_path / "clip")
+    given = ("--dataset", "video", "--data", folder)
+    assert "a video, without depth and poses" in bench("check", *given, cwd=tmp_path, code=2).stderr
+    with pytest.raises(ConfigError, match="without depth and poses"):
+        semstab.run(options(folder))
+    with pytest.raises(DataError, match="a video has no depth; use --video-measures dis"):
+        semstab.run_videos({**options(folder), "video_measures": "depth"})
+    with pytest.raises(ConfigError, match=r"use semstab\.run"):
+        semstab.run_videos({"dataset": {"name": "city"}})
+    refused = bench("run", *given, "--predict", "colour-clusters", "--filter", "ema-warped:0.6", cwd=tmp_path, code=2)
+    assert "looks at depth and pose, which a video does not have" in refused.stderr
+
+
+@pytest.mark.parametrize(
+    ("content", "said"), [(b"", "no video that OpenCV can decode"), (b"no video" * 99, "no video that OpenCV can")]
+)
+def test_a_file_that_is_no_video_is_one_line(content, said, tmp_path, capfd) -> None:
+    (tmp_path / "clip.mp4").write_bytes(content)
+    with pytest.raises(DataError, match=f"clip.mp4: {said}"):
+        open_dataset("video", {"root": tmp_path / "clip.mp4"}).scene("clip")
+
+
+def test_missing_labels_and_a_single_frame_are_named(tmp_path) -> None:
+    folder = write(tmp_path / "clip")
+    (folder / "labels/right/0003.png").unlink()
+    with pytest.raises(DataError, match=r"1 missing: labels/right/0003.png"):
+        semstab.run_videos(options(folder))
+    result = semstab.run_videos(options(folder, incomplete="skip"))
+    assert result.records[0].frames == COUNT - 1
+    with pytest.raises(DataError, match="clip: a single frame is selected"):
+        semstab.run_videos({**options(folder), "frames": {"stop": 1}})
+    with pytest.raises(DataError, match="no images here"):
+        open_dataset("video", {"root": _empty(tmp_path)})
+
+
+def _empty(tmp_path):
+    (tmp_path / "empty").mkdir()
+    return tmp_path / "empty"
+
+
+def test_truth_gives_consistency_where_it_stays_the_same(tmp_path) -> None:
+    folder = write(tmp_path / "clip", wrong=(5,))
+    (folder / "labels/right").rename(folder / "truth")
+    (record,) = semstab.run_videos(options(folder, ground_truth="truth/{name}")).records
+    assert record.model == "flips"
+    assert 0 < record.image_space.vc8 < 1
