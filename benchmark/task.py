@@ -84,7 +84,7 @@ def tasks_of(scene: Scene, config: Config, others: Sequence[str] = ()) -> Iterat
     Frames are those that have labels of all of them, and of the label sources `others`: models that are compared are
     fused from the same frames.
     """
-    names = selected(config.models, scene.models, scene.by_name, "model", scene.name)
+    names = models_of(scene, config)
     if not names:
         searched = f"searched {', '.join(scene.label_paths)}; " if scene.label_paths else ""
         what, instead = "label maps", "add them, or predict them: --predict colour-clusters, or --predict FILE.py:NAME"
@@ -109,6 +109,17 @@ def tasks_of(scene: Scene, config: Config, others: Sequence[str] = ()) -> Iterat
             scene, model, indices, mapping, fused_by, config.perturbation, config.exclude, config.top_k,
             frames.left_out,
         )  # fmt: skip
+
+
+def models_of(scene: Scene, config: Config) -> Sequence[str]:
+    """Return the label sources that a configuration selects; raises ConfigError for one that is not there."""
+    for name in config.models or ():
+        if name in scene.replaced and name not in (*scene.models, *scene.by_name):
+            raise ConfigError(
+                f"{scene.name}: label maps of '{name}' are there, but --predict stands for them; read them, too, by"
+                f" --predict stored,source={name}"
+            )
+    return selected(config.models, scene.models, scene.by_name, "model", scene.name)
 
 
 def applies(part: Part, scene: str, model: str) -> bool:

@@ -10,6 +10,7 @@ import functools
 import importlib.resources
 import shlex
 import subprocess
+import sys
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -18,6 +19,7 @@ from semstab.config import nearest
 from semstab.conformance.files import EXPECTED, differences, read_case, read_rows, read_table, write_case, write_rows
 from semstab.conformance.formulas import FORMULAS
 from semstab.conformance.random_cases import RANDOM, random_frames, seed_of, write_random
+from semstab.core.code import absolute, is_code
 from semstab.core.files import ScratchFolder
 from semstab.data.voxels import VoxelTable
 from semstab.errors import ConfigError, DataError, summarize_error
@@ -30,6 +32,9 @@ __all__ = [
 
 TOLERANCE = 1e-9
 """Largest difference of a sum or a measure, of sums above 1 relative to the sum; counts are equal."""
+
+ALIKE = 3
+"""Cases in which a program fails in one way until it is not started again."""
 
 SECONDS = 120.0
 """Seconds that a program may take for a case, on a busy machine."""
@@ -100,10 +105,12 @@ def conform(
 ) -> Iterator[Verdict]:
     """Run `command CASE OUT` for each case, or for some, and compare what it wrote to OUT with what is expected.
 
-    So many random cases, with seeds from 0, follow. Without `scans` the cases that have some are left out.
+    The command may be a backend's FILE.py:NAME. A program that fails alike in the first three cases is not started
+    again. So many random cases, with seeds from 0, follow. Without `scans` the cases that have some are left out.
 
     Raises:
-        ConfigError: For a case that there is not, or a command that cannot be read or started.
+        ConfigError: For a case that there is not, or a command that cannot be read or started, or fails alike in the
+            first three cases.
     """
     known = [name for name in case_names() if scans or name not in OF_SCANS]
     names = [*(only or known), *(f"{RANDOM}{seed}" for seed in range(random))]
@@ -115,11 +122,18 @@ def conform(
         raise ConfigError(f"{command}: {summarize_error(error)}") from error
     if not words:
         raise ConfigError("name the program that fuses a case: semstab-bench conform 'PROGRAM OPTIONS'")
+    if len(words) == 1 and is_code(words[0]):
+        words = [sys.executable, "-m", "semstab.conformance.fuse", absolute(words[0])]
+    failures = list[str]()
     for name in names:
         folder = case_folder(name)
         with ScratchFolder() as temporary:
             out = temporary / "table.csv"
-            problem = _ran(words, folder, out) or compared(folder, out, tolerance)
+            failed = _ran(words, folder, out)
+            problem = failed or compared(folder, out, tolerance)
+        failures.append(failed)
+        if failed and failures == [failed] * ALIKE:
+            raise ConfigError(f"{command}: {failed}, in the first {ALIKE} cases alike (PROGRAM CASE OUT)")
         yield Verdict(name, problem)
 
 

@@ -164,6 +164,9 @@ POINTS = {
 FILES = (".bag", ".mcap", ".db3")
 """Suffixes of files that are a scene each."""
 
+SHORT = 60
+"""The longest description of a format that is told where a folder is recognised as one, in characters."""
+
 VIDEOS = (".mp4", ".avi", ".mov", ".mkv", ".webm", ".m4v", ".mpg", ".mpeg")
 """Suffixes of video files."""
 
@@ -197,7 +200,8 @@ def recognise(root: Path) -> tuple[str, str]:
         else:
             deep = min(len(folder.relative_to(root).parts) for folder in folders)
             count = f"{len(folders)} scene{'s' if len(folders) > 1 else ''}"
-            fits.append((deep, rank, name, f"{cls.contents}; {count}"))
+            what = f"{cls.contents}; " if len(cls.contents) <= SHORT else ""
+            fits.append((deep, rank, name, f"{what}{count}"))
     if fits:
         return min(fits)[2:]
     listed = " or ".join(text for _, text in sorted(near)[:3])

@@ -72,6 +72,8 @@ class Scene(ABC):
         of_scans: Whether its frames are scans of points, not images.
         made: Whether it is simulated, so that each frame has the pose that it was rendered from.
         posed: Whether its frames have depth and a pose, so that they can be fused.
+        replaced: Label sources in its files that predictions stand for, and that are not read.
+        in_program: Whether its frames are those of a program, and not in files.
     """
 
     name: str
@@ -95,6 +97,8 @@ class Scene(ABC):
     of_scans: bool = False
     made: bool = False
     posed: bool = True
+    replaced: Sequence[str] = ()
+    in_program: bool = False
 
     @abstractmethod
     def __len__(self) -> int:
@@ -284,6 +288,9 @@ class Dataset(ABC):
 
 MAX_LISTED = 5
 
+PHOTOGRAPHS = (".jpg", ".jpeg", ".tif", ".tiff")
+"""Suffixes of images that hold no labels."""
+
 
 def listed(missing: Sequence[str], folder: str = "") -> str:
     """Return the number of missing files and the first of them, as they are called in the folder."""
@@ -335,7 +342,8 @@ def select_frames(
     if len(complete) < len(chosen):
         needs = ("depth", "pose", *(("labels",) if sources else ()), *(("colour",) if color else ()))
         paths = [path for paths in missing.values() for path in paths]
-        images = color and any(len(paths) > len(scene.missing(index, sources)) for index, paths in missing.items())
+        photographs = any(path.lower().endswith(PHOTOGRAPHS) for path in paths)
+        images = photographs or (color and any(len(own) > len(scene.missing(k, sources)) for k, own in missing.items()))
         _tell_missing(scene, paths, len(complete), len(chosen), needs, images=images)
     lost = {index for index in complete if not scene.tracked(index)}
     if lost:
@@ -355,8 +363,12 @@ def _tell_missing(
     where = str(scene.folder or scene.name)
     if not scene.skips_incomplete:
         skip = "set incomplete: skip (--option incomplete=skip) to leave such frames out"
-        there = ", name their folder (--option images=FOLDER)" if images and scene.images_elsewhere else ""
-        raise DataError(f"{where}: {listed(paths, where)}; add them{there}, or {skip}")
+        then = ["add them"]
+        if images and scene.images_elsewhere:
+            then.append("name their folder (--option images=FOLDER)")
+        if complete:
+            then.append(skip)
+        raise DataError(f"{where}: {listed(paths, where)}; {', or '.join(then)}")
     if not complete:
         raise DataError(
             f"{where}: no selected frame has {', '.join(needs[:-1])} and {needs[-1]} ({listed(paths, where)})"

@@ -45,7 +45,7 @@ REGISTRY = Registry(
             install=WITH_SEGFORMER,
             needs=NETWORKS,
         ),
-        "segformer": Entry(SEGMENTER, "the same by its first name", install=WITH_SEGFORMER, needs=NETWORKS),
+        "segformer": Entry(SEGMENTER, "`transformers` by its first name", install=WITH_SEGFORMER, needs=NETWORKS),
         "sam-raw": Entry(
             SAM + "SamRaw", "Segment Anything's proposals as regions without classes", install=WITH_SAM, needs=NETWORKS
         ),

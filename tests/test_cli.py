@@ -45,6 +45,26 @@ def test_help_imports_nothing_heavy(tmp_path) -> None:
     assert result.returncode == 0, result.stderr
 
 
+def test_list_takes_a_kind(tmp_path) -> None:
+    text = bench("list", "taxonomies", cwd=tmp_path, columns=200).stdout
+    assert "uavid7" in text
+    assert "open3d" not in text
+    assert text == bench("list", "taxonomy", cwd=tmp_path, columns=200).stdout
+    assert "did you mean 'datasets'" in bench("list", "datasett", cwd=tmp_path, code=2).stderr
+
+
+def test_an_option_of_the_dataset_is_told_from_a_setting(tmp_path) -> None:
+    wall = tiny_scene.write(tmp_path / "wall", models=("a",))
+    refused = bench("--data", wall, "--set", "depth_scale=500", cwd=tmp_path, code=2).stderr
+    assert "depth_scale is an option of the dataset; write --option depth_scale=500" in refused
+
+
+def test_stored_labels_that_predictions_stand_for_are_named(tmp_path) -> None:
+    wall = tiny_scene.write(tmp_path / "wall", models=("a",))
+    words = "--data", wall, "--predict", "colour-clusters", "--model", "a"
+    assert "--predict stored,source=a" in bench(*words, cwd=tmp_path, code=2).stderr
+
+
 def test_list_names_what_there_is(tmp_path) -> None:
     text = bench("list", cwd=tmp_path, columns=200).stdout
     assert {"open3d", "numpy", "city", "posed_folder", "uavid7", "ready"} <= set(text.split())
@@ -195,6 +215,7 @@ def test_ctrl_c_is_exit_130_and_the_same_command_goes_on(tmp_path) -> None:
     _, stderr = process.communicate(timeout=60)
     assert process.returncode == 130, stderr
     assert "interrupted" in stderr
+    assert "with --out run resumes" in stderr
     assert "Traceback" not in stderr
     again = bench(*arguments, cwd=tmp_path)
     assert "finished earlier: 1 of 2 units" in again.stderr

@@ -221,6 +221,17 @@ def test_what_cannot_be_fused_is_one_line(city, classes):
         semstab.fuse([good], voxel_sizes=SIZE)
 
 
+def test_frames_that_contradict_each_other_are_told_in_the_words_of_a_program(city):
+    good = [f | {"T_wc": np.vstack([f["T_wc"][:3], [0, 0, 0, 1]])} for f in frames_of(city, "sim-steady")]
+    for change, message in (
+        (lambda f: {"T_wc": np.linalg.inv(f["T_wc"])}, r"T_wc that maps the world to the camera \(pass np.linalg.inv"),
+        (lambda f: {"depth": f["depth"] * 1000}, r"depth of 1000 units a metre \(divide it by 1000\)"),
+        (lambda f: {"T_wc": f["T_wc"] @ np.diag([1, -1, -1, 1])}, r"T_wc with opengl camera axes \(turn them: x right"),
+    ):
+        with pytest.raises(DataError, match=f"{message}.*; check_geometry=False fuses it as it is"):
+            semstab.fuse([f | change(f) for f in good], voxel_size=SIZE)
+
+
 def test_a_saved_run_says_that_its_frames_are_gone(steady, tmp_path):
     folder = steady.save(Path(tmp_path) / "run")
     config = semstab.load_config(folder / "config.yaml")

@@ -50,6 +50,19 @@ def test_it_is_called_by_the_name_of_its_class_and_checked(folder) -> None:
     assert load_result(folder / "out").backend == "Mine"
 
 
+def test_conform_takes_it_by_its_file(folder) -> None:
+    only = "--only", "pinhole", "--only", "gaps"
+    assert bench("conform", "fusion.py:Mine", *only, cwd=folder).stdout == "pinhole: the same\ngaps: the same\n"
+    (folder / "fusion.py").write_text(ALIKE + TWICE, encoding="utf-8")
+    assert "evidence" in bench("conform", "fusion.py:Mine", "--only", "pinhole", cwd=folder, code=3).stderr
+
+
+def test_conform_stops_where_a_program_fails_alike(folder) -> None:
+    done = bench("conform", "fusion.py:Yours", cwd=folder, code=2)
+    assert done.stderr.count("\n") == 3
+    assert "in the first 3 cases alike" in done.stderr.splitlines()[-1]
+
+
 def test_other_processes_know_it(folder) -> None:
     run(folder, "--backend", "fusion.py:Mine", "--jobs", "2")
     assert load_result(folder / "out").backend == "Mine"

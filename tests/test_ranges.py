@@ -22,13 +22,18 @@ NEAR, MIDDLE = stratum(0, 10, 0.9, 0.85, 0.95), stratum(10, 20, 0.6, 0.4, 0.8)
     [
         ((NEAR, MIDDLE), (10, 10, 20), "reliable up to 10 m (10 to 20 m)"),
         ((NEAR, stratum(10, 20)), (10, 10, 10), "reliable up to 10 m (the farthest seen)"),
-        ((stratum(0, 10), MIDDLE), (0, 0, 20), "reliable up to 20 m at most (alpha .60 (.40 to .80) from 10 to 20 m)"),
         ((stratum(0, 10), stratum(10, 20, 0.3, 0.2, 0.4)), (0, 0, 0),
          "reliable at no range (alpha .30 (.20 to .40) from 10 to 20 m)"),
     ],
 )  # fmt: skip
 def test_the_text_names_a_range_that_has_a_number(strata, reliable, text) -> None:
-    assert RangeAgreement(strata, 0.667, *reliable).text == text
+    found = RangeAgreement(strata, 0.667, *reliable)
+    assert (found.is_told, found.text) == ("farthest" not in text, text)
+
+
+@pytest.mark.parametrize("reliable", [(0, 0, 20), (20, 20, 20)])
+def test_nothing_is_said_where_it_is_not_known_or_labels_are_reliable_everywhere(reliable) -> None:
+    assert not RangeAgreement((NEAR, MIDDLE), 0.667, *reliable).is_told
 
 
 @pytest.mark.parametrize(("twice", "said"), [(100, False), (1500, True)])

@@ -240,7 +240,7 @@ def test_strata_by_range_tell_a_model_that_is_worse_far_away(run):
     by_model = {record.unit.model: record.summary.statistics.ranges for record in semstab.load(folder).result.select()}
     far, clean = by_model["far"], by_model["clean"]
     assert clean.reliable == clean.farthest
-    assert not clean.limited
+    assert not clean.is_told
     assert far.reliable < clean.reliable
     alphas = [row.alpha.value for row in far.strata if not math.isnan(row.alpha.value)]
     assert alphas[0] > 0.9

@@ -60,10 +60,10 @@ def test_own_data_is_checked_on_a_sample_of_the_voxels(tmp_path) -> None:
     assert "checked numba against numpy on" in printed(result)
     longest = {"seconds": {"reference": 3.6, "statistics": 5.1, "keep": 0.4, "all": 9.0}}
     timed = dataclasses.replace(result, manifest=result.manifest | longest)
-    assert "9 s (wall time by stage: statistics 5, check of the backend 4)" in printed(timed, seconds=9.2)
+    assert "9 s (longest stages: statistics 5, check of the backend 4)" in printed(timed, seconds=9.2)
     elsewhere = {"units": {"executor": "2 local processes"}}
     timed = dataclasses.replace(timed, manifest=timed.manifest | elsewhere)
-    assert "9 s (wall time by stage, all workers: statistics 5, check of the backend 4)" in printed(timed, seconds=9.2)
+    assert "9 s (longest stages, all workers: statistics 5, check of the backend 4)" in printed(timed, seconds=9.2)
     assert semstab.run(config, out=tmp_path / "run", report=False).manifest["units"]["kept"] == 2
 
 

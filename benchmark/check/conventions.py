@@ -90,6 +90,7 @@ class Reading:
         ratios: Sizes that the intrinsics may be for, relative to what is said.
         file: The scene.yaml with further settings, where the dataset has one.
         names: Names of all settings, those that are not set too.
+        in_program: Whether the frames are those of a program, where no file and no option sets anything.
     """
 
     said: Mapping[str, Any]
@@ -99,6 +100,7 @@ class Reading:
     file: str | None
     depth_scale: float | None
     names: tuple[str, ...] = ()
+    in_program: bool = False
 
     @property
     def convention(self) -> Convention:
@@ -125,7 +127,12 @@ class Reading:
         return [round(side * share) for side, share in zip(said, ratio, strict=True)]
 
     def lines(self, convention: Convention) -> tuple[str, ...]:
-        """Return the lines of scene.yaml, or the options, with which the files are read by that convention."""
+        """Return the lines of scene.yaml, or the options, with which the files are read by that convention.
+
+        Of a program's frames it is what they hold, in words.
+        """
+        if self.in_program:
+            return tuple(name for name, _ in self._of_program(convention))
         said = {
             "pose": ("pose_convention", convention.pose),
             "axes": ("camera_axes", convention.axes),
@@ -135,6 +142,19 @@ class Reading:
         }
         return tuple(self._line(*said[field]) for field in convention.differs_in(self.convention))
 
+    def _of_program(self, convention: Convention) -> Iterator[tuple[str, str]]:
+        """Yield what a program's frames seem to hold instead of what `Frame` asks for, and what to do about it."""
+        width, height = self.size_after(convention.ratio)
+        unit = f"{1 / convention.factor:.4g}"
+        texts = {
+            "pose": ("T_wc that maps the world to the camera", "pass np.linalg.inv(T_wc)"),
+            "axes": (f"T_wc with {convention.axes} camera axes", "turn them: x right, y down, z forward"),
+            "depth": ("depth along the rays of the pixels", "convert it to depth along the optical axis"),
+            "factor": (f"depth of {unit} units a metre", f"divide it by {unit}"),
+            "ratio": (f"intrinsics of an image of {width}x{height}", "scale them to the depth's size"),
+        }
+        yield from (texts[field] for field in convention.differs_in(self.convention))
+
     def _scale_after(self, factor: float) -> str:
         if self.depth_scale is None:
             return f"{1 / factor:.4g} times the present one"
@@ -142,6 +162,8 @@ class Reading:
 
     def advice(self, convention: Convention) -> str:
         """Return the file in which the lines belong, and the fault that they would mend."""
+        if self.in_program:
+            return ", ".join(text for _, text in self._of_program(convention))
         where, factor = self._where(self.lines(convention)), convention.factor
         if factor == 1:
             return where
@@ -187,6 +209,7 @@ def reading(
         file=None if scene.settings_file is None else str(scene.settings_file),
         depth_scale=scene.depth_scale or said.get("depth_scale"),
         names=(*said,),
+        in_program=scene.in_program,
     )
 
 

@@ -18,6 +18,10 @@ from semstab.data.labels import IGNORE_16BIT
 
 STATES = {"sound": "green", "imprecise": "yellow", "unsound": "bold red", "unclear": "yellow"}
 NOTHING = "-"
+OF_IMAGES = "predict them (--predict), or put the label maps of a model into its folder"
+OF_SCANS = "put those of a model into predictions/MODEL (docs/tutorials/scans.md), or check the truth, --model gt"
+"""What to do where a scene has no labels."""
+
 MOST_UNKNOWN = 4
 MOST_COLUMNS = 100
 
@@ -34,7 +38,7 @@ def print_check(checked: SceneCheck, console: Console, *, verbose: bool = False)
     console.print()
     say(f"  {state.upper()}  {_conclusion(checked)}", 4, STATES[state])
     if not checked.labels:
-        say("  labels   none: predict them (--predict), or put the label maps of a model into its folder", 11)
+        say(f"  labels   none: {OF_SCANS if checked.of_scans else OF_IMAGES}", 11)
     for text in checked.problems_of_labels:
         say(f"  LABELS  {text}", 4, STATES["unsound"])
     if checked.placed is not None:
@@ -139,7 +143,7 @@ def _label_table(checked: SceneCheck) -> Table:
 
 
 def _advice(checked: SceneCheck, *, verbose: bool) -> Iterator[str]:
-    for each in checked.label_findings if verbose else ():
+    for each in checked.label_findings:
         if each.open is not None:
             yield f"labels   {each.model}: {each.open}"
     if verbose and checked.motion is not None:

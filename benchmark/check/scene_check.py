@@ -43,7 +43,7 @@ from semstab.data.frames import Frame
 from semstab.data.labels import LabelSpace
 from semstab.datasets import Scene, open_dataset
 from semstab.errors import DataError
-from semstab.task import frame_indices, require_posed, selected
+from semstab.task import frame_indices, models_of, require_posed, selected
 
 SCHEMA = 2
 """Version of the file that --json writes."""
@@ -253,7 +253,7 @@ def _whole(scene: Scene, config: Config) -> tuple[list[str], list[str]]:
 
     Models that the configuration names are all checked.
     """
-    models = list(selected(config.models, scene.models, scene.by_name, "model", scene.name))
+    models = list(models_of(scene, config))
     if config.models is not None or scene.skips_incomplete or len(models) < 2:
         return models, []
     indices = frame_indices(scene, config)
@@ -313,15 +313,16 @@ def require_sound(scene: Scene, indices: Sequence[int], options: Mapping[str, An
         DataError: If depth and poses contradict each other.
     """
     verdict = quick_check(scene, indices, options)
-    refuse_unsound(scene.name, verdict)
+    refuse_unsound(scene, verdict)
     return verdict
 
 
-def refuse_unsound(scene: str, verdict: Verdict) -> None:
+def refuse_unsound(scene: Scene, verdict: Verdict) -> None:
     """Raise DataError where the verdict on that scene is that depth and poses contradict each other."""
     if verdict.state == "unsound":
+        then = "`semstab-bench check` reports more, --no-geometry-check fuses the scene as it is"
         raise DataError(
-            f"{scene}: {verdict.text}; `semstab-bench check` reports more, --no-geometry-check fuses the scene as it is"
+            f"{scene.name}: {verdict.text}; {'check_geometry=False fuses it as it is' if scene.in_program else then}"
         )
 
 

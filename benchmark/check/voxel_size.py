@@ -16,7 +16,7 @@ from semstab.data.results import VoxelAdvice
 from semstab.datasets import Scene
 from semstab.errors import DataError
 from semstab.predict.dataset import NAME as PREDICTED
-from semstab.task import frame_indices, selected
+from semstab.task import frame_indices, models_of
 
 SCENES = 3
 """The most scenes that are looked at; the largest size suits all of them."""
@@ -59,7 +59,7 @@ def _is_made(config: Config) -> bool:
 
 def _coverage(config: Config, scene: Scene) -> Stays | None:
     """Return what a scene's frames share; None where they cannot be read."""
-    models = selected(config.models, scene.models, scene.by_name, "model", scene.name)
+    models = models_of(scene, config)
     with contextlib.suppress(DataError):
         indices = frame_indices(scene, config, models)
         if scene.of_scans:

@@ -68,10 +68,11 @@ RESUMED = ("run", "study", "benchmark", "filters", "predict", "convert")
 """The commands that go on where they were."""
 
 
-def _interrupted(command: str | None) -> str:
-    """Return what is left of a command that a signal ended."""
+def _interrupted(command: str | None, folder: Path | None) -> str:
+    """Return what is left of a command that a signal ended, in a folder that the command line may not name."""
     if command in RESUMED:
-        return "interrupted; finished work is stored, and the same command with the same --out resumes there"
+        again = "the same --out" if folder is None else f"--out {folder}"
+        return f"interrupted; finished work is stored, and the same command with {again} resumes there"
     return "interrupted; no file is half-written; start the same command again"
 
 
@@ -186,7 +187,8 @@ class Group(TyperGroup):
             say(f"error: {_usage(error)}; see {command} --help")
             raise typer.Exit(2) from error
         except KeyboardInterrupt as error:
-            say(_interrupted(ctx.invoked_subcommand))
+            folder = next((each for each in error.args if isinstance(each, Path)), None)
+            say(_interrupted(ctx.invoked_subcommand, folder))
             number = next((each for each in error.args if isinstance(each, int)), signal.SIGINT)
             raise typer.Exit(128 + number) from error
         except OSError as error:

@@ -164,12 +164,26 @@ def chosen(
                 raise ConfigError(f"--set {setting}: '{group}' is given as an option too; use one of the two")
         inner[key] = parse_yaml(text, f"--set {setting}")
     select_dataset(content, dataset, data, seed)
+    _require_settings(settings or (), content)
     if frames is not None:
         try:
             content["frames"] = in_full(frames)
         except ConfigError as error:
             raise ConfigError(f"--frames {frames}: {error}") from error
     return content
+
+
+def _require_settings(settings: list[str] | tuple[()], content: dict[str, Any]) -> None:
+    """Raise ConfigError where --set names an option of the dataset instead of a setting."""
+    from semstab.config import Config
+    from semstab.datasets import options_model
+
+    dataset = content.get("dataset")
+    name = dataset.get("name") if isinstance(dataset, dict) else None
+    for setting in settings:
+        key, _, text = setting.partition("=")
+        if name is not None and key not in Config.model_fields and key in options_model(str(name)).model_fields:
+            raise ConfigError(f"--set {setting}: {key} is an option of the dataset; write --option {key}={text}")
 
 
 def select_dataset(content: dict[str, Any], name: str | None, data: Path | None, seed: int | None) -> None:

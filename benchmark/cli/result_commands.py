@@ -261,7 +261,29 @@ def relabel(
 # The command list.
 
 
+KINDS = {
+    "backends": "backend", "datasets": "dataset", "models": "model", "filters": "filter", "taxonomies": "taxonomy",
+    "studies": "study", "benchmarks": "benchmark",
+}  # fmt: skip
+"""The kinds of things that `list` lists, in the plural."""
+
+
+def _kind(text: str | None) -> str | None:
+    """Return a kind by its name in the singular or the plural; raises ConfigError if there is none."""
+    if text is None or text in KINDS.values():
+        return text
+    if text not in KINDS:
+        from semstab.config import nearest
+        from semstab.errors import ConfigError
+
+        raise ConfigError(f"list {text}: there is no such kind; {nearest(text, [*KINDS])}")
+    return KINDS[text]
+
+
 def list_(
+    kind: Annotated[
+        str | None, typer.Argument(metavar="KIND", help="Only backends, datasets, models, filters, taxonomies, ...")
+    ] = None,
     check: Annotated[bool, typer.Option("--check", help="Also load each one, which takes seconds.")] = False,
 ) -> None:
     """List backends, datasets, models, filters, taxonomies, studies and benchmarks, with 'ready' or what is missing.
@@ -283,8 +305,9 @@ def list_(
     table = Table(show_edge=False)
     for name in ("kind", "name", "", "description"):
         table.add_column(name)
+    wanted = _kind(kind)
     for registry in (backends.REGISTRY, datasets.REGISTRY, models.REGISTRY, filters.REGISTRY):
-        for name, entry in sorted(registry.entries().items()):
+        for name, entry in sorted(registry.entries().items()) if wanted in (None, registry.kind) else ():
             missing = registry.missing(name)
             if check and not missing:
                 try:
@@ -293,12 +316,12 @@ def list_(
                     missing = str(error)
             ready = f"[yellow]{escape(missing)}" if missing else "[green]ready"
             table.add_row(registry.kind, name, ready, escape(entry.summary))
-    for name in shipped_taxonomies():
+    for name in shipped_taxonomies() if wanted in (None, "taxonomy") else ():
         space = LabelSpace.load(name)
         table.add_row("taxonomy", name, "[green]ready", f"K = {len(space)}: {', '.join(space.classes)}")
-    for name in shipped_studies():
+    for name in shipped_studies() if wanted in (None, "study") else ():
         table.add_row("study", name, "[green]ready", load_study(name).description)
-    for name, file in shipped_benchmarks().items():
+    for name, file in shipped_benchmarks().items() if wanted in (None, "benchmark") else ():
         table.add_row("benchmark", name, "[green]ready", read_yaml(file)["description"])
     console = Console()
     console.print(table)

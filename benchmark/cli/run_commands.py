@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import gc
 import os
 import re
@@ -9,6 +10,7 @@ import shlex
 import sys
 import textwrap
 import time
+from collections.abc import Iterator
 from enum import StrEnum
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -112,12 +114,25 @@ def run(
     if device is not None:
         loaded = _on_device(loaded, device)
     out = out or Path("runs") / datetime.now().astimezone().strftime("%Y-%m-%d_%H-%M-%S")
-    if is_video(loaded):
-        if jobs > 1 or scheduler is not None:
-            raise ConfigError("--jobs and --scheduler: videos are measured in one process; leave them out")
-        measure_videos(loaded, out, rerun, report, overwrite=overwrite, quiet=quiet)
-        return
-    execute(loaded, out, executor_of(jobs, scheduler), rerun, report, overwrite=overwrite, quiet=quiet, verbose=verbose)
+    with _naming(out):
+        if is_video(loaded):
+            if jobs > 1 or scheduler is not None:
+                raise ConfigError("--jobs and --scheduler: videos are measured in one process; leave them out")
+            measure_videos(loaded, out, rerun, report, overwrite=overwrite, quiet=quiet)
+        else:
+            execute(
+                loaded, out, executor_of(jobs, scheduler), rerun, report, overwrite=overwrite, quiet=quiet,
+                verbose=verbose,
+            )  # fmt: skip
+
+
+@contextlib.contextmanager
+def _naming(out: Path) -> Iterator[None]:
+    """Let an interruption say in which folder the same command goes on."""
+    try:
+        yield
+    except KeyboardInterrupt as error:
+        raise KeyboardInterrupt(*error.args, out) from error
 
 
 def measure_videos(config: Config, out: Path, rerun: str | None, report: str, *, overwrite: bool, quiet: bool) -> None:

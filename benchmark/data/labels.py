@@ -278,7 +278,8 @@ class LabelMapping:
             raise DataError(
                 f"{where}: label id {listed} ({np.count_nonzero(unknown[labels])} pixels) is outside the taxonomy"
                 f" {self.source.name} ({len(self.source)} classes,"
-                f" ids {min(self.source.ids)} to {max(self.source.ids)})"
+                f" ids {min(self.source.ids)} to {max(self.source.ids)}); name the class in it, or leave the id out"
+                " (option void_ids)"
             )
         return _look_up(table.astype(np.uint8 if len(self.target) <= IGNORE_8BIT else np.uint16), labels)
 

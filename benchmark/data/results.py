@@ -218,6 +218,7 @@ class UnitSummary:
             "verdict": "" if verdict is None else verdict.level,
             "probability": math.nan if verdict is None else verdict.probability,
             "alpha": alpha.value, "alpha_low": alpha.low, "alpha_high": alpha.high, "confidence": alpha.level,
+            "agreeing": math.nan if self.statistics is None else self.statistics.agreeing,
             "taxonomy": self.taxonomy, "K": table.K, "voxel_size": table.voxel_size, "frames": self.frames,
             "points": table.points, "observations": table.observations, "voxels": table.voxels,
             "mean_op": table.mean_op,

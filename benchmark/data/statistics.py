@@ -240,9 +240,12 @@ class RangeAgreement:
         return max((row.high for row in self.strata if not math.isnan(row.alpha.value)), default=0.0)
 
     @property
-    def limited(self) -> bool:
-        """Return whether labels may be unreliable somewhere in the range that was seen."""
-        return self.low < self.farthest
+    def is_told(self) -> bool:
+        """Return whether the number is for people: labels may be unreliable farther out, and are reliable near by.
+
+        Or they are so at no range; what is not known either way is the verdict's to say.
+        """
+        return self.low < self.farthest and (self.reliable > 0 or self.high == 0)
 
     @property
     def text(self) -> str:
@@ -259,7 +262,7 @@ class RangeAgreement:
             return f"up to {self.reliable:g} m", note and f"({note})"
         first = next((row for row in self.strata if not math.isnan(row.alpha.value)), self.strata[0])
         found = f"(alpha {first.alpha.text()} from {first.low:g} to {first.high:g} m)"
-        return f"up to {self.high:g} m at most" if self.high else "at no range", found
+        return "at no range", found
 
 
 @dataclass(frozen=True)

@@ -183,7 +183,7 @@ class _Execution:
                 if (advice := advise(sample, config)) is not None:
                     self.units.advice[task.scene.name] = advice
         for scene, verdict in verdicts.items():
-            refuse_unsound(scene, verdict)
+            refuse_unsound(tasks[scene].scene, verdict)
             self._observers.tell(
                 lambda observer, scene=scene, verdict=verdict: observer.geometry_checked(tasks[scene], verdict)  # type: ignore[misc]
             )

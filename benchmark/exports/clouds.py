@@ -195,5 +195,6 @@ def codes(voxels: Voxels, table: Path | None = None) -> UInt8:
 
 
 def without_code(voxels: Voxels, table: Path | None) -> list[str]:
-    """Return the classes without a code of their own, which become 'unclassified'."""
-    return [name for name, code in zip(voxels.classes, codes(voxels, table)[1:], strict=True) if code == UNCLASSIFIED]
+    """Return the classes of these voxels without a code of their own, which become 'unclassified'."""
+    known, there = codes(voxels, table), np.unique(voxels.classified)
+    return [voxels.classes[row - 1] for row in there.tolist() if row and known[row] == UNCLASSIFIED]

@@ -151,6 +151,8 @@ class Frames(Dataset):
 class FramesScene(Scene):
     """The frames of a program, with the labels of one model, and the truth where every frame has it."""
 
+    in_program = True
+
     def __init__(self, sequence: Sequence, options: FramesOptions) -> None:
         self._sequence = sequence
         self.name, self.models, self.ground_truth = options.scene, (options.model,), sequence.has_truth

@@ -193,7 +193,7 @@ class PredictedScene(Scene):
             )
         self.name = inner.name
         self.models = tuple(dataset.predictors)
-        self.ground_truth = inner.ground_truth
+        self.ground_truth, self.replaced = inner.ground_truth, inner.models
         self.up = inner.up
         self.georeference = inner.georeference
         self.placed = inner.placed

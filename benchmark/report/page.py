@@ -140,7 +140,7 @@ def _numbers(
     alpha = macro_mean(alphas)
     yield "alpha", "" if math.isnan(alpha) else short(alpha), interval(None if head is None else head.alpha)
     yield "two views agree", mean([stats.agreeing for stats in assessed], "{:.0f} %", 100), "of the spots"
-    if one is not None and one.ranges is not None and one.ranges.limited:
+    if one is not None and one.ranges is not None and one.ranges.is_told:
         value, note = one.ranges.parts
         yield "reliable", value, note
     flicker = [record.image_space.compensated_flicker_percent for record in records]

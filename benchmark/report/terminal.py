@@ -192,7 +192,7 @@ def _verdict(run: UnitSummary) -> Iterator[str]:
     yield f"  two views see the same class at {_percent(statistics.agreeing)} of the spots"
     if not math.isnan(wrong.value) and statistics.verdict.level != "misleading":
         yield f"  {told}"
-    if statistics.ranges is not None and statistics.ranges.limited:
+    if statistics.ranges is not None and statistics.ranges.is_told:
         yield f"  {statistics.ranges.text}"
     yield ""
 
@@ -280,7 +280,7 @@ def _several(result: Result, records: Sequence[Record], width: int) -> Iterator[
     yield from _outlying(records)
     for record in records:
         ranges = None if record.summary.statistics is None else record.summary.statistics.ranges
-        if ranges is not None and ranges.limited:
+        if ranges is not None and ranges.is_told:
             scene = f" in {record.unit.scene}" if len(result.scenes) > 1 else ""
             yield f"  {record.unit.model}{scene}: {ranges.text}"
     yield ""
@@ -447,7 +447,7 @@ def _where(result: Result, out: Path | None, seconds: float | None) -> Iterator[
         longest = sorted(stages, key=lambda name: -stages[name])[:3]
         parts = ", ".join(f"{name} {stages[name]:.0f}" for name in longest if stages[name] >= 1)
         here = result.manifest.get("units", {}).get("executor") == InProcess.name
-        what = f"wall time by stage{'' if here else ', all workers'}"  # their sum may exceed the run's time
+        what = f"longest stages{'' if here else ', all workers'}"  # of all workers they may exceed the run's time
         yield f"  {seconds:.0f} s{f' ({what}: {parts})' if parts else ''}"
     if speeds := _speeds(result):
         yield from textwrap.wrap(f"predicted: {speeds}", WIDTH, initial_indent="  ", subsequent_indent="    ")

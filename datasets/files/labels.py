@@ -300,11 +300,12 @@ class LabelMaps:
         if space is None:
             assert source.first is not None
             folder = source.first[1].parent
+            beside = f", or put a {LABEL_SPACE_FILE} into {folder}" if folder.is_dir() else ""
             settings = "set" if where.exists() else f"write {where.name} with"
             raise DataError(
                 f"{where if where.exists() else where.parent}: the classes of '{model}' are not known; {settings}"
-                f" classes: [name, ...] in id order, taxonomy: NAME, or taxonomies: {{{model}: NAME}}, or put a"
-                f" {LABEL_SPACE_FILE} into {folder}"
+                f" classes: [name, ...] in id order, taxonomy: NAME, or taxonomies: {{{model}: NAME}}"
+                f" (--option 'classes=[name, ...]' and so on){beside}"
             )
         return space
 
