@@ -12,6 +12,7 @@ from semstab.config.settings import in_full
 from semstab.datasets import GROUND_TRUTH, open_dataset, resolved
 from semstab.errors import ConfigError
 from semstab.predict.dataset import NAME as PREDICTED
+from semstab.predict.filters import parse
 from semstab.predict.predictor import NAME as STORED
 from semstab.predict.predictor import PredictorConfig, StoredSequence
 
@@ -126,7 +127,7 @@ def filtered_config(filters: Sequence[str], path: str | Path | None, overrides: 
             scores = StoredSequence(scene, name, False).has_scores
             stored = {"model": STORED, "options": {"source": name}, "scores": scores, "filters": filters}
             if scores and name.removesuffix("-scores") in names:  # beside the labels of that name
-                stored["name"] = "-".join([name, *(text.replace(":", "-") for text in filters)])
+                stored["name"] = "-".join([name, *(str(parse(text)).replace(":", "-") for text in filters)])
             predictors.append(validated(PredictorConfig, stored))
     content = merge(dataset_defaults({"dataset": config.dataset.model_dump()}), _over(_of_file(path), overrides))
     selected = [*(predictor.source_name for predictor in predictors), *(name for name in names if name == GROUND_TRUTH)]

@@ -28,7 +28,7 @@ from semstab.errors import ConfigError, DataError
 from semstab.report import terminal
 from semstab.report.tables import tables
 from semstab.report.tables.table import to_json as table_content
-from semstab.report.terminal import print_summary
+from semstab.report.terminal import common_beginning, print_summary
 from semstab.statistics import CellObservations, MapSample, analyse, describe
 from semstab.statistics.correctness import ACCURACY
 
@@ -296,3 +296,17 @@ def test_the_mean_of_several_scenes_counts_each_once() -> None:
     entropies = [record.statistics.uncertainty.entropy.value for record in judged]
     assert total["scene"] == "Mean"
     assert total["entropy"] == pytest.approx(np.mean(entropies))
+
+
+@pytest.mark.parametrize(
+    ("names", "begin"),
+    [
+        (["espnetv2_voc scale=0.5", "espnetv2_voc scale=2.0"], "espnetv2_voc "),
+        (["sim-steady", "sim-flicker"], ""),
+        (["a long name of one model"], ""),
+        (["segformer_b0", "segformer_b0_ade20k_finetuned"], "segformer_"),
+        (["segformer_b0 ", "segformer_b0 more and more"], ""),
+    ],
+)
+def test_long_names_are_written_without_what_all_begin_with(names, begin) -> None:
+    assert common_beginning(names) == begin

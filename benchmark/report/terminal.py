@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import itertools
 import math
+import re
 import textwrap
 import time
 from collections.abc import Iterator, Mapping, Sequence
@@ -260,8 +262,8 @@ def _several(result: Result, records: Sequence[Record], width: int) -> Iterator[
     if told:
         yield ""
     known = any(not math.isnan(miou(record)) for record in records)
-    shown = columns() if known else columns()[:-1]
-    heads, rows = [*zip(*shown, strict=True)], [row_of(record)[: len(shown)] for record in records]
+    shown, begin = columns() if known else columns()[:-1], common_beginning([*result.models])
+    heads, rows = [*zip(*shown, strict=True)], [row_of(record, begin)[: len(shown)] for record in records]
     lines = iter(laid_out([*heads, *rows], width))
     yield next(lines)
     yield next(lines)
@@ -270,13 +272,15 @@ def _several(result: Result, records: Sequence[Record], width: int) -> Iterator[
         if len(result.scenes) > 1 and record.unit.scene != scene:
             yield f"  {(scene := record.unit.scene)}"
         yield line
+    if begin:
+        yield f"  names of models begin with '{begin}'"
     if any(record.summary.table.recurrent.voxels < ENOUGH for record in records):
         titles = ", ".join(measure.title for measure in headlines())
         yield f"  {titles} -: fewer than {ENOUGH:,} voxels were seen 3 times or more"
     yield LEVELS
     if len(records) <= MOST_MAPS and any(record.summary.table.categories for record in records):
-        yield from ("", *_map_shares(records, width), "")
-    yield from _classes(records, width)
+        yield from ("", *_map_shares(records, width, begin), "")
+    yield from _classes(records, width, begin)
     yield from _outlying(records)
     for record in records:
         ranges = None if record.summary.statistics is None else record.summary.statistics.ranges
@@ -286,13 +290,26 @@ def _several(result: Result, records: Sequence[Record], width: int) -> Iterator[
     yield ""
 
 
-def _map_shares(records: Sequence[Record], width: int) -> Iterator[str]:
+LONG_NAME = 16
+"""Characters from which on a model's name is written without what all names begin with."""
+
+
+def common_beginning(names: Sequence[str]) -> str:
+    """Return what the names of models begin with, up to a sign between words; '' where that makes none much shorter."""
+    same = itertools.takewhile(lambda letters: len({*letters}) == 1, zip(*names, strict=False))
+    found = re.match(r".*[ _-]", "".join(letters[0] for letters in same))
+    begin = found[0] if found and len(names) > 1 else ""
+    return begin if len(begin) > LEAST_NAME and max(map(len, names)) > LONG_NAME and begin not in names else ""
+
+
+def _map_shares(records: Sequence[Record], width: int, begin: str) -> Iterator[str]:
     """Yield a row for each map: how much of it is stable, uncertain, drifting, and seen too rarely to tell."""
     known = [record for record in records if record.summary.table.categories]
     rows = [percents([record.summary.table.categories[name] for name in reversed(CATEGORIES)]) for record in known]
     heads = ("stable", "uncertain", "drifting", "seen less than 3 times")
     scenes = len({record.unit.scene for record in known}) > 1
-    named = [f"{record.unit.scene}, {record.unit.model}" if scenes else record.unit.model for record in known]
+    models = [record.unit.model.removeprefix(begin) for record in known]
+    named = [f"{each.unit.scene}, {name}" if scenes else name for each, name in zip(known, models, strict=True)]
     names = [_cut(name, width - sum(map(len, heads)) - 2 * len(heads) - 2) for name in named]
     first = max(map(len, (OF_MAP, *names)))
     for name, row in ((OF_MAP, heads), *zip(names, rows, strict=True)):
@@ -320,8 +337,8 @@ def _cut(name: str, size: int) -> str:
     return f"{name[:first]}...{name[first + 3 - size :]}"
 
 
-def row_of(record: Record) -> list[str]:
-    """Return a model's row under `columns`."""
+def row_of(record: Record, begin: str = "") -> list[str]:
+    """Return a model's row under `columns`, its name without a beginning."""
     run, statistics = record.summary, record.summary.statistics
     level, alpha, agree = "-", "", math.nan
     if statistics is not None:
@@ -332,7 +349,7 @@ def row_of(record: Record) -> list[str]:
     shown = [short(value, digits=m.digits[0]) for m, value in means.items()]
     flicker = record.image_space.compensated_flicker_percent
     agreeing, flickering, overlap = _number(agree, 0), _number(flicker, 1), _number(100 * miou(record), 1)
-    return [run.unit.model, level, alpha, agreeing, flickering, *shown, overlap]
+    return [run.unit.model.removeprefix(begin), level, alpha, agreeing, flickering, *shown, overlap]
 
 
 def miou(record: Record) -> float:
@@ -348,8 +365,8 @@ def _number(value: float, digits: int) -> str:
 # --- Both -------------------------------------------------------------------------------------------------------------
 
 
-def _classes(records: Sequence[Record], width: int) -> Iterator[str]:
-    """Yield the classes with most of the disagreement, and which class is not listed."""
+def _classes(records: Sequence[Record], width: int, begin: str = "") -> Iterator[str]:
+    """Yield the classes with most of the disagreement, and which class is not listed; names without a beginning."""
     names = list(dict.fromkeys(record.unit.model for record in records))
     most, alone = MOST_CLASSES.get(len(records), 1), len(names) == 1
     rows: list[tuple[str, str, str, str, str]] = []
@@ -367,7 +384,7 @@ def _classes(records: Sequence[Record], width: int) -> Iterator[str]:
             left_out |= dict.fromkeys(key for key in listed if key not in small)
             listed = small
         for key in listed[:most]:
-            label, (alpha, disagreement) = key if alone else f"{name}: {key}", classes[key]
+            label, (alpha, disagreement) = key if alone else f"{name.removeprefix(begin)}: {key}", classes[key]
             of_map, of_all = f"{100 * shares.get(key, 0.0):.0f} %", f"{100 * disagreement:.0f} %"
             rows.append((f"  {label}", short(alpha), others.get(key, ""), of_map, of_all))
     if rows:
