@@ -93,7 +93,9 @@ def test_255_classes_are_the_most_that_8_bits_hold():
 
 @pytest.mark.parametrize("labels", [u8(0, 9, 8, 9), u16(0, 9, 8, 9)])
 def test_an_id_outside_the_taxonomy_is_named_with_its_file(labels):
-    expected = r"^labels/0012.png: label id 8, 9 \(3 pixels\) is outside the taxonomy uavid8 \(8 classes, ids 0 to 7\)$"
+    expected = (
+        r"^labels/0012.png: label id 8, 9 \(3 pixels\) is outside the taxonomy uavid8 \(8 classes, ids 0 to 7\); "
+    )
     with pytest.raises(DataError, match=expected):
         UAVID8.mapping_to(UAVID7).labels(labels, "labels/0012.png")
 

@@ -712,7 +712,7 @@ def test_an_image_that_is_not_there_is_named_by_where_it_would_be(tmp_path) -> N
     folder = write_project(tmp_path / "field")
     shutil.rmtree(folder / "opensfm/undistorted/images")
     assert opened(folder).missing(0, color=True) == [f"{folder}/opensfm/undistorted/images/DJI_0001.JPG"]
-    with pytest.raises(DataError, match=r"3 missing: .*add them, name their folder \(--option images=FOLDER\), or set"):
+    with pytest.raises(DataError, match=r"3 missing: .*add them, or name their folder \(--option images=FOLDER\)$"):
         select_frames(opened(folder), FrameSelection(), color=True)
 
 
