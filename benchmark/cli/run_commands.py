@@ -159,9 +159,9 @@ def measure_videos(config: Config, out: Path, rerun: str | None, report: str, *,
             observer.close()
     lines = [*screen(result), *textwrap.wrap(f"note: {NEEDS}", 80, initial_indent="  ", subsequent_indent="    ")]
     lines.append(f"  {time.monotonic() - began:.0f} s")
-    for name, file in (("report", out / "report.html"), ("viewer", out / "recording.rrd")):
+    for line, file in (("report  ", out / "report.html"), ("viewer  semstab-bench view ", out / "recording.rrd")):
         if file.exists():
-            lines.append(f"  {name}  {file if name == 'report' else f'rerun {file}'}")
+            lines.append(f"  {line}{file}")
     print_lines([*lines, f"  more    {out}"], quiet=quiet)
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import dataclasses
 import math
 from collections.abc import Iterator, Mapping, Sequence
 
@@ -69,7 +70,9 @@ def _measured(tasks: Sequence[Task], config: Config, observers: Sequence[VideoOb
     meters = [_Meter(task, config, flows) for task in tasks]
 
     def decoded(index: int) -> list[tuple[Frame, Frame | None]]:
-        return [(read(meter.task, index, config.pixel_stride, color=True), meter.true(index)) for meter in meters]
+        frames = [read(task, index, config.pixel_stride, color=k == 0) for k, task in enumerate(tasks)]
+        shown = [dataclasses.replace(frame, color=frames[0].color) for frame in frames]
+        return [(frame, meter.true(index)) for meter, frame in zip(meters, shown, strict=True)]
 
     with contextlib.ExitStack() as stack:
         for task in tasks:
