@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import logging
 import time
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -21,8 +22,16 @@ from semstab.report.videos import save_series, summary, tables, write_page
 from semstab.settings import as_config, resolve
 from semstab.task import open_scenes
 
+logger = logging.getLogger("semstab")
+
 VIDEO = "video"
 """The dataset of videos."""
+
+OF_MAPS = (
+    "voxel_size", "backends", "check", "statistics", "events", "tile_size", "scope", "sweeps", "shared_taxonomy",
+    "critical_classes", "region_maps", "frame_quality",
+)  # fmt: skip
+"""Settings that a video, which has no map, does not use."""
 
 
 def is_video(config: Config) -> bool:
@@ -71,6 +80,8 @@ def run_videos(
         100.0
     """
     began, config = time.perf_counter(), resolve(as_config(config))
+    if unused := [name for name in OF_MAPS if name in config.model_fields_set]:
+        logger.warning("%s: a video has no map, so that this is not used", ", ".join(unused))
     with contextlib.ExitStack() as stack:
         if out is None:
             scratch = ScratchFolder()

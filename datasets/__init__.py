@@ -206,13 +206,7 @@ def recognise(root: Path) -> tuple[str, str]:
         return min(fits)[2:]
     listed = " or ".join(text for _, text in sorted(near)[:3])
     _refuse_points(root, listed)
-    images_of: Any = REGISTRY.load("video").images_of
-    if images_of(root) is not None:
-        raise DataError(
-            f"{root}: holds images, without the depth and poses of a format that is recognised"
-            f"{f' (the nearest are {listed}; name it with --dataset NAME)' if listed else ''}; --dataset video measures"
-            " their flicker without a map"
-        )
+    _refuse_videos(root, listed)
     if not near:
         return "posed_folder", ""
     raise DataError(f"{root}: no format is recognised; the nearest are {listed}; name it with --dataset NAME")
@@ -230,3 +224,17 @@ def _refuse_points(root: Path, nearest: str) -> None:
                     " (docs/datasets.md#scans), or, where a camera was beside, make depth images of them"
                     " (docs/tutorials/lidar-camera.md)"
                 )
+
+
+def _refuse_videos(root: Path, nearest: str) -> None:
+    """Raise DataError where a folder holds images or video files alone."""
+    video: Any = REGISTRY.load("video")
+    try:
+        video(video.Options(root=root))
+    except DataError:
+        return
+    near = f" (the nearest are {nearest}; name it with --dataset NAME)" if nearest else ""
+    raise DataError(
+        f"{root}: holds images, without the depth and poses of a format that is recognised{near}; --dataset video"
+        " measures their flicker without a map"
+    )

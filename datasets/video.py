@@ -86,12 +86,7 @@ class Video(Dataset):
 
     def __init__(self, options: VideoOptions) -> None:
         self.options = options
-        self._found = {entry.name: (entry, images) for entry, images in _find(options.root)}
-
-    @staticmethod
-    def images_of(folder: Path) -> Path | None:
-        """Return the folder with a scene's images: itself, or one that is called so; None where there are none."""
-        return _images_of(folder)
+        self._found = {entry.name: (entry, images) for entry, images in find_videos(options.root)}
 
     @property
     def scenes(self) -> tuple[str, ...]:
@@ -115,7 +110,7 @@ class Video(Dataset):
         return VideoScene(entry, [VideoFrame(f"{k:06d}") for k in range(len(film))], self.options, film)
 
 
-def _find(root: Path) -> Iterable[tuple[SceneEntry, Path]]:
+def find_videos(root: Path) -> Iterable[tuple[SceneEntry, Path]]:
     """Return the scenes, each with its folder of images or its video file.
 
     Raises:

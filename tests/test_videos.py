@@ -125,6 +125,7 @@ def test_a_run_writes_what_it_found(tmp_path) -> None:
     assert len(rows) == COUNT
     summary = json.loads((out / "summary.json").read_text())
     assert {record["model"] for record in summary["records"]} == {"right", "flips"}
+    assert (out / "summary.json").stat().st_size < 10_000
     assert (out / "tables/flicker.csv").read_text().count("\n") == 3
     assert {path.stem for path in (out / "tables").glob("*.md")} == {"flicker", "frames", "video_measures"}
     page = (out / "report.html").read_text()
@@ -190,6 +191,10 @@ def test_a_folder_of_images_alone_names_the_dataset(images, tmp_path) -> None:
 def test_what_needs_a_map_says_so(tmp_path) -> None:
     folder = write(tmp_path / "clip")
     given = ("--dataset", "video", "--data", folder)
+    classes = ("--option", f"classes=[{','.join(CLASSES)}]")
+    told = bench("run", *given, *classes, "--voxel-size", "0.1", "--out", "sized", cwd=tmp_path).stderr
+    assert "voxel_size: a video has no map, so that this is not used" in told
+    assert "not used" not in bench("run", *given, *classes, "--out", "plain", cwd=tmp_path).stderr
     assert "a video, without depth and poses" in bench("check", *given, cwd=tmp_path, code=2).stderr
     with pytest.raises(ConfigError, match="without depth and poses"):
         semstab.run(options(folder))

@@ -19,19 +19,15 @@ LEAST = 0.001
 """... and takes away a millimetre."""
 
 
-def _distances(
-    surfaces: Surfaces, motions: tuple[Float64, Float64] | None = None, sweep: Sweep | None = None
-) -> Float64:
-    """Return (n,) metres from points to surfaces near them, with both sensors' motion (6,) in a sweep taken out."""
-    if motions is not None and sweep is not None:
-        share = share_of_sweep(surfaces.middle, sweep)
-        surfaces = dataclasses.replace(
-            surfaces,
-            points=carried(surfaces.points, motions[0], share_of_sweep(surfaces.points, sweep)),
-            normal=carried(surfaces.normal, motions[1] * [1, 1, 1, 0, 0, 0], share),
-            middle=carried(surfaces.middle, motions[1], share),
-        )
-    return surfaces.distance[surfaces.flat & surfaces.near]
+def _deskewed(surfaces: Surfaces, motion: Float64, motion_of_other: Float64, sweep: Sweep) -> Surfaces:
+    """Return points and surfaces with the motion (6,) of their sensors in a sweep taken out."""
+    share = share_of_sweep(surfaces.middle, sweep)
+    return dataclasses.replace(
+        surfaces,
+        points=carried(surfaces.points, motion, share_of_sweep(surfaces.points, sweep)),
+        normal=carried(surfaces.normal, motion_of_other * [1, 1, 1, 0, 0, 0], share),
+        middle=carried(surfaces.middle, motion_of_other, share),
+    )
 
 
 def with_sweep(verdict: Verdict, sample: ScanSample) -> Verdict:
@@ -43,9 +39,10 @@ def with_sweep(verdict: Verdict, sample: ScanSample) -> Verdict:
     if not known:
         return verdict
     moved = {position: _motion(sample, position) for pair in known for position in pair}
-    now = [_distances(surfaces) for surfaces in known.values()]
+    now = [each.distance[each.met] for each in known.values()]
     under = {
-        sweep: [_distances(each, (moved[a], moved[b]), sweep) for (a, b), each in known.items()] for sweep in SWEEPS
+        sweep: [_deskewed(each, moved[a], moved[b], sweep).distance[each.met] for (a, b), each in known.items()]
+        for sweep in SWEEPS
     }
     best = min(SWEEPS, key=lambda sweep: float(np.median(np.concatenate(under[sweep]))))
     before, after = (float(np.median(np.concatenate(each))) for each in (now, under[best]))

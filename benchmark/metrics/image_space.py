@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import dataclasses
 import math
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from typing import Any
 
 import numpy as np
@@ -22,6 +23,7 @@ from semstab.metrics.flicker import (
     changed_pixels,
     compensated_flicker,
 )
+from semstab.metrics.summary import macro_mean
 from semstab.pixels.edges import depth_edges, label_edges
 
 CLIPS = (8, 16)
@@ -92,6 +94,13 @@ class ImageSpaceMeter:
     def result(self, flicker_percent: float) -> ImageSpace:
         """Return means over the frames so far, in addition to the flicker of the unit's summary."""
         return ImageSpace(flicker_percent, **{name: mean(self.rows.column(k)) for k, name in enumerate(COLUMNS)})
+
+
+def mean_over_scenes(rows: Iterable[ImageSpace]) -> ImageSpace:
+    """Return the macro mean of each number over scenes: each of them counts once, where it has the number."""
+    known = list(rows)
+    names = [field.name for field in dataclasses.fields(ImageSpace)]
+    return ImageSpace(**{name: macro_mean([getattr(row, name) for row in known]) for name in names})
 
 
 def lone_picture(frame: Frame, others: Sequence[Frame]) -> LonePicture:

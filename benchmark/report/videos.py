@@ -17,7 +17,7 @@ from semstab.core.json_form import to_json
 from semstab.data.frames import Frame
 from semstab.data.videos import VideoRecord, VideoResult, VideoRow
 from semstab.engine.videos import VideoObserver
-from semstab.metrics import macro_mean
+from semstab.metrics.image_space import mean_over_scenes
 from semstab.report.charts import Line, line_chart, sample
 from semstab.report.html import filled, lone_pictures, table_block
 from semstab.report.narrative import nearly_all, outlying_line
@@ -56,7 +56,7 @@ class VideoProgress(VideoObserver):
 
 def flicker_of(records: Sequence[VideoRecord]) -> float:
     """Return the flicker of a model with the motion removed, percent: the mean over videos."""
-    return macro_mean([record.image_space.compensated_flicker_percent for record in records])
+    return mean_over_scenes(record.image_space for record in records).compensated_flicker_percent
 
 
 def ranked(result: VideoResult) -> list[str]:
@@ -95,14 +95,11 @@ def screen(result: VideoResult) -> Iterator[str]:
         yield f"  least flicker first: {order}"
     lines = [["", "flicker %", "pixel flicker %", "co-visible %", "VC8", "VC16"]]
     for name in names:
-        own = [record.image_space for record in result.of(name)]
-        shown = [
-            macro_mean([each.compensated_flicker_percent for each in own]),
-            macro_mean([each.flicker_percent for each in own]),
-            100 * macro_mean([each.compensated_share for each in own]),
-            macro_mean([each.self_vc8 for each in own]),
-            macro_mean([each.self_vc16 for each in own]),
-        ]
+        own = mean_over_scenes(record.image_space for record in result.of(name))
+        shown = (
+            own.compensated_flicker_percent, own.flicker_percent, 100 * own.compensated_share, own.self_vc8,
+            own.self_vc16,
+        )  # fmt: skip
         cells = [_text(value, 2 if k < 2 else 0 if k == 2 else 3) for k, value in enumerate(shown)]
         lines.append([name, *cells])
     sizes = [max(map(len, column)) for column in zip(*lines, strict=True)]
@@ -172,11 +169,11 @@ def save_series(record: VideoRecord, folder: Path) -> Path:
 
 
 def summary(result: VideoResult) -> dict[str, Any]:
-    """Return the content of summary.json: all numbers but those of single frames."""
-    content = [to_json(dataclasses.replace(record, rows=())) for record in result.records]
+    """Return the content of summary.json: all numbers but those of single frames, which frames/ has."""
+    fields = [field.name for field in dataclasses.fields(VideoRecord) if field.repr]
     return {
         "schema": "semstab video 1",
-        "records": [{k: v for k, v in each.items() if k != "rows"} for each in content],
+        "records": [{name: to_json(getattr(record, name)) for name in fields} for record in result.records],
     }
 
 
@@ -214,24 +211,14 @@ def page(result: VideoResult) -> str:
 
 
 def _card(result: VideoResult, model: str) -> dict[str, Any]:
-    own = [record.image_space for record in result.of(model)]
+    own = mean_over_scenes(record.image_space for record in result.of(model))
     numbers = (
-        ("flicker", flicker_of(result.of(model)), "{:.2f} %", "of the pixels per frame, motion removed"),
-        (
-            "pixel flicker",
-            macro_mean([each.flicker_percent for each in own]),
-            "{:.2f} %",
-            "of the pixels per frame, motion included",
-        ),
-        (
-            "co-visible",
-            100 * macro_mean([each.compensated_share for each in own]),
-            "{:.0f} %",
-            "of the pixels, in the frame before",
-        ),
-        ("VC8", macro_mean([each.self_vc8 for each in own]), "{:.3f}", "of the pixels keep their label for 8 frames"),
-        ("VC16", macro_mean([each.self_vc16 for each in own]), "{:.3f}", "for 16 frames"),
-        ("VC8, truth", macro_mean([each.vc8 for each in own]), "{:.3f}", "where the truth stays the same"),
+        ("flicker", own.compensated_flicker_percent, "{:.2f} %", "of the pixels per frame, motion removed"),
+        ("pixel flicker", own.flicker_percent, "{:.2f} %", "of the pixels per frame, motion included"),
+        ("co-visible", 100 * own.compensated_share, "{:.0f} %", "of the pixels, in the frame before"),
+        ("VC8", own.self_vc8, "{:.3f}", "of the pixels keep their label for 8 frames"),
+        ("VC16", own.self_vc16, "{:.3f}", "for 16 frames"),
+        ("VC8, truth", own.vc8, "{:.3f}", "where the truth stays the same"),
     )
     return {
         "model": model,

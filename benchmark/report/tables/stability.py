@@ -10,6 +10,7 @@ from semstab.data.measures import SBD, VSS, measures
 from semstab.data.records import ImageSpace, Record, Result
 from semstab.data.results import Agreement, Means, TableSummary
 from semstab.metrics import macro_mean, split_last
+from semstab.metrics.image_space import mean_over_scenes
 from semstab.report.means import (
     ENOUGH,
     Level,
@@ -369,16 +370,11 @@ def _by_method(result: Result) -> dict[str, dict[str, ImageSpace]]:
 
 
 def _numbers(scenes: Iterable[ImageSpace]) -> Row:
-    rows = list(scenes)
+    own = mean_over_scenes(scenes)
     return (
-        macro_mean([row.flicker_percent for row in rows]),
-        macro_mean([row.compensated_flicker_percent for row in rows]),
-        100 * macro_mean([row.compensated_share for row in rows]),
-        macro_mean([row.vc8 for row in rows]),
-        macro_mean([row.vc16 for row in rows]),
-        macro_mean([row.self_vc8 for row in rows]),
-        macro_mean([row.self_vc16 for row in rows]),
-    )
+        own.flicker_percent, own.compensated_flicker_percent, 100 * own.compensated_share, own.vc8, own.vc16,
+        own.self_vc8, own.self_vc16,
+    )  # fmt: skip
 
 
 # The fusion implementations: the same frames through every backend, and the differences of the measures.
