@@ -14,7 +14,7 @@ from semstab.config import Config, Exclusion, Part, Perturbation, as_range, near
 from semstab.core.types import Mask
 from semstab.data.frames import Frame
 from semstab.data.labels import LabelMapping, LabelSpace
-from semstab.data.results import Unit
+from semstab.data.results import UnitName
 from semstab.datasets import GROUND_TRUTH, Scene, open_dataset
 from semstab.datasets.scene import Selected, select_frames
 from semstab.errors import ConfigError, DataError
@@ -44,9 +44,9 @@ class Task:
     apart: tuple[str, ...] = ()
 
     @property
-    def units(self) -> list[Unit]:
+    def units(self) -> list[UnitName]:
         """Return one unit for each backend."""
-        return [Unit(self.scene.name, self.model, backend) for backend in self.backends]
+        return [UnitName(self.scene.name, self.model, backend) for backend in self.backends]
 
     @cached_property
     def digest(self) -> str:

@@ -27,7 +27,7 @@ from semstab import backends
 from semstab.backends.torch_map import TorchMap, TorchMaps
 from semstab.backends.torch_storage import Columns, TensorPrediction
 from semstab.core.files import write_json
-from semstab.data.results import Unit
+from semstab.data.results import UnitName
 from semstab.metrics import compare
 
 VOXEL_SIZE, APART, WARM_UP, MODELS = 0.2, 200.0, 5, 3
@@ -135,7 +135,7 @@ def agreement(K: int, size: tuple[int, int], arguments: argparse.Namespace) -> b
         for index in range(4):
             backend.integrate(flight.frame(index, *size, K))
         tables.append(backend.table())
-    units = (Unit("flight", "", "torch"), Unit("flight", "", "numba"))
+    units = (UnitName("flight", "", "torch"), UnitName("flight", "", "numba"))
     return compare(tables[0], tables[1], units).agrees
 
 

@@ -31,8 +31,8 @@ from semstab.config import Config  # noqa: E402
 from semstab.core.files import write_json  # noqa: E402
 from semstab.core.process import resident_bytes  # noqa: E402
 from semstab.datasets import open_dataset  # noqa: E402
-from semstab.engine.messages import Start, TileTask, Work  # noqa: E402
 from semstab.engine.units import make_plan  # noqa: E402
+from semstab.engine.work import Start, UnitTile, Work  # noqa: E402
 
 WIDTH, HEIGHT, OWN, LEG = 16, 12, 50, 500
 
@@ -73,7 +73,7 @@ def steps(root: Path) -> dict[str, tuple[float, float]]:
     (unit,) = plan.units
     _ = unit.task.digest
     end("hash the input")
-    sent = pickle.dumps(Work.of(unit, Start("", root)).in_tile(TileTask("", 64, (0, 0)), unit.task.indices[:4096]))
+    sent = pickle.dumps(Work.of(unit, Start("", root)).in_tile(UnitTile("", 64, (0, 0)), unit.task.indices[:4096]))
     end(f"pickle a task of 4096 frames: {len(sent) / 1e3:.0f} kB")
     return found
 

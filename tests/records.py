@@ -6,7 +6,7 @@ import numpy as np
 
 from semstab.config import BASE
 from semstab.data.records import Record, Result, Variation
-from semstab.data.results import Unit, UnitSummary
+from semstab.data.results import UnitName, UnitSummary
 from semstab.data.voxels import VoxelTable
 from semstab.metrics import summarise
 
@@ -28,7 +28,7 @@ def voxels(*groups, r=0.2):
 
 def record(table, sweep=BASE, value=None, repeat=0, scene="s", model="m", backend="numpy", **more):
     """The record of a unit that left this map."""
-    unit = Unit(scene, model, backend)
+    unit = UnitName(scene, model, backend)
     summary = UnitSummary(unit, "abc", 4, summarise(table), 10.0, fuse_ms_per_frame=5.0)
     return Record(unit.slug, Variation(sweep, value, repeat), summary, **more)
 

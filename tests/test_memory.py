@@ -33,7 +33,7 @@ def planned(root, **settings) -> tuple[Plan, Config]:
 
 
 def test_the_estimate_holds_for_a_flight_and_saturates_over_one_place(tmp_path) -> None:
-    """From a few pairs of frames; frames that see nothing new add observations only."""
+    """From a sample of frames; frames that see nothing new add observations only."""
     root = tiny_scene.write(tmp_path / "wall", models=("a",), frames=60)
     plan, config = planned(root, voxel_size=0.05, pixel_stride=1)
     table = semstab.run(config, report=False).runs[0].table

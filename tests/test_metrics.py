@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from semstab import backends
 from semstab.data.frames import Frame, Intrinsics
 from semstab.data.measures import ENTROPY, SBD, VSS, margin, measures
-from semstab.data.results import Means, MeasureMeans, Unit
+from semstab.data.results import Means, MeasureMeans, UnitName
 from semstab.data.voxels import VoxelTable
 from semstab.errors import DataError
 from semstab.metrics import (
@@ -276,7 +276,7 @@ def test_flicker_needs_frames_of_one_size():
 
 # --- Agreement --------------------------------------------------------------------------------------------------------
 
-UNITS = (Unit("s", "b", "numpy"), Unit("s", "b", "open3d"))
+UNITS = (UnitName("s", "b", "numpy"), UnitName("s", "b", "open3d"))
 TABLE = voxel_table(op=[1, 2, 4], evidence=[[1, 0], [1, 1], [3, 1]], drift_sum=[0, 0.3, 0.3])
 
 

@@ -21,7 +21,7 @@ from semstab import metrics
 from semstab.core.json_form import to_json
 from semstab.data.measures import ENTROPY, SBD, VSS
 from semstab.data.records import Result
-from semstab.data.results import STAGES, Unit
+from semstab.data.results import STAGES, UnitName
 from semstab.datasets.files import options
 from semstab.engine import Observer, load_result
 from semstab.errors import ConfigError, DataError
@@ -46,13 +46,13 @@ class Watching(Observer):
 
     def run_started(self, plan, finished) -> None:
         self.seen.append(f"start {len(plan.tasks)}")
-        self.seen += [f"kept {each.unit.model}" for each in plan.units if each.identity in finished]
+        self.seen += [f"kept {each.name.model}" for each in plan.units if each.identity in finished]
 
     def frame_fused(self, task, frame, rows) -> None:
         self.seen += [f"{unit.slug} {row.report.frame}" for unit, row in rows.items()]
 
     def unit_finished(self, planned, content, table, error) -> None:
-        self.seen.append(f"{planned.unit.slug} {'failed' if table is None else f'done {len(table)}'}")
+        self.seen.append(f"{planned.name.slug} {'failed' if table is None else f'done {len(table)}'}")
 
     def run_finished(self, result) -> None:
         self.seen.append("finished")
@@ -106,7 +106,7 @@ def test_the_run_folder_holds_what_the_design_promises(root, tmp_path) -> None:
     assert manifest["command"] == ["semstab-bench", "--x"]
     assert set(manifest["inputs"]) == {"wall/a", "wall/b"}
     assert manifest["peak_memory_bytes"] > 1e6
-    unit = Unit("wall", "a", "numpy")
+    unit = UnitName("wall", "a", "numpy")
     voxels = pq.read_table(out / "voxels" / f"{unit.slug}.parquet")
     assert {"ix", "iy", "iz", "op", "vss", "sbd", "entropy", "label", "evidence"} <= set(voxels.column_names)
     table = semstab.VoxelTable.load(out / "voxels" / f"{unit.slug}.parquet")

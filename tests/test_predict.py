@@ -529,8 +529,8 @@ def test_a_study_measures_regions_by_name(scene):
     predict(scene, Tiles(), name="tiles")
     predict(scene, Shifting(), name="thirds")
     grid = make_plan(configure(scene, region_maps=["tiles"]))
-    assert [cell.unit.model for cell in grid.regions] == ["tiles"]
-    assert {cell.unit.model for cell in grid.units} == {"thirds"}
+    assert [cell.name.model for cell in grid.regions] == ["tiles"]
+    assert {cell.name.model for cell in grid.units} == {"thirds"}
 
 
 def test_regions_of_single_images_have_no_camera(scene, tmp_path):

@@ -23,12 +23,12 @@ from semstab.config import Config
 from semstab.data.frames import Frame, Intrinsics
 from semstab.data.labels import LabelSpace
 from semstab.data.measures import measures
-from semstab.data.records import Record, Result, UnitContent, Variation
-from semstab.data.results import Unit, UnitSummary
+from semstab.data.records import Record, Result, Variation
+from semstab.data.results import UnitName, UnitSummary
 from semstab.data.voxels import VoxelTable
 from semstab.engine import Observer
 from semstab.engine.series import FrameRow
-from semstab.engine.units import Plan, PlannedUnit, make_plan
+from semstab.engine.units import Plan, Unit, make_plan
 from semstab.errors import ConfigError, DataError
 from semstab.recording import (
     SERIES,
@@ -415,7 +415,7 @@ class Scene:
 
 
 CLASSES = LabelSpace("abc", ("a", "b", "c"))
-UNIT = Unit(Scene.name, "net/x", "numpy")
+UNIT = UnitName(Scene.name, "net/x", "numpy")
 
 
 def frame(index: int, label: int, at: tuple[float, float, float], timestamp: float | None = None) -> Frame:
@@ -430,9 +430,9 @@ def summary_of(table: VoxelTable) -> UnitSummary:
     return UnitSummary(UNIT, "abc", 3, metrics.summarise(table), math.nan, 1.0)
 
 
-def planned(indices: Sequence[int] = (0,)) -> PlannedUnit:
+def planned(indices: Sequence[int] = (0,)) -> Unit:
     task = Task(Scene(), "net/x", indices, CLASSES.mapping_to(CLASSES), ("numpy",))
-    return PlannedUnit(Variation(), Config(voxel_size=0.25), task, "key", image_space=True, stored=True)
+    return Unit.of(Variation(), Config(voxel_size=0.25), task, "key", image_space=True, stored=True)
 
 
 def record(path: Path | Target, frames: list[Frame], *, finish: bool = True) -> tuple[Recording, VoxelTable]:
@@ -447,8 +447,9 @@ def record(path: Path | Target, frames: list[Frame], *, finish: bool = True) -> 
         watching.frame_fused(task, each, {UNIT: FrameRow(backend.integrate(each), each.timestamp, math.nan)})
     table = backend.table()
     if finish:
-        watching.unit_finished(unit, UnitContent("", summary_of(table)), table, None)
-        watching.run_finished(Result("run", "numpy", (Record("key", Variation(), summary_of(table)),)))
+        kept = Record("key", Variation(), summary_of(table))
+        watching.unit_finished(unit, kept, table, None)
+        watching.run_finished(Result("run", "numpy", (kept,)))
     return watching, table
 
 
@@ -484,7 +485,7 @@ def test_what_goes_wrong_beside_the_loop_is_said_and_the_file_is_closed(tmp_path
 
     monkeypatch.setattr(voxel_maps.VoxelLogger, "finish", fail)
     with pytest.raises(RuntimeError, match="no room"):
-        watching.unit_finished(planned(), UnitContent("", summary_of(table)), table, None)
+        watching.unit_finished(planned(), Record("key", Variation(), summary_of(table)), table, None)
     watching.close()
     verify(path)
     assert set(series(read(path), r"/floor\ 1/series/map_vss/net\/x/numpy")) == {0, 1}

@@ -26,7 +26,7 @@ from semstab import backends, metrics
 from semstab.data.frames import Frame, Intrinsics
 from semstab.data.labels import LabelSpace
 from semstab.data.measures import SBD_MAX
-from semstab.data.results import Unit
+from semstab.data.results import UnitName
 from semstab.engine.units import make_plan
 from semstab.errors import DataError
 from semstab.recording import Recording, camera, color_modes, drift, lacks_pictures, layout, record_finished, voxel_maps
@@ -73,12 +73,14 @@ def test_backends_that_need_not_agree_have_lines_of_their_own(tmp_path, given, s
     (task,) = plan.tasks
     assert layout.drawn(task) == shown
     views = layout._plot("wall", "map_vss", [task])
-    assert views.contents == [entity("map_vss", Unit("wall", "a", backend)) for backend in lines]
+    assert views.contents == [entity("map_vss", UnitName("wall", "a", backend)) for backend in lines]
     watching = Recording(tmp_path / "recording.rrd")
     watching.run_started(plan, {})
-    fused = {Unit("wall", "a", name): backends.create(name, voxel_size=0.25, num_classes=3) for name in task.backends}
+    fused = {
+        UnitName("wall", "a", name): backends.create(name, voxel_size=0.25, num_classes=3) for name in task.backends
+    }
     watching.group_started(dataclasses.replace(task, apart=()), config, fused)
-    assert watching._fused is fused[Unit("wall", "a", shown)]
+    assert watching._fused is fused[UnitName("wall", "a", shown)]
 
 
 def frames_of(config: Any) -> list[Frame]:

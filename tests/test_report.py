@@ -19,7 +19,7 @@ from wall_study import CLASSES, drawn_walls, wall_study
 from semstab.config import BASE, SHARED
 from semstab.data.measures import dominant
 from semstab.data.records import Failure, Variation
-from semstab.data.results import Agreement, Unit
+from semstab.data.results import Agreement, UnitName
 from semstab.metrics import categories, vss
 from semstab.report import write_report
 from semstab.report.figures.topdown import EMPTY, FromAbove
@@ -72,7 +72,7 @@ def page_of(result, folder):
 def walls(tmp_path_factory):
     """The study with both walls, one model, its figures, and a failure."""
     calm, folder, _ = drawn_walls(tmp_path_factory.getbasetemp())
-    failure = Failure(Unit("often", "calm", "numpy"), Variation("voxel_size", 0.001), f"out of memory {EVIL}")
+    failure = Failure(UnitName("often", "calm", "numpy"), Variation("voxel_size", 0.001), f"out of memory {EVIL}")
     result = dataclasses.replace(calm, failures=(failure,))
     return result, folder, page_of(result, folder)
 
@@ -198,7 +198,7 @@ def test_a_study_of_sweeps_has_their_charts_and_one_in_which_everything_failed_h
     result = study(*(record(voxels((5, 4, SURE)), "frame_count", n) for n in (5, 9)), record(voxels((5, 2, SURE))))
     page = page_of(result, tmp_path)
     assert "VSS, OP ≥ 3 by temporal sampling, frames" in {attributes["aria-label"] for attributes in page.all("svg")}
-    failure = Failure(Unit("s", "m", "numpy"), Variation(BASE), "no depth")
+    failure = Failure(UnitName("s", "m", "numpy"), Variation(BASE), "no depth")
     page = page_of(study(failures=(failure,)), tmp_path)
     assert "there are no results yet" in page.text
     assert "no depth" in page.text

@@ -20,12 +20,13 @@ from semstab.api import run_study
 from semstab.config import BACKENDS, Config
 from semstab.core.json_form import to_json
 from semstab.data.records import Variation
+from semstab.data.results import UnitName
 from semstab.datasets.files.scene import FileScene
 from semstab.engine import load_result
 from semstab.engine.folder import Folder
 from semstab.engine.frame_loop import run_job
-from semstab.engine.messages import Start, Work, jobs_of
-from semstab.engine.units import make_plan
+from semstab.engine.units import Unit, make_plan
+from semstab.engine.work import Start, Work, jobs_of
 from semstab.errors import ConfigError, DataError
 from semstab.metrics import SelfConsistency, VideoConsistency, compare, compensated_flicker, flicker_percent, summarise
 from semstab.settings import resolve
@@ -85,9 +86,9 @@ def test_the_grid_goes_through_every_sweep_scene_and_model(root) -> None:
     noisy = [cell.config.perturbation for cell in cells if cell.variation.value == 0.05]
     assert [(noise.depth_noise, noise.seed) for noise in noisy] == [(0.05, 7), (0.05, 7), (0.05, 8), (0.05, 8)]
     counted = [cell for cell in cells if cell.variation.sweep == "frame_count"]
-    assert [(cell.unit.model, len(cell.task.indices)) for cell in counted] == [("a", 5), ("a", 10)]
+    assert [(cell.name.model, len(cell.task.indices)) for cell in counted] == [("a", 5), ("a", 10)]
     assert counted[0].task.indices == [0, 2, 4, 7, 9]
-    assert [cell.unit.backend for cell in cells if cell.variation.sweep == BACKENDS] == ["numba", "numba"]
+    assert [cell.name.backend for cell in cells if cell.variation.sweep == BACKENDS] == ["numba", "numba"]
 
 
 def test_a_point_at_the_base_settings_is_the_base_unit(finished) -> None:
@@ -428,10 +429,10 @@ def test_a_worker_that_does_not_see_the_folder_sends_the_voxels_back_and_a_job_f
     plan = make_plan(config)
     (cell,) = plan.units
     elsewhere = tmp_path / "elsewhere"
-    (outcome,) = run_job((Work.of(cell, Start("start", elsewhere)),))
+    (done,) = run_job((Work.of(cell, Start("start", elsewhere)),))
     assert not elsewhere.exists()
     folder = Folder(tmp_path / "out", plan)
-    folder.save(outcome)
+    folder.save(done)
     folder.close()
     counting = Counting()
     result = run_study(config, tmp_path / "out", observers=[counting], report=False)
@@ -439,19 +440,20 @@ def test_a_worker_that_does_not_see_the_folder_sends_the_voxels_back_and_a_job_f
     assert summarise(result.select()[0].table()) == result.select()[0].summary.table
     config = resolve(configure(root, sweeps={"voxel_size": [0.5]}, backends=["numpy"], models=["a"]))
     start = Start("start", tmp_path)
-    works = [dataclasses.replace(Work.of(cell, start), scene="hall") for cell in make_plan(config).units]
-    outcomes = [*run_job(tuple(works))]
-    assert [outcome.error for outcome in outcomes] == [outcomes[0].error] * 2
-    assert "scene 'hall' is not there" in outcomes[0].error
+    units = [dataclasses.replace(unit, name=UnitName("hall", "a", "numpy")) for unit in make_plan(config).units]
+    errors = [work.error for work in run_job(tuple(Work.of(unit, start) for unit in units))]
+    assert errors == [errors[0]] * 2
+    assert "scene 'hall' is not there" in errors[0]
 
 
 def works(model: str, identities: str, kept: str = "") -> list[Work]:
-    start = Start("", Path())
-    return [Work(start, "s", model, name, Config(), stored=name in kept) for name in identities]
+    name, start = UnitName("s", model, "numpy"), Start("", Path())
+    units = [Unit(name, Variation(), Config(), None, each, stored=each in kept) for each in identities]
+    return [Work(start, unit, range(1)) for unit in units]
 
 
 def names(job: tuple[Work, ...]) -> str:
-    return "".join(work.identity for work in job)
+    return "".join(work.unit.identity for work in job)
 
 
 def test_jobs_are_halved_until_every_worker_has_one_and_watched_works_stay_in_one() -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import dataclasses
 import json
 import os
 import signal
@@ -16,9 +17,9 @@ from tiny_study import Counting, summary
 
 from semstab.api import run_study
 from semstab.engine import DaskCluster, LocalProcesses
-from semstab.engine.messages import Start, Work
 from semstab.engine.observer import Observers
 from semstab.engine.units import make_plan
+from semstab.engine.work import Start, Work
 from semstab.errors import ConfigError, MissingDependencyError
 
 MODELS = ("a", "b", "c", "d")
@@ -103,25 +104,25 @@ def test_a_job_that_kills_its_process_fails_and_the_others_finish(root, tmp_path
     config = tiny_study.configure(root, sweeps={}, backends=["numpy"], models=["a", "b"])
     start = Start("start", tmp_path)
     fine = [Work.of(cell, start) for cell in make_plan(config).units]
-    jobs = iter([(fine[0],), (Deadly(start, "wall", "x", "deadly", config),), *((work,) for work in fine[1:])])
-    outcomes = {each.identity: each for each in LocalProcesses(1).run(lambda: next(jobs, None), Observers([]))}
-    assert len(outcomes) == 3
-    assert outcomes["deadly"].error.startswith("its process was killed, perhaps because memory ran out")
-    assert [outcomes[work.identity].error for work in fine] == [None] * 2
+    deadly = Deadly(start, dataclasses.replace(fine[0].unit, identity="deadly"), range(1))
+    jobs = iter([(fine[0],), (deadly,), *((work,) for work in fine[1:])])
+    done = {each.unit.identity: each for each in LocalProcesses(1).run(lambda: next(jobs, None), Observers([]))}
+    assert len(done) == 3
+    assert done["deadly"].error.startswith("its process was killed, perhaps because memory ran out")
+    assert [done[work.unit.identity].error for work in fine] == [None] * 2
 
 
 def test_worker_processes_end_with_a_parent_that_was_killed(tmp_path) -> None:
     (tmp_path / "parent.py").write_text(
         "import pathlib\n"
-        "from semstab.config import Config\n"
         "from semstab.engine import LocalProcesses\n"
         "from semstab.engine.observer import Observers\n"
-        "from semstab.engine.messages import Start, Work\n"
+        "from semstab.engine.work import Start, Work\n"
         "class Endless(Work):\n"
         "    def __reduce__(self):\n"
         "        return exec, ('import pathlib, time; pathlib.Path(\"at work\").touch(); time.sleep(600)',)\n"
         "if __name__ == '__main__':\n"
-        "    jobs = iter([(Endless(Start('start', pathlib.Path('out')), 'wall', 'a', 'endless', Config()),)])\n"
+        "    jobs = iter([(Endless(Start('start', pathlib.Path('out')), None, range(1)),)])\n"
         "    list(LocalProcesses(1).run(lambda: next(jobs, None), Observers([])))\n"
     )
     with subprocess.Popen([sys.executable, "parent.py"], cwd=tmp_path) as parent:
@@ -198,7 +199,7 @@ def test_a_dask_cluster_gives_the_same_numbers_though_a_worker_is_killed(
 
     monkeypatch.setattr("semstab.engine.executors.CONNECT_SECONDS", 1)  # after which it is given up
     executor = DaskCluster(address)
-    jobs = iter([(Work(Start("start", tmp_path), "nowhere", "none", "x", config),)] * 9)
+    jobs = iter([(Work.of(make_plan(config).units[0], Start("start", tmp_path)),)] * 9)
     finished = executor.run(lambda: next(jobs, None), Observers([]))
     next(finished)
     scheduler.kill()

@@ -59,7 +59,7 @@ class Counting(Observer):
 
     def unit_finished(self, cell, content, table, error) -> None:
         value = cell.variation.value
-        what = f"{cell.unit.slug} {cell.variation.sweep} {value if value is None else f'{value:g}'}"
+        what = f"{cell.name.slug} {cell.variation.sweep} {value if value is None else f'{value:g}'}"
         (self.computed if error is None else self.failed).append(what)
 
 

@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 T = TypeVar("T")
 
 INLINE: Mapping[str, bool] = types.MappingProxyType({"inline": True})
-"""Metadata of a field whose own fields stand among those of its parent: `unit: Unit = field(metadata=INLINE)`."""
+"""Metadata of a field whose own fields stand among those of its parent: `unit: UnitName = field(metadata=INLINE)`."""
 
 LONGEST = 150
 """Characters at most of a field's name in a message, and of the problem."""

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -18,7 +18,7 @@ from semstab.data.contrast import ModelComparison
 from semstab.data.display import as_figure
 from semstab.data.georeference import Georeference
 from semstab.data.measures import measures
-from semstab.data.results import Agreement, Unit, UnitSummary, VoxelAdvice
+from semstab.data.results import Agreement, UnitName, UnitSummary, VoxelAdvice
 from semstab.data.statistics import UNKNOWN, MapStatistics
 from semstab.data.voxels import VoxelTable
 from semstab.errors import ConfigError
@@ -184,7 +184,7 @@ class FrameQuality:
 
 @dataclass(frozen=True)
 class Record:
-    """One finished unit.
+    """What is kept of one finished unit: its numbers, and where its files are.
 
     Attributes:
         key: Hash of its inputs and settings, under which it is stored.
@@ -196,6 +196,13 @@ class Record:
         voxels_file: File of its voxel table, or the folder of its tiles, for the 'base' and 'backends' units; None
             elsewhere.
         truth_file: File of the ground truth's voxels of the same frames, where the statistics fused it.
+        input: Digest of its input. This and what follows stand in the unit's own file alone: a result that is loaded
+            from its folder has them for all units together.
+        up: The scene's up axis, where it is known or could be estimated.
+        files: Digests of the unit's other files, by their path in the folder.
+        checked: Agreement with the reference on a sample of its voxels, where it was checked so.
+        advice: Advice on its voxel size, where that was assessed.
+        notes: Remarks of the check on its depth and labels, which look wrong but may be right.
     """
 
     key: str
@@ -206,6 +213,12 @@ class Record:
     video_measures: VideoMeasures | None = None
     voxels_file: Path | None = None
     truth_file: Path | None = None
+    input: str = ""
+    up: tuple[float, float, float] | None = None
+    files: Mapping[str, str] = field(default_factory=dict)
+    checked: Agreement | None = None
+    advice: VoxelAdvice | None = None
+    notes: tuple[str, ...] = ()
 
     def __repr__(self) -> str:
         sweep, value = self.variation.sweep, self.variation.value
@@ -218,9 +231,13 @@ class Record:
         return self.summary.statistics
 
     @property
-    def unit(self) -> Unit:
+    def unit(self) -> UnitName:
         """Its scene, model and backend."""
         return self.summary.unit
+
+    def without_own(self) -> Record:
+        """Return it without what stands in the unit's own file alone."""
+        return replace(self, input="", up=None, files={}, checked=None, advice=None, notes=())
 
     def table(self) -> VoxelTable:
         """Return its voxels, read from their file."""
@@ -286,7 +303,8 @@ class RegionFlicker:
     """Flicker of a label source that holds regions without classes, by matched regions; it is not fused.
 
     The percentages are means over pairs of sampled frames, see `semstab.metrics.matched_region_flicker`; compensated:
-    after the previous map is warped by depth and pose. compensated_share is that of `ImageSpace`.
+    after the previous map is warped by depth and pose. compensated_share is that of `ImageSpace`; input is the digest
+    of what it was measured on.
     """
 
     scene: str
@@ -294,40 +312,18 @@ class RegionFlicker:
     flicker_percent: float
     compensated_flicker_percent: float
     compensated_share: float
+    input: str = ""
 
 
-@dataclass(frozen=True)
-class UnitContent:
-    """The content of a finished unit's file, from which its record comes.
-
-    Attributes:
-        input: Digest of its input.
-        up: The scene's up axis, where it is known or could be estimated.
-        files: Digests of the unit's other files, by their path in the folder.
-        regions: Series of a source of regions, instead of a summary.
-        advice: Advice on its voxel size, where that was assessed.
-        notes: Remarks of the check on its depth and labels, which look wrong but may be right.
-        checked: Agreement with the reference on a sample of its voxels, where it was checked so.
-    """
-
-    input: str
-    summary: UnitSummary | None = None
-    image_space: ImageSpace | None = None
-    quality: FrameQuality | None = None
-    video_measures: VideoMeasures | None = None
-    up: tuple[float, float, float] | None = None
-    files: Mapping[str, str] = field(default_factory=dict)
-    regions: RegionFlicker | None = None
-    checked: Agreement | None = None
-    advice: VoxelAdvice | None = None
-    notes: tuple[str, ...] = ()
+OF_THE_UNIT = ("input", "up", "files", "checked", "advice", "notes")
+"""Fields of a record that stand in the unit's own file alone, not in summary.json."""
 
 
 @dataclass(frozen=True)
 class Failure:
     """A unit that could not be computed, and the one line that says why."""
 
-    unit: Unit = field(metadata=INLINE)
+    unit: UnitName = field(metadata=INLINE)
     variation: Variation
     message: str
 

@@ -30,7 +30,7 @@ RECURRENT = 3
 
 
 @dataclass(frozen=True)
-class Unit:
+class UnitName:
     """One cell of a run: a model's labels on a scene, fused by a backend."""
 
     scene: str
@@ -41,6 +41,11 @@ class Unit:
     def slug(self) -> str:
         """SCENE__MODEL__BACKEND, usable as a file name."""
         return slug(self.scene, self.model, self.backend)
+
+    @property
+    def stated(self) -> str:
+        """SCENE · MODEL · BACKEND, for people."""
+        return f"{self.scene} · {self.model} · {self.backend}"
 
 
 def slug(*names: str) -> str:
@@ -181,7 +186,7 @@ class UnitSummary:
     the voxel size would give another result; reduced is there for soft scores.
     """
 
-    unit: Unit = field(metadata=INLINE)
+    unit: UnitName = field(metadata=INLINE)
     taxonomy: str
     frames: int
     table: TableSummary = field(metadata=INLINE)

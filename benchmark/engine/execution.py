@@ -15,16 +15,16 @@ from semstab.check import Verdict, advise, quick_sample, refuse_unsound, with_in
 from semstab.check.scene_notes import scene_notes
 from semstab.config import Config
 from semstab.core.process import trim_malloc
-from semstab.data.records import Result
+from semstab.data.records import Record, Result
 from semstab.engine.executors import Executor, InProcess
 from semstab.engine.folder import Folder, require_file_names
 from semstab.engine.frame_loop import share_open_scenes
 from semstab.engine.memory import planned_sizes
-from semstab.engine.messages import Job, Outcome, Start, Work, jobs_of
 from semstab.engine.observer import Observer, Observers
 from semstab.engine.run_result import UnitResults, advice_of, manifest, result_of
 from semstab.engine.tiled_units import TiledUnit
-from semstab.engine.units import Plan, PlannedUnit, make_plan
+from semstab.engine.units import Plan, Unit, make_plan
+from semstab.engine.work import Job, Start, Work, jobs_of
 from semstab.errors import ConfigError, DataError
 from semstab.settings import resolve
 from semstab.task import open_scenes
@@ -63,21 +63,21 @@ def execute(
         scenes = open_scenes(config, out.absolute())
     config, advice = with_voxel_size(config, scenes)
     plan = make_plan(config, scenes)
-    require_file_names(out, (each.unit for each in plan.units))
+    require_file_names(out, (unit.name for unit in plan.units))
     folder = Folder(out, plan, overwrite=overwrite)
     try:
         execution = _Execution(plan, folder, executor, telling, gaps)
         with folder.started(config) as start, share_open_scenes(start.name, plan.scenes):
             execution.begin(start)
-            with contextlib.closing(executor.run(execution.next_job, telling)) as outcomes:
-                for outcome in itertools.chain(execution.ended, outcomes):
-                    execution.take(outcome)
+            with contextlib.closing(executor.run(execution.next_job, telling)) as works:
+                for work in itertools.chain(execution.ended, works):
+                    execution.take(work)
         units = execution.units
-        units.advice = advice or advice_of(plan, units.contents)
+        units.advice = advice or advice_of(plan, units.records)
         result = result_of(plan, folder, units)
         units.watch.seconds["all"] = time.perf_counter() - started
         result = dataclasses.replace(result, manifest=manifest(plan, units, executor.name, command))
-        folder.save_result(result, units.contents.values())
+        folder.save_result(result, units.finished())
         telling.tell(lambda observer: observer.run_finished(result))
     finally:
         folder.close()
@@ -91,7 +91,7 @@ class _Execution:
 
     Attributes:
         units: What is known of each unit so far.
-        ended: Outcomes of tiled units that an earlier start computed and did not store.
+        ended: Tiled units that an earlier start computed and did not store.
     """
 
     def __init__(
@@ -101,14 +101,14 @@ class _Execution:
         self._gaps = gaps
         self.units = units = UnitResults()
         with units.watch("digest"):
-            there = ((key, folder.finished(each)) for key, each in plan.distinct().items())
-            units.contents = {key: content for key, content in there if content is not None}
-        units.finished_before, finished = len(units.contents), dict(units.contents)
-        self._missing = {each.identity: each for each in plan.distinct().values() if each.identity not in finished}
+            stored = ((key, folder.finished(unit)) for key, unit in plan.distinct().items())
+            units.records = {key: record for key, record in stored if record is not None}
+        units.finished_before, finished = len(units.records), dict(units.records)
+        self._missing = {key: unit for key, unit in plan.distinct().items() if key not in finished}
         if self._missing:
             folder.remove_outputs()
         observers.tell(lambda observer: observer.run_started(plan, finished))
-        self._queue, self._tiled, self.ended = deque[Job](), dict[str, TiledUnit](), list[Outcome]()
+        self._queue, self._tiled, self.ended = deque[Job](), dict[str, TiledUnit](), list[Work]()
         if plan.config.check_geometry:
             with units.watch("check"):
                 self._check_geometry(plan.config, [*self._missing.values()])
@@ -121,60 +121,65 @@ class _Execution:
         for line in sizing.lines:
             logger.warning("%s", line)
         whole = list[Work]()
-        for each in self._missing.values():
-            if (error := sizing.refused.get(each.identity)) is not None:
-                self._keep(each, Outcome(each.identity, error=error, cause=ConfigError(error)))
-            elif (size := sizing.tile_sizes.get(each.identity)) is not None:
-                self._tiled[each.identity] = TiledUnit(each, size, self._folder, start)
+        for key, unit in self._missing.items():
+            if (error := sizing.refused.get(key)) is not None:
+                self._keep(Work.of(unit, start).failed(ConfigError(error)))
+            elif (size := sizing.tile_sizes.get(key)) is not None:
+                self._tiled[key] = TiledUnit(unit, size, self._folder, start)
             else:
-                whole.append(Work.of(each, start))
+                whole.append(Work.of(unit, start))
         self._queue = deque(jobs_of(whole, self._executor.width))
-        self.ended = [outcome for unit in self._tiled.values() if (outcome := unit.ended()) is not None]
+        self.ended = [work for tiled in self._tiled.values() if (work := tiled.ended()) is not None]
 
     def next_job(self) -> Job | None:
-        """Return the next job; None where there is none until outcomes that are taken call for more."""
+        """Return the next job; None where there is none until works that are taken call for more."""
         if self._queue:
             return self._queue.popleft()
         return next(filter(None, (unit.next_job() for unit in self._tiled.values())), None)
 
-    def take(self, outcome: Outcome) -> None:
-        """Store the outcome of a unit, or of a tile."""
-        own: Outcome | None = outcome
-        unit = self._tiled.get(outcome.identity)
-        if unit is not None and outcome.tile is not None:
-            self.units.add_seconds(outcome)
-            with self.units.watch("assemble"):
-                own = unit.take(outcome)
-            step, name = unit.step(), unit.name
-            self._observers.tell(lambda observer: observer.advanced(step, name))
-        if own is not None:
-            self._keep(self._missing[own.identity], own, in_tiles=unit is not None)
+    def take(self, work: Work) -> None:
+        """Store a unit or a tile that a worker gave back."""
+        tiled = self._tiled.get(work.unit.identity)
+        if tiled is None or work.tile is None:
+            self._keep(work)
+            return
+        self.units.add_seconds(work)
+        with self.units.watch("assemble"):
+            whole = tiled.take(work)
+        step, name = tiled.step(), tiled.name
+        self._observers.tell(lambda observer: observer.advanced(step, name))
+        if whole is not None:
+            self._keep(whole)
 
-    def _keep(self, each: PlannedUnit, outcome: Outcome, *, in_tiles: bool = False) -> None:
-        units, folder, content = self.units, self._folder, outcome.content
-        if content is not None:
-            unit = each.unit
-            advice, notes = units.advice.get(unit.scene), units.notes.get((unit.scene, unit.model), ())
-            content = dataclasses.replace(content, advice=advice, notes=notes)
-            with units.watch("keep"):
-                folder.save(dataclasses.replace(outcome, content=content))
-                folder.clear(each, content.files)
-            units.contents[outcome.identity] = content
+    def _keep(self, work: Work) -> None:
+        """Store a whole unit, or why there is none, and tell the observers."""
+        units, folder, record = self.units, self._folder, work.record
+        unit = self._missing[work.unit.identity]  # a worker gives it back without its task
+        if record is None:
+            error = units.errors[unit.identity] = work.error or ""
+            folder.save_trace(work)
+            if work.cause is not None:
+                units.causes.setdefault(error, work.cause)
         else:
-            error = units.errors[outcome.identity] = outcome.error or ""
-            folder.save_trace(outcome)
-            if outcome.cause is not None:
-                units.causes.setdefault(error, outcome.cause)
-        if not in_tiles:
-            units.add_seconds(outcome)
-            if self._executor.elsewhere or each.regions:
-                name = f"{each.unit.scene} · {each.unit.model}"
-                self._observers.tell(lambda observer: observer.advanced(each.frames, name))
-        self._observers.tell(lambda observer: observer.unit_finished(each, content, outcome.table, outcome.error))
+            if isinstance(record, Record):
+                scene, model = unit.name.scene, unit.name.model
+                advice, notes = units.advice.get(scene), units.notes.get((scene, model), ())
+                record = dataclasses.replace(record, advice=advice, notes=notes)
+            with units.watch("keep"):
+                folder.save(dataclasses.replace(work, record=record))
+                if isinstance(record, Record):
+                    folder.clear(unit, record.files)
+            units.records[unit.identity] = record
+        if unit.identity not in self._tiled:
+            units.add_seconds(work)
+            if self._executor.elsewhere or unit.regions:
+                frames, name = len(unit.task.indices), f"{unit.name.scene} · {unit.name.model}"
+                self._observers.tell(lambda observer: observer.advanced(frames, name))
+        self._observers.tell(lambda observer: observer.unit_finished(unit, record, work.table, work.error))
 
-    def _check_geometry(self, config: Config, missing: Sequence[PlannedUnit]) -> None:
+    def _check_geometry(self, config: Config, missing: Sequence[Unit]) -> None:
         """Check the geometry and the voxel size of each scene of missing units; those report errors of reading."""
-        fused = {(each.unit.scene, each.unit.model): each.task for each in reversed(missing) if not each.regions}
+        fused = {(unit.name.scene, unit.name.model): unit.task for unit in reversed(missing) if not unit.regions}
         tasks = {scene: task for (scene, _), task in fused.items()}
         verdicts: dict[str, Verdict] = {}
         for task in reversed(tasks.values()):

@@ -17,8 +17,8 @@ from typing import Any
 from semstab.core.prefetch import default_threads
 from semstab.core.process import configure_process, follow_parent
 from semstab.engine.frame_loop import run_job
-from semstab.engine.messages import Job, Outcome, failed
 from semstab.engine.observer import Observers
+from semstab.engine.work import Job, Work
 from semstab.errors import ConfigError, MissingDependencyError
 
 CONNECT_SECONDS = 10
@@ -27,9 +27,9 @@ AWAY = OSError, RuntimeError, AttributeError
 
 LOST = "the scheduler does not answer any more; start it again, and the same command continues from the finished units"
 
-Future = cf.Future[tuple[Outcome, ...]]
+Future = cf.Future[Job]
 NextJob = Callable[[], Job | None]
-"""A function that gives the next job; None where there is none until outcomes that were yielded call for more."""
+"""A function that gives the next job; None where there is none until works that were yielded call for more."""
 
 
 class Executor:
@@ -39,8 +39,8 @@ class Executor:
     width = 1
     elsewhere = False
 
-    def run(self, next_job: NextJob, observers: Observers) -> Generator[Outcome, None, None]:
-        """Yield outcomes as works finish, in any order. Closing the iterator stops the rest.
+    def run(self, next_job: NextJob, observers: Observers) -> Generator[Work, None, None]:
+        """Yield works as they finish, in any order. Closing the iterator stops the rest.
 
         A job is taken when there is somebody to do it. `observers` see the work that is done in this very process.
         """
@@ -55,7 +55,7 @@ class InProcess(Executor):
 
     name = "in this process"
 
-    def run(self, next_job: NextJob, observers: Observers) -> Generator[Outcome, None, None]:
+    def run(self, next_job: NextJob, observers: Observers) -> Generator[Work, None, None]:
         """Run them in order."""
         while (job := next_job()) is not None:
             yield from run_job(job, observers)
@@ -72,8 +72,8 @@ class LocalProcesses(Executor):
         self.width = jobs
         self.name = f"{jobs} local processes"
 
-    def run(self, next_job: NextJob, observers: Observers) -> Generator[Outcome, None, None]:
-        """Yield outcomes as jobs finish.
+    def run(self, next_job: NextJob, observers: Observers) -> Generator[Work, None, None]:
+        """Yield works as jobs finish.
 
         If a process dies, its job is not known: those that were running are run again, one by one. The job
         whose process dies then fails, and the others finish.
@@ -88,9 +88,9 @@ class LocalProcesses(Executor):
                     yield from self._run(begun, lambda: None, 1)
                 except BrokenProcessPool:
                     text = "its process was killed, perhaps because memory ran out; try fewer jobs, or larger voxels"
-                    yield from failed(begun.pop(0), text)
+                    yield from (work.failed(text) for work in begun.pop(0))
 
-    def _run(self, begun: list[Job], next_job: NextJob, width: int) -> Generator[Outcome, None, None]:
+    def _run(self, begun: list[Job], next_job: NextJob, width: int) -> Generator[Work, None, None]:
         """Run the jobs that were begun before, then the next ones; begun stay those that are not finished."""
         waiting = [*begun]
 
@@ -113,9 +113,9 @@ class LocalProcesses(Executor):
         try:
             _check_start(pool)
             for future, job in _ended(take, lambda job: pool.submit(_run_all, job), lambda: width):
-                outcomes = future.result()
+                works = future.result()
                 begun[:] = [each for each in begun if each is not job]
-                yield from outcomes
+                yield from works
             pool.shutdown()
         finally:
             alive.close()  # ends processes that are still at work: after an interruption, or where one of them died
@@ -127,7 +127,7 @@ def _ended(
 ) -> Generator[tuple[Future, Job], None, None]:
     """Yield each job that ended, and its future; as many are submitted as can run at once.
 
-    The next ones are submitted before one is yielded: nobody waits for whoever takes its outcomes.
+    The next ones are submitted before one is yielded: nobody waits for whoever takes its works.
     """
     jobs = dict[Future, Job]()
 
@@ -153,7 +153,7 @@ def _with_start(job: Job, **changes: Any) -> Job:
     return tuple(dataclasses.replace(work, start=start) for work in job)
 
 
-def _run_all(job: Job) -> tuple[Outcome, ...]:
+def _run_all(job: Job) -> Job:
     return tuple(run_job(job))
 
 
@@ -204,8 +204,8 @@ class DaskCluster(Executor):
         self.width = self._threads() or 1
         self.name = f"Dask, {self.width} threads"
 
-    def run(self, next_job: NextJob, observers: Observers) -> Generator[Outcome, None, None]:
-        """Yield outcomes as jobs finish. The scheduler gives the job of a worker that died to another one.
+    def run(self, next_job: NextJob, observers: Observers) -> Generator[Work, None, None]:
+        """Yield works as jobs finish. The scheduler gives the job of a worker that died to another one.
 
         There are never more at the scheduler than its workers have threads, so that whoever is free has the next one.
 
@@ -222,13 +222,13 @@ class DaskCluster(Executor):
 
         for future, job in _ended(take, lambda job: pool.submit(_run_settled, job), self._threads):
             if future.cancelled():
-                yield from failed(job, LOST)
+                yield from (work.failed(LOST) for work in job)
                 continue
             try:
-                outcomes = future.result()
+                works = future.result()
             except Exception as error:  # noqa: BLE001 - any error of a job on the cluster
-                outcomes = tuple(failed(job, error))
-            yield from outcomes
+                works = tuple(work.failed(error) for work in job)
+            yield from works
         if take() is not None:
             raise ConfigError(LOST)
 
@@ -262,7 +262,7 @@ class DaskCluster(Executor):
                 )
 
 
-def _run_settled(job: Job) -> tuple[Outcome, ...]:
+def _run_settled(job: Job) -> Job:
     """Run a job in a worker of the cluster, with as many threads as are its own.
 
     A worker runs a job in each of its threads at once: frames are decoded in turn unless `threads` is set.

@@ -5,7 +5,7 @@ from __future__ import annotations
 import contextlib
 import dataclasses
 import glob
-import hashlib
+import itertools
 import logging
 import os
 import shutil
@@ -35,6 +35,7 @@ from semstab.data.records import (
     EVENTS,
     FRAMES,
     OBSERVATIONS,
+    OF_THE_UNIT,
     OVERVIEW,
     SUMS,
     TRUTH,
@@ -42,12 +43,12 @@ from semstab.data.records import (
     VOXELS,
     ImageSpace,
     Record,
+    RegionFlicker,
     Result,
-    UnitContent,
 )
-from semstab.data.results import SCHEMA, Unit, slug
-from semstab.engine.messages import TILES, Outcome, Start
-from semstab.engine.units import Plan, PlannedUnit
+from semstab.data.results import SCHEMA, UnitName, slug
+from semstab.engine.units import Plan, Unit, unit_key
+from semstab.engine.work import TILES, Start, Work
 from semstab.errors import ConfigError, DataError
 
 logger = logging.getLogger("semstab")
@@ -98,11 +99,11 @@ def _holds_run(folder: Path) -> bool:
         return lines.readline(200).startswith(LAYOUT.rstrip("0123456789"))
 
 
-def require_file_names(out: Path, units: Iterable[Unit]) -> None:
+def require_file_names(out: Path, units: Iterable[UnitName]) -> None:
     """Raise ConfigError where two units' files would share a name, or one is too long for the file system."""
     there = next(folder for folder in (out.absolute(), *out.absolute().parents) if folder.is_dir())
     longest = os.pathconf(there, "PC_NAME_MAX") - len(".parquet")
-    named: dict[str, Unit] = {}
+    named: dict[str, UnitName] = {}
     for unit in units:
         other = named.setdefault(unit.slug, unit)
         if other != unit:
@@ -146,7 +147,7 @@ class Folder:
         if same_dataset:
             return any(name.startswith(each.identity) for name in self._files for each in units)
         with contextlib.suppress(DataError):
-            return any(unit_key(each.identity, each.task.digest) in self._files for each in units)
+            return any(each.key in self._files for each in units)
         return False
 
     def remove_outputs(self) -> None:
@@ -160,41 +161,45 @@ class Folder:
         """Let another process have it."""
         self._lock.release()
 
-    def finished(self, planned: PlannedUnit) -> UnitContent | None:
+    def finished(self, unit: Unit) -> Record | RegionFlicker | None:
         """Return a unit that an earlier start finished, if its input is the same and all that is wanted is there."""
-        if not any(name.startswith(planned.identity) for name in self._files):
+        if not any(name.startswith(unit.identity) for name in self._files):
             return None
         try:
-            file = self._files.get(unit_key(planned.identity, planned.task.digest))
+            file = self._files.get(unit.key)
         except DataError:
             return None  # the input cannot be read: computing the unit will report it
+        if file is None:
+            return None
         try:
-            content = None if file is None else from_json(UnitContent, read_json(file), file)
+            if unit.regions:
+                return from_json(RegionFlicker, read_json(file), file)
+            record = from_json(Record, read_json(file), file)
         except DataError:
             logger.warning("%s: damaged; the unit is computed again", file)
             return None
-        return content if content is not None and self._is_whole(planned, content) else None
+        return record if self._is_whole(unit, record) else None
 
-    def save(self, outcome: Outcome) -> None:
+    def save(self, work: Work) -> None:
         """Store a finished unit."""
-        assert outcome.content is not None
-        self.save_files(outcome)
-        key = unit_key(outcome.identity, outcome.content.input)
-        write_json(self.path / UNITS / f"{key}.json", outcome.content)
+        assert work.record is not None
+        self.save_files(work)
+        key = unit_key(work.unit.identity, work.record.input)
+        write_json(self.path / UNITS / f"{key}.json", work.record)
         shutil.rmtree(self.path / TILES / key, ignore_errors=True)
         with contextlib.suppress(OSError):
             (self.path / TILES).rmdir()  # where nothing of other units is left
 
-    def save_files(self, outcome: Outcome) -> None:
+    def save_files(self, work: Work) -> None:
         """Write what a worker that does not see the folder sent; the last file says that the others are there."""
-        for name, file in outcome.files.items():
+        for name, file in work.files.items():
             with atomic_path(self.path / name) as temporary:
                 temporary.write_bytes(file)
 
-    def clear(self, planned: PlannedUnit, keep: Collection[str]) -> None:
+    def clear(self, unit: Unit, keep: Collection[str]) -> None:
         """Remove what was left of a unit's voxels, truth and log, a file or tiles, but for these files."""
-        slug = planned.unit.slug
-        for name in (VOXELS, TRUTH, EVENTS) if planned.stored else ():
+        slug = unit.name.slug
+        for name in (VOXELS, TRUTH, EVENTS) if unit.stored else ():
             tiles = self.path.glob(f"{name}/{glob.escape(slug)}/*.parquet")
             for file in (self.path / f"{name}/{slug}.parquet", *tiles):
                 if file.relative_to(self.path).as_posix() not in keep:
@@ -202,36 +207,34 @@ class Folder:
             with contextlib.suppress(OSError):
                 (self.path / name / slug).rmdir()  # where it is empty
 
-    def save_trace(self, outcome: Outcome) -> None:
+    def save_trace(self, work: Work) -> None:
         """Add where a unit's error was raised to failures.log of this start."""
-        if outcome.trace:
+        if work.trace:
             with (self.path / FAILURES).open("a", encoding="utf-8") as log:
-                log.write(f"{outcome.error}\n{outcome.trace}\n")
+                log.write(f"{work.error}\n{work.trace}\n")
 
-    def record(self, planned: PlannedUnit, content: UnitContent) -> Record:
-        """Return the record of a unit from the content of its file."""
-        assert content.summary is not None
-        suffix = "" if _in_tiles(planned.unit, content) else ".parquet"
-        voxels, truth = (f"{name}/{planned.unit.slug}{suffix}" for name in (VOXELS, TRUTH))
-        has_truth = any(name.startswith(truth) for name in content.files)
-        return Record(
-            key=unit_key(planned.identity, content.input),
-            variation=planned.variation,
-            summary=content.summary,
-            image_space=(content.image_space or ImageSpace()) if planned.image_space else ImageSpace(),
-            quality=content.quality if planned.image_space else None,
-            video_measures=content.video_measures if planned.image_space else None,
-            voxels_file=self.path / voxels if planned.stored else None,
-            truth_file=self.path / truth if planned.image_space and has_truth else None,
+    def record(self, unit: Unit, record: Record) -> Record:
+        """Return the record of a unit as a result has it: under its variation, with its files, and what is wanted."""
+        suffix = "" if _in_tiles(record) else ".parquet"
+        voxels, truth = (f"{name}/{unit.name.slug}{suffix}" for name in (VOXELS, TRUTH))
+        has_truth = any(name.startswith(truth) for name in record.files)
+        return dataclasses.replace(
+            record.without_own(),
+            variation=unit.variation,
+            image_space=record.image_space if unit.image_space else ImageSpace(),
+            quality=record.quality if unit.image_space else None,
+            video_measures=record.video_measures if unit.image_space else None,
+            voxels_file=self.path / voxels if unit.stored else None,
+            truth_file=self.path / truth if unit.image_space and has_truth else None,
         )
 
-    def save_result(self, result: Result, contents: Iterable[UnitContent]) -> None:
+    def save_result(self, result: Result, kept: Iterable[Record]) -> None:
         """Write summary.json, manifest.json, and the digests of the units' files.
 
         Raises:
             DataError: If one of these files is gone.
         """
-        digests = {name: digest for content in contents for name, digest in content.files.items()}
+        digests = {name: digest for record in kept for name, digest in record.files.items()}
         if lost := next((name for name in digests if not (self.path / name).exists()), None):
             raise DataError(f"{self.path / lost}: was written, and is gone; run the same command again")
         if gone := sorted(_models_in(self.path) - {record.unit.model for record in result.records}):
@@ -239,6 +242,8 @@ class Folder:
         records = _with_files(result.records, lambda file: file.relative_to(self.path))
         content = to_json(dataclasses.replace(result, records=records, manifest={}))
         runs = content.pop("records")
+        for run, name in itertools.product(runs, OF_THE_UNIT):
+            del run[name]
         del content["manifest"]
         write_json(self.path / "summary.json", {"schema": SCHEMA, "runs": runs, **content})
         write_json(self.path / "manifest.json", result.manifest)
@@ -259,18 +264,13 @@ class Folder:
         finally:
             start.marker.unlink(missing_ok=True)
 
-    def _is_whole(self, planned: PlannedUnit, content: UnitContent) -> bool:
-        """Return whether the unit's file has all that is wanted of it, and its other files are unchanged."""
-        if planned.regions:
-            return content.regions is not None
-        summary = content.summary
+    def _is_whole(self, unit: Unit, record: Record) -> bool:
+        """Return whether the record has all that is wanted of the unit, and its files are unchanged."""
         return (
-            summary is not None
-            and (content.image_space is not None or not planned.image_space)
-            and (summary.statistics is not None or not planned.assessed)
-            and (content.checked is not None or not planned.sampled)
-            and self.are_whole({name: content.files.get(name) for name in self._wanted(planned, content)})
-            and (not planned.stored or self.are_whole(content.files))
+            (record.statistics is not None or not unit.assessed)
+            and (record.checked is not None or not unit.sampled)
+            and self.are_whole({name: record.files.get(name) for name in _wanted(unit, record)})
+            and (not unit.stored or self.are_whole(record.files))
         )
 
     def are_whole(self, files: Mapping[str, str | None]) -> bool:
@@ -287,15 +287,17 @@ class Folder:
                 return False
         return True
 
-    def _wanted(self, planned: PlannedUnit, content: UnitContent) -> list[str]:
-        unit: Unit = planned.unit
-        voxels = _in_tiles(unit, content) or [f"{VOXELS}/{unit.slug}.parquet"]
-        wanted = [*voxels, f"{FRAMES}/{unit.slug}.csv"] if planned.stored else []
-        if planned.stored and planned.assessed:
-            wanted.append(f"{SUMS}/{unit.slug}.parquet")
-        if planned.stored and planned.config.events and keeps_log(planned.unit.backend):
-            wanted += _in_tiles(unit, content, EVENTS) or [f"{EVENTS}/{unit.slug}.parquet"]
-        return wanted + ([f"{OVERVIEW}/{slug(unit.scene, unit.model)}.npz"] if planned.image_space else [])
+
+def _wanted(unit: Unit, record: Record) -> list[str]:
+    """Return the files that a unit must have."""
+    name, wanted = unit.name, list[str]()
+    if unit.stored:
+        wanted += [*(_in_tiles(record) or [f"{VOXELS}/{name.slug}.parquet"]), f"{FRAMES}/{name.slug}.csv"]
+    if unit.stored and unit.assessed:
+        wanted.append(f"{SUMS}/{name.slug}.parquet")
+    if unit.stored and unit.config.events and keeps_log(name.backend):
+        wanted += _in_tiles(record, EVENTS) or [f"{EVENTS}/{name.slug}.parquet"]
+    return wanted + ([f"{OVERVIEW}/{slug(name.scene, name.model)}.npz"] if unit.image_space else [])
 
 
 def _models_in(folder: Path) -> set[str]:
@@ -311,13 +313,9 @@ def _are(names: Sequence[str]) -> str:
     return f"{', '.join(names)} {'is' if len(names) == 1 else 'are'}"
 
 
-def _in_tiles(unit: Unit, content: UnitContent, of: str = VOXELS) -> list[str]:
-    return [name for name in content.files if name.startswith(f"{of}/{unit.slug}/")]
-
-
-def unit_key(identity: str, digest: str) -> str:
-    """Return the key of a unit: the hash of its settings, then one of its input."""
-    return identity + hashlib.blake2b(digest.encode(), digest_size=8).hexdigest()
+def _in_tiles(record: Record, of: str = VOXELS) -> list[str]:
+    """Return the files of a record's tiles; none of a map that is in one file."""
+    return [name for name in record.files if name.startswith(f"{of}/{record.unit.slug}/")]
 
 
 def run_and_model(named: str | os.PathLike[str]) -> tuple[Path, str | None]:

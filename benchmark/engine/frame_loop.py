@@ -17,41 +17,39 @@ import numpy as np
 from semstab.core.prefetch import Fetched, prefetch
 from semstab.core.process import Stopwatch
 from semstab.data.frames import Frame
-from semstab.data.records import RegionFlicker, UnitContent
+from semstab.data.records import RegionFlicker
 from semstab.datasets import GROUND_TRUTH, Dataset, Scene, open_dataset
 from semstab.engine.live_maps import Decoded, LiveMap, frame_order, streams_of
 from semstab.engine.measurement import finish
 from semstab.engine.memory import MemoryBudget
-from semstab.engine.messages import Job, Outcome, Work, failed
 from semstab.engine.observer import Observers
+from semstab.engine.work import Job, Work
 from semstab.errors import DataError
 from semstab.metrics import macro_mean, matched_region_flicker
 from semstab.pixels.preparation import leave_out, perturb
 from semstab.pixels.warp import correspond
-from semstab.task import frame_indices
 
 
-def run_job(job: Job, observers: Observers | None = None) -> Iterator[Outcome]:
+def run_job(job: Job, observers: Observers | None = None) -> Iterator[Work]:
     """Compute works that read one sequence. One that fails does not keep the others from finishing.
 
     Observers see it where it is done in their process.
     """
-    left = {(work.identity, work.tile): work for work in job}
+    left = [*job]
     try:
         scene = _scene(job[0])
-        for key, work in [*left.items()]:
-            if work.regions:
-                yield _measured_regions(scene, work)
-                del left[key]
+        for work in (work for work in job if work.unit.regions):
+            yield _measured_regions(scene, work)
+            left.remove(work)
         while left:
-            fusion = Fusion(scene, [*left.values()], observers or Observers())
+            fusion = Fusion(scene, left, observers or Observers())
             yield from fuse_sequence(fusion)
-            left = {(work.identity, work.tile): work for work in fusion.put_off}
+            left = fusion.put_off
     except Exception as error:  # noqa: BLE001 - whatever happens to a job is reported, and the other jobs continue
-        yield from failed(left.values(), error)
+        yield from (work.failed(error) for work in left)
 
 
-def fuse_sequence(fusion: Fusion) -> Iterator[Outcome]:
+def fuse_sequence(fusion: Fusion) -> Iterator[Work]:
     """Fuse the frames of a sequence into all maps that want them; then measure and write each map."""
     with contextlib.closing(fusion.decoded_frames()) as frames:
         for index, fetched in zip(fusion.order, frames, strict=True):
@@ -78,26 +76,26 @@ class Fusion:
     """The maps of a pass, and the bookkeeping around it: failures, memory, time by stage.
 
     Attributes:
-        failed: Outcomes of the works that failed.
+        failed: The works that failed.
         put_off: Works for another pass, where all maps do not fit into the memory.
     """
 
     def __init__(self, scene: Scene, works: Sequence[Work], observers: Observers) -> None:
-        self.watch, self.put_off, self.failed = Stopwatch(), list[Work](), list[Outcome]()
+        self.watch, self.put_off, self.failed = Stopwatch(), list[Work](), list[Work]()
         self._scene, self._observers, self._threads = scene, observers, works[0].start.threads
         maps = list[LiveMap]()
         for work in works:
             try:
                 maps.append(LiveMap.of(work, scene))
             except Exception as error:  # noqa: BLE001 - a failing unit is reported, and the others continue
-                self.failed += failed([work], error)
+                self.failed.append(work.failed(error))
         self.streams = streams_of(maps, self.watch, observers)
         self.order = frame_order(self.streams)
-        self._budget = MemoryBudget(works[0].config.memory_gb, works[0].start.width)
+        self._budget = MemoryBudget(works[0].unit.config.memory_gb, works[0].start.width)
         for stream in self.streams:
             if watched := stream.watched:
-                backends = {live.unit: live.backend for live in watched if live.backend is not None}
-                task, config = stream.task, watched[0].work.config
+                backends = {live.name: live.backend for live in watched if live.backend is not None}
+                task, config = stream.task, watched[0].work.unit.config
                 observers.tell(lambda observer: observer.group_started(task, config, backends))  # noqa: B023
 
     def decoded_frames(self) -> Generator[Fetched[Decoded], None, None]:
@@ -130,12 +128,12 @@ class Fusion:
 
     @contextlib.contextmanager
     def failing(self, maps: Sequence[LiveMap]) -> Iterator[None]:
-        """Turn an error that is raised in the block into the outcome of these maps, which are given up."""
+        """Turn an error that is raised in the block into failed works of these maps, which are given up."""
         lost = list(maps)
         try:
             yield
         except Exception as error:  # noqa: BLE001 - a failing unit is reported, and the others continue
-            self.failed += failed([live.work for live in lost], error)
+            self.failed += [live.work.failed(error) for live in lost]
             self._give_up(lost)
 
     def _give_up(self, lost: Sequence[LiveMap]) -> None:
@@ -143,7 +141,7 @@ class Fusion:
             stream.maps = [live for live in stream.maps if live not in lost]
 
     def lap(self) -> dict[str, float]:
-        """Return the seconds of each stage since the last outcome."""
+        """Return the seconds of each stage since the last work."""
         seconds, self.watch.seconds = self.watch.seconds, defaultdict(float)
         return dict(seconds)
 
@@ -179,9 +177,11 @@ def share_open_scenes(start: str, scenes: Mapping[str, Scene]) -> Iterator[None]
 
 def _scene(work: Work) -> Scene:
     if work.start.name in _shared:
-        return _shared[work.start.name][work.scene]
-    dataset = work.config.dataset
-    return _dataset(work.start.name, work.start.folder, dataset.name, json.dumps(dataset.options)).scene(work.scene)
+        return _shared[work.start.name][work.unit.name.scene]
+    dataset = work.unit.config.dataset
+    return _dataset(work.start.name, work.start.folder, dataset.name, json.dumps(dataset.options)).scene(
+        work.unit.name.scene
+    )
 
 
 @functools.lru_cache(maxsize=1)
@@ -200,32 +200,32 @@ def _ground_truth(scene: Scene, index: int) -> Frame | None:
 # --- Flicker of label sources that hold regions without classes, as Segment Anything's proposals do; none is fused ----
 
 
-def _measured_regions(scene: Scene, work: Work) -> Outcome:
-    """Return the outcome of a unit of regions: the means over its pairs of sampled frames."""
+def _measured_regions(scene: Scene, work: Work) -> Work:
+    """Return a unit of regions with the means over its pairs of sampled frames."""
+    name = work.unit.name
     try:
         rows = [_compared(*pair) for pair in itertools.pairwise(_region_frames(scene, work))]
         flicker, compensated, share = zip(*rows, strict=True) if rows else ((), (), ())
         means = macro_mean(flicker), macro_mean(compensated), macro_mean(share)
-        digest = scene.digest(frame_indices(scene, work.config, [work.model]), work.model)
+        digest = scene.digest([*work.frames], name.model)
     except Exception as error:  # noqa: BLE001 - a failing unit is reported, and the others continue
-        return failed([work], error)[0]
-    return Outcome(work.identity, UnitContent(digest, regions=RegionFlicker(work.scene, work.model, *means)))
+        return work.failed(error)
+    return replace(work, record=RegionFlicker(name.scene, name.model, *means, input=digest))
 
 
 def _region_frames(scene: Scene, work: Work) -> Iterator[Frame]:
-    config = work.config
+    config, name = work.unit.config, work.unit.name
 
     def decode(index: int) -> Frame:
-        frame = scene.frame(index, work.model, color=False)
+        frame = scene.frame(index, name.model, color=False)
         if frame.labels is None:
             raise DataError(f"{frame.where('scores')}: regions are label maps of ids, not scores")
         frame = leave_out(frame, masks=config.exclude.masks)
         if config.perturbation is not None:
-            frame = perturb(frame, config.perturbation, work.scene)
+            frame = perturb(frame, config.perturbation, name.scene)
         return frame.every(config.pixel_stride)
 
-    indices = frame_indices(scene, config, [work.model])
-    fetched = prefetch(decode, indices, threads=work.start.threads, size=lambda frame: frame.nbytes)
+    fetched = prefetch(decode, work.frames, threads=work.start.threads, size=lambda frame: frame.nbytes)
     with contextlib.closing(fetched):
         for each in fetched:
             yield each.item

@@ -19,13 +19,13 @@ from semstab.core.prefetch import Fetched
 from semstab.core.process import Stopwatch
 from semstab.core.types import Float64, Int32
 from semstab.data.frames import Frame
-from semstab.data.results import FrameReport, Unit
+from semstab.data.results import FrameReport, UnitName
 from semstab.data.voxels import Extent
 from semstab.datasets import Scene
-from semstab.engine.messages import Work
 from semstab.engine.observer import Observers
 from semstab.engine.series import FrameRow, Series
 from semstab.engine.tiles import tiles_met
+from semstab.engine.work import Work
 from semstab.errors import ConfigError
 from semstab.metrics import FrameQualityMeter, VideoMeter, flicker_percent
 from semstab.metrics.image_space import ImageSpaceMeter
@@ -33,7 +33,7 @@ from semstab.pixels.scans import pictured
 from semstab.statistics import Sampler
 from semstab.statistics.observations import CellObservations
 from semstab.statistics.voxel_sizes import SizeSample
-from semstab.task import Task, prepare, tasks_of, truth_task
+from semstab.task import Task, prepare, truth_task
 
 WARM_UP_STRIDE = 8
 """A backend is warmed up with every n-th pixel of each axis of the first frame."""
@@ -72,49 +72,55 @@ class LiveMap:
     @classmethod
     def of(cls, work: Work, scene: Scene) -> LiveMap:
         """Return an empty map for a work on its scene."""
-        (task,) = tasks_of(scene, work.config)
-        task, config, K = dataclasses.replace(task, left_out=work.left_out), work.config, len(task.mapping.target)
-        live = cls(work, task, frames=_as_set(task.indices))
+        unit, task = work.unit, work.unit.task_on(scene)
+        task = task if work.tile is None else dataclasses.replace(task, indices=work.frames)
+        config, K = unit.config, len(task.mapping.target)
+        live = cls(work, task, frames=_as_set(work.frames))
         if work.fuses:
             live.backend = new_map(config, K, work.within)
             if config.statistics and truth_task(task) is not None:
                 live.truth = new_map(config, K, work.within, log=False)
-            if work.sampled:
+            if unit.sampled:
                 live.reference = NumpySample(config.voxel_size, K, work.within)
-        if work.assessed and work.measures_images:
+        if unit.assessed and work.measures_images:
             live.sampler = Sampler(K)
-            if work.image_space and not config.frame_quality:
+            if unit.image_space and not config.frame_quality:
                 live.sizes = SizeSample(
                     task.indices, config.voxel_size, K
                 )  # filters share the sizes of what they are put over
         return live
 
     @property
-    def unit(self) -> Unit:
+    def name(self) -> UnitName:
         """Its scene, model and backend."""
-        return self.task.units[0]
+        return self.work.unit.name
+
+    @property
+    def config(self) -> Config:
+        """Its settings."""
+        return self.work.unit.config
 
     def integrate(self, prepared: Prepared, watch: Stopwatch) -> FrameReport:
         """Fuse a frame, and its ground truth, into the maps."""
         frame, K = prepared.frame, len(self.task.mapping.target)
         if self.backend is None:
             return FrameReport(frame.index, points=0, voxels=0, new_voxels=0, drift_sum=0.0, seconds=0.0, map_voxels=0)
-        config = self.work.config
-        kind = (self.unit.backend, json.dumps(config.backends[0].options), K, frame.scores is None)
+        config = self.config
+        kind = (self.name.backend, json.dumps(config.backends[0].options), K, frame.scores is None)
         if kind not in _warm:  # let it load what it compiles, once a process: else the first frame costs more
             _warm.add(kind)
             new_map(config, K).integrate(frame.every(WARM_UP_STRIDE))
-        with watch(f"fuse {self.unit.backend}"):
+        with watch(f"fuse {self.name.backend}"):
             report = self.backend.integrate(frame)
         if not isinstance(report, FrameReport):
             raise ConfigError(
-                f"backend '{self.unit.backend}': integrate returned a {type(report).__name__}; it returns a"
+                f"backend '{self.name.backend}': integrate returned a {type(report).__name__}; it returns a"
                 " semstab.data.results.FrameReport (docs/tutorials/own-backend.md)"
             )
         if self.reference is not None:
             with watch("reference"):
                 self.reference.integrate(frame)
-        if frame.scores is not None and self.work.image_space:
+        if frame.scores is not None and self.work.unit.image_space:
             with watch("reduced scores"):
                 self.hard = self.hard or new_map(config, K, self.work.within, log=False)
                 self.hard.integrate(dataclasses.replace(frame, labels=frame.predicted, scores=None))
@@ -133,7 +139,7 @@ class LiveMap:
             with watch("voxel sizes"):
                 self.sizes.add(prepared.frame)
         if not self.work.fuses and self.work.tile is not None:
-            frame, voxel_size = prepared.frame, self.work.config.voxel_size
+            frame, voxel_size = prepared.frame, self.config.voxel_size
             if self.origin is None:
                 x, y, z = np.floor(frame.T_wc[:3, 3] / voxel_size).astype(int).tolist()
                 self.origin = x, y, z
@@ -143,7 +149,7 @@ class LiveMap:
     @property
     def left_out(self) -> list[int]:
         """The classes whose locations are left out of the map."""
-        return [self.task.mapping.target.classes.index(name) for name in self.work.config.exclude.classes]
+        return [self.task.mapping.target.classes.index(name) for name in self.config.exclude.classes]
 
     def sampled_observations(self) -> CellObservations | None:
         """Return the sampled observations, without the locations that are left out."""
@@ -202,21 +208,21 @@ class Stream:
     def __init__(self, maps: Sequence[LiveMap], watch: Stopwatch, observers: Observers) -> None:
         self.maps, self._watch, self._observers = list(maps), watch, observers
         self.watched = [live for live in maps if live.work.watched]
-        self.task = dataclasses.replace(maps[0].task, backends=tuple(live.unit.backend for live in self.watched))
-        self.pixel_stride = maps[0].work.config.pixel_stride
+        self.task = dataclasses.replace(maps[0].task, backends=tuple(live.name.backend for live in self.watched))
+        self.pixel_stride = maps[0].config.pixel_stride
         self.frames = maps[0].frames if len(maps) == 1 else _as_set({index for live in maps for index in live.frames})
         self._sequential = any(live.work.measures_images for live in maps)
         self._previous: Frame | None = None
-        base = any(live.work.image_space and live.work.measures_images for live in maps)
-        series = any(live.work.stored and live.work.measures_images for live in maps)  # theirs hold flicker
-        voxel_size = maps[0].work.config.voxel_size
+        base = any(live.work.unit.image_space and live.work.measures_images for live in maps)
+        series = any(live.work.unit.stored and live.work.measures_images for live in maps)  # theirs hold flicker
+        voxel_size = maps[0].config.voxel_size
         self.image_space = ImageSpaceMeter(voxel_size=voxel_size) if base or series else None
-        quality = base and maps[0].work.config.frame_quality
+        quality = base and maps[0].config.frame_quality
         self.quality = FrameQualityMeter(len(self.task.mapping.target)) if quality else None
-        flow = maps[0].work.config.video_measures if base else None
+        flow = maps[0].config.video_measures if base else None
         self.video = None if flow is None else VideoMeter(len(self.task.mapping.target), flow)
         self.wants_color = flow == "dis"
-        self.truth_task = truth_task(self.task) if base or maps[0].work.config.statistics else None
+        self.truth_task = truth_task(self.task) if base or maps[0].config.statistics else None
         self._poses = Rows(POSE)
         self._estimates_up = base and self.task.scene.up is None
         self.shown = self.task.indices[len(self.task.indices) // 2] if base else None
@@ -288,15 +294,14 @@ class Stream:
     def notify(self, now: Prepared, rows: Mapping[LiveMap, FrameRow]) -> None:
         """Show the frame to observers, and append each row to the series of its map."""
         seconds = math.nan
-        if watched := {live.unit: row for live, row in rows.items() if live.work.watched}:
+        if watched := {live.name: row for live, row in rows.items() if live.work.watched}:
             with self._watch("observe") as lap:
                 self._observers.tell(lambda observer: observer.frame_fused(self.task, now.frame, watched))
             seconds = lap.seconds / len(watched)
         for live, row in rows.items():
             live.rows.append(dataclasses.replace(row, logging_seconds=seconds) if live.work.watched else row)
             if live.work.tile is None:
-                unit = live.unit
-                what = f"{unit.scene} · {unit.model} · {unit.backend}"
+                what = live.name.stated
                 self._observers.tell(lambda observer, what=what: observer.advanced(1, what))  # type: ignore[misc]
 
 
@@ -304,7 +309,7 @@ def streams_of(maps: Iterable[LiveMap], watch: Stopwatch, observers: Observers) 
     """Return the maps by what they share of each frame; tiles share frames though each fuses those that see it."""
     groups: dict[Any, list[LiveMap]] = {}
     for live in maps:
-        config = live.work.config
+        config = live.config
         same = (config.taxonomy, config.exclude, config.perturbation, config.pixel_stride, config.top_k)
         frames = None if live.work.within is not None else live.frames
         groups.setdefault((*same, frames), []).append(live)

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-import dataclasses
 from collections.abc import Callable, Mapping
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -21,15 +21,16 @@ from semstab.data.evidence import stretches
 from semstab.data.frames import LeftOut
 from semstab.data.measures import dominant, mean, measures, vss
 from semstab.data.parquet import Tile
-from semstab.data.records import EVENTS, FRAMES, OBSERVATIONS, OVERVIEW, SUMS, TRUTH, VOXELS, FrameQuality, UnitContent
-from semstab.data.results import RECURRENT, STAGES, Agreement, ReducedScores, Unit, UnitSummary, slug
+from semstab.data.records import EVENTS, FRAMES, OBSERVATIONS, OVERVIEW, SUMS, TRUTH, VOXELS, FrameQuality, Record
+from semstab.data.results import RECURRENT, STAGES, Agreement, ReducedScores, UnitName, UnitSummary, slug
 from semstab.data.videos import LonePicture
 from semstab.data.voxels import VoxelTable
 from semstab.datasets import Scene
 from semstab.engine.live_maps import LiveMap, Stream
-from semstab.engine.messages import Outcome, Start
 from semstab.engine.series import Series
 from semstab.engine.tiles import TILE_OBSERVATIONS, TileResult
+from semstab.engine.units import Unit, unit_key
+from semstab.engine.work import Start, Work
 from semstab.errors import DataError
 from semstab.metrics import compare
 from semstab.metrics.agreement import rows_of
@@ -48,13 +49,13 @@ Savers = dict[str, Callable[[Path], None]]
 """A function that writes each file of a unit, by the file's path in the folder."""
 
 
-def finish(live: LiveMap, stream: Stream, watch: Stopwatch) -> Outcome:
+def finish(live: LiveMap, stream: Stream, watch: Stopwatch) -> Work:
     """Measure a map, a tile of one or the pass over the frames of tiles, and write its files.
 
     Raises:
         DataError: If no pixel of a whole map was valid.
     """
-    work, config, tile = live.work, live.work.config, live.work.tile
+    work, config, tile = live.work, live.config, live.work.tile
     fused = _fused_map(live, watch) if work.fuses else None
     if fused is not None and tile is None and not len(fused.table):
         raise no_voxels(live.task, config)
@@ -62,7 +63,7 @@ def finish(live: LiveMap, stream: Stream, watch: Stopwatch) -> Outcome:
         sizes = () if live.sizes is None else live.sizes.alphas()
     observations, sums, sample, analysis = live.sampled_observations(), dict[str, Float64](), None, None
     with watch("statistics"):
-        if fused is not None and work.assessed:
+        if fused is not None and work.unit.assessed:
             log = fused.events if config.statistics else None
             sample = MapSample.draw(fused.table, log, fused.truth, edges=config.strata)
         if fused is not None:
@@ -89,13 +90,13 @@ def finish(live: LiveMap, stream: Stream, watch: Stopwatch) -> Outcome:
     if tile is not None:
         with watch("write"):
             _, own = written(work.start, {f"{tile.folder}/{tile.name}.npz": result.save})
-        return Outcome(work.identity, tile=tile.name, files=returned | own)
+        return replace(work, files=returned | own)
     assert fused is not None
     with watch("measure"):
-        content = unit_content(live.task, config, live.rows, result, analysis)
-        if work.image_space:
-            content = in_image_space(content, live.task, result, fused.table)
-    return Outcome(work.identity, content, files=returned, table=fused.table if work.watched else None)
+        record = record_of(work.unit, live.task, live.rows, result, analysis)
+        if work.unit.image_space:
+            record = in_image_space(record, live.task, result, fused.table)
+    return replace(work, record=record, files=returned, table=fused.table if work.watched else None)
 
 
 class FusedMap(NamedTuple):
@@ -111,18 +112,18 @@ class FusedMap(NamedTuple):
 def _fused_map(live: LiveMap, watch: Stopwatch) -> FusedMap:
     """Return the tables of a map, whose backend is let go: the statistics have its memory."""
     assert live.backend is not None
-    config, classes = live.work.config, live.task.mapping.target.classes
+    config, classes = live.config, live.task.mapping.target.classes
     with watch("table"):
-        table = dataclasses.replace(live.backend.table(), classes=classes)
-        _check_evidence(table, live.unit)
+        table = replace(live.backend.table(), classes=classes)
+        _check_evidence(table, live.name)
         events = live.backend.events() if config.statistics or config.events else None
-        truth = None if live.truth is None else dataclasses.replace(live.truth.table(), classes=classes)
+        truth = None if live.truth is None else replace(live.truth.table(), classes=classes)
         reduced = np.zeros(0) if live.hard is None else reduced_sums(_left(live, live.hard.table())[0])
         live.backend = live.truth = live.hard = None
     with watch("reference"):
         checked = None if live.reference is None else _checked(live, table, live.reference)
         trim_malloc(least=SMALL)
-    events = None if events is None else dataclasses.replace(events, classes=classes)
+    events = None if events is None else replace(events, classes=classes)
     return FusedMap(*_left(live, table, events), truth, reduced, checked)
 
 
@@ -130,7 +131,7 @@ OF_OP = 1e-6
 """Largest difference of a voxel's summed evidence from its OP, divided by OP."""
 
 
-def _check_evidence(table: VoxelTable, unit: Unit) -> None:
+def _check_evidence(table: VoxelTable, name: UnitName) -> None:
     """Raise DataError where a backend's evidence of a voxel does not sum to its OP."""
     starts, _, weight = table.evidence.entries
     for some in stretches(len(table)):
@@ -142,7 +143,7 @@ def _check_evidence(table: VoxelTable, unit: Unit) -> None:
             row = some.start + wrong[0]
             voxel = ", ".join(str(axis[row]) for axis in (table.ix, table.iy, table.iz))
             raise DataError(
-                f"{unit.scene}, {unit.model}: backend '{unit.backend}': the evidence of voxel ({voxel}) sums to"
+                f"{name.scene}, {name.model}: backend '{name.backend}': the evidence of voxel ({voxel}) sums to"
                 f" {total[wrong[0]]:g}, and its OP is {op[wrong[0]]}; add one distribution over the classes for each"
                 " frame that sees a voxel (semstab.testing.BackendConformance finds where it goes wrong)"
             )
@@ -183,21 +184,20 @@ def no_voxels(task: Task, config: Config) -> DataError:
 
 
 def _checked(live: LiveMap, table: VoxelTable, reference: NumpySample) -> Agreement:
-    expected, one_in = dataclasses.replace(reference.table(), classes=table.classes), reference.one_in
+    expected, one_in = replace(reference.table(), classes=table.classes), reference.one_in
     some_in = [in_sample(np.stack([table.ix[s], table.iy[s], table.iz[s]]), one_in) for s in stretches(len(table))]
     drawn = rows_of(table, np.concatenate(some_in))
-    units = (live.unit, dataclasses.replace(live.unit, backend="numpy"))
-    return dataclasses.replace(compare(drawn, expected, units, tolerance=live.work.config.tolerance), one_in=one_in)
+    units = (live.name, replace(live.name, backend="numpy"))
+    return replace(compare(drawn, expected, units, tolerance=live.config.tolerance), one_in=one_in)
 
 
-def unit_content(
-    task: Task, config: Config, rows: Series, result: TileResult, analysis: Analysis | None
-) -> UnitContent:
-    """Return the content of a unit from its time series, its result and the statistics of its map."""
+def record_of(unit: Unit, task: Task, rows: Series, result: TileResult, analysis: Analysis | None) -> Record:
+    """Return the record of a unit from its time series, its result and the statistics of its map."""
+    config = unit.config
     sums = TableSums.read(result.sums)
     cut, most = rows.column("scores_left_out"), rows.column("most_scores_left_out")
     summary = UnitSummary(
-        unit=task.units[0],
+        unit=unit.name,
         taxonomy=task.mapping.target.name,
         frames=len(task.indices),
         table=sums.summary(config.voxel_size, task.mapping.target.classes, config.strata),
@@ -212,17 +212,21 @@ def unit_content(
         reduced=_reduced(result.reduced) if len(result.reduced) else None,
         sizes=result.sizes,
     )
-    return UnitContent(task.digest, summary, files=result.files, checked=result.checked)
-
-
-def in_image_space(content: UnitContent, task: Task, result: TileResult, points: VoxelTable | Float64) -> UnitContent:
-    """Return the content with what is measured in image coordinates, and the scene's up axis."""
-    assert content.summary is not None
-    image_space = ImageSpaceMeter(result.image).result(content.summary.flicker_percent)
-    up = up_axis(task.scene, points, result.poses)
-    return dataclasses.replace(
-        content, image_space=image_space, up=up, quality=result.quality, video_measures=result.video_measures
+    return Record(
+        unit_key(unit.identity, task.digest),
+        unit.variation,
+        summary,
+        input=task.digest,
+        files=result.files,
+        checked=result.checked,
     )
+
+
+def in_image_space(record: Record, task: Task, result: TileResult, points: VoxelTable | Float64) -> Record:
+    """Return the record with what is measured in image coordinates, and the scene's up axis."""
+    image_space = ImageSpaceMeter(result.image).result(record.summary.flicker_percent)
+    up = up_axis(task.scene, points, result.poses)
+    return replace(record, image_space=image_space, up=up, quality=result.quality, video_measures=result.video_measures)
 
 
 def reduced_sums(table: VoxelTable) -> Float64:
@@ -260,34 +264,35 @@ def _savers(
 
     A tile's voxels to which statistics add columns wait in its folder until the whole map is there.
     """
-    work, config, unit, tile, savers = live.work, live.work.config, live.unit, live.work.tile, Savers()
-    if work.image_space and stream.overview:
+    work, config, tile, savers = live.work, live.config, live.work.tile, Savers()
+    unit, of_unit = work.unit, live.name.slug
+    if unit.image_space and stream.overview:
         pictures = pictures_of_outlying(live.task, config, analysis)
         savers[overview_file(live.task)] = partial(save_overview, stream.overview | pictures)
     if tile is not None and observations is not None:
         savers[f"{tile.folder}/{tile.size}_{TILE_OBSERVATIONS}"] = observations.save
-    if tile is None and work.stored:
+    if tile is None and unit.stored:
         savers |= unit_savers(live.task, live.rows, observations, analysis)
     if fused is None or not len(fused.table):
         return savers
     if tile is not None and sample is not None:
         savers[f"{tile.folder}/{tile.name}.sample"] = sample.below(tile.bound).save
-    if not work.stored:
+    if not unit.stored:
         return savers
     own = None if tile is None or tile.index is None else Tile(*tile.index, tile.size, tile.key)
 
     def path(folder: str, *, waits: bool) -> str:
         if tile is None or own is None:
-            return f"{folder}/{unit.slug}.parquet"
-        return f"{tile.folder}/{folder}/{own.name}" if waits else f"{folder}/{unit.slug}/{own.name}"
+            return f"{folder}/{of_unit}.parquet"
+        return f"{tile.folder}/{folder}/{own.name}" if waits else f"{folder}/{of_unit}/{own.name}"
 
     columns = analysis.columns(fused.table, fused.truth) if config.statistics and analysis is not None else {}
-    voxels = path(VOXELS, waits=config.statistics and work.assessed)
+    voxels = path(VOXELS, waits=config.statistics and unit.assessed)
     savers[voxels] = partial(save_voxels, fused.table, columns=columns, tile=own)
     if fused.events is not None and config.events:
         savers[path(EVENTS, waits=False)] = partial(fused.events.save, tile=own)
-    if fused.truth is not None and (work.image_space if own is None else len(fused.truth)):
-        savers[path(TRUTH, waits=not work.image_space)] = partial(fused.truth.save, tile=own)
+    if fused.truth is not None and (unit.image_space if own is None else len(fused.truth)):
+        savers[path(TRUTH, waits=not unit.image_space)] = partial(fused.truth.save, tile=own)
     return savers
 
 

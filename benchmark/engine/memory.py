@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, NamedTuple
@@ -16,7 +17,7 @@ from semstab.core.prefetch import default_threads
 from semstab.core.process import available_bytes, resident_bytes, trim_malloc
 from semstab.core.types import Int64
 from semstab.data.frames import Frame
-from semstab.engine.units import PlannedUnit
+from semstab.engine.units import Unit
 from semstab.errors import ConfigError, DataError, OutgrownError
 from semstab.pixels.preparation import perturb
 from semstab.statistics.cluster_sums import distinct_rows
@@ -85,8 +86,8 @@ def voxels_in(frame: Frame, voxel_size: float) -> Int64:
 DOUBT = 10
 """A sequence whose frames might see that many times the voxels of the first one, all new, is surely small enough."""
 
-FEW = 8
-"""Pairs of successive frames, evenly spaced, from which the size of a map is estimated."""
+SAMPLED = 24
+"""Frames, evenly spaced, from which the size of a map is estimated; every third of them with its successor."""
 
 SHARE = 0.5
 """The part of the memory for maps that a tile takes: a hash or a grid that doubles needs room."""
@@ -107,12 +108,12 @@ class Sizing:
     lines: list[str] = field(default_factory=list)
 
 
-def planned_sizes(config: Config, missing: Iterable[PlannedUnit], width: int) -> Sizing:
+def planned_sizes(config: Config, missing: Iterable[Unit], width: int) -> Sizing:
     """Estimate the units that are to be fused; where one cannot be read, its computation reports the error."""
-    sizing, together = Sizing(), dict[object, list[PlannedUnit]]()
+    sizing, together = Sizing(), dict[object, list[Unit]]()
     for each in missing:
         if not each.regions:  # watched units of a sequence are in memory together; others can be put off
-            key = (each.unit.scene, each.unit.model) if each.stored else each.identity
+            key = (each.name.scene, each.name.model) if each.stored else each.identity
             together.setdefault(key, []).append(each)
     for group in together.values():
         try:
@@ -122,12 +123,12 @@ def planned_sizes(config: Config, missing: Iterable[PlannedUnit], width: int) ->
     return sizing
 
 
-def _plan_sizes(config: Config, group: Sequence[PlannedUnit], width: int, sizing: Sizing) -> None:
+def _plan_sizes(config: Config, group: Sequence[Unit], width: int, sizing: Sizing) -> None:
     task, settings, K = group[0].task, group[0].config, len(group[0].task.mapping.target)
     why = None
     if config.tile_size == "off":
         why = "tile_size: off forbids to fuse it in tiles"
-    elif other := [each.unit.backend for each in group if not is_pointwise(each.unit.backend)]:
+    elif other := [each.name.backend for each in group if not is_pointwise(each.name.backend)]:
         why = f"backend '{other[0]}' cannot be restricted to tiles"
     if isinstance(config.tile_size, int):
         if why is not None:
@@ -175,14 +176,14 @@ def available_for_maps(config: Config, width: int, taken: float) -> float:
     return max(free - taken, free / 4) if config.memory_gb is None else config.memory_gb * GB / width
 
 
-def _bytes_of(planned: PlannedUnit, voxels: float, observations: float, *, soft: bool) -> float:
-    config, K = planned.config, len(planned.task.mapping.target)
+def _bytes_of(unit: Unit, voxels: float, observations: float, *, soft: bool) -> float:
+    config, K = unit.config, len(unit.task.mapping.target)
     logged = config.statistics or config.events
-    return map_bytes(planned.unit.backend, K, voxels, observations, soft=soft, logged=logged, sampled=planned.sampled)
+    return map_bytes(unit.name.backend, K, voxels, observations, soft=soft, logged=logged, sampled=unit.sampled)
 
 
-def _without(group: Sequence[PlannedUnit], settings: Config) -> str:
-    backends = [each.unit.backend for each in group]
+def _without(group: Sequence[Unit], settings: Config) -> str:
+    backends = [each.name.backend for each in group]
     keep_all = [name for name in backends if expected_bytes(name, 1, 2, 2) > expected_bytes(name, 1, 1, 2)]
     without = f", no backend that keeps every observation ({', '.join(keep_all)})" if keep_all else ""
     return without + (", no statistics" if settings.statistics else "")
@@ -196,7 +197,7 @@ class MapSize(NamedTuple):
     by_column: float
 
 
-def _tile_edge(planned: PlannedUnit, size: MapSize, budget: float, width: int, *, soft: bool) -> int:
+def _tile_edge(unit: Unit, size: MapSize, budget: float, width: int, *, soft: bool) -> int:
     """Return the largest edge of a tile, a power of 2, within the budget.
 
     It is smaller where several processes share the tiles.
@@ -206,35 +207,39 @@ def _tile_edge(planned: PlannedUnit, size: MapSize, budget: float, width: int, *
         voxels = min(CROWDED * size.by_column * edge**2, size.voxels)
         observations = voxels * size.observations / max(size.voxels, 1.0)
         alone = width > 1 and 2 * width * size.by_column * edge**2 > size.voxels
-        if _bytes_of(planned, voxels, observations, soft=soft) <= budget and not alone:
+        if _bytes_of(unit, voxels, observations, soft=soft) <= budget and not alone:
             break
         edge //= 2
     return edge
 
 
 def map_size(task: Task, settings: Config) -> MapSize:
-    """Estimate the size of a map from a few pairs of successive frames, evenly spaced.
+    """Estimate the size of a map from a sample of its frames, evenly spaced.
 
-    If no location is seen again later, each frame adds as many voxels as the second one of a pair adds to the first.
-    If frames far apart see the same voxels, there are fewer: capture and recapture by every other one of the sampled
-    frames (Lincoln and Petersen).
+    The more frames, the fewer voxels are new: a quarter, a half and all of the sample tell by which factor the voxels
+    that another doubling of the frames adds are fewer than those which the last one added. There are no more than if
+    each frame added as many as the second one of two successive frames adds to the first.
     """
 
     def seen_by(k: int) -> Int64:
         return voxels_in(_geometry(task, settings, task.indices[k]), settings.voxel_size)
 
-    sampled = evenly(len(task.indices), FEW)
+    frames = len(task.indices)
+    sampled = evenly(frames, SAMPLED)
     seen = [seen_by(k) for k in sampled]
-    pairs = [(own, seen_by(k + 1)) for k, own in zip(sampled, seen, strict=True) if k + 1 < len(task.indices)]
-    new = [_count(pair) - len(pair[0]) for pair in pairs]
-    each = float(np.mean([len(own) for own in seen]))
-    voxels = each + (len(task.indices) - 1) * (float(np.mean(new)) if new else 0.0)
     distinct = distinct_rows(np.concatenate(seen))[0]
-    captured, recaptured = _count(seen[::2]), _count(seen[1::2])
-    if (both := captured + recaptured - len(distinct)) > 0:
-        voxels = min(voxels, captured * recaptured / both)
+    quarter, half, voxels = _count(seen[::4]), _count(seen[::2]), float(len(distinct))
+    factor, added, read = min((voxels - half) / max(half - quarter, 1), 2.0), voxels - half, len(sampled)
+    while read < frames:
+        added *= factor
+        voxels += added * min(1.0, math.log2(frames / read))
+        read *= 2
+    each = float(np.mean([len(own) for own in seen]))
+    pairs = [(seen[k], seen_by(sampled[k] + 1)) for k in range(0, len(sampled), 3) if sampled[k] + 1 < frames]
+    new = [_count(pair) - len(pair[0]) for pair in pairs]
+    most = each + (frames - 1) * (float(np.mean(new)) if new else 0.0)
     columns = len(distinct_rows(distinct[:, :2])[0])
-    return MapSize(max(float(len(distinct)), voxels), len(task.indices) * each, len(distinct) / max(columns, 1))
+    return MapSize(max(float(len(distinct)), min(voxels, most)), frames * each, len(distinct) / max(columns, 1))
 
 
 def _count(seen: Sequence[Int64]) -> int:
@@ -292,12 +297,12 @@ class MemoryBudget:
 
     def outgrown(self, live: LiveMap) -> OutgrownError:
         """Return the error of a map that is given up."""
-        unit, config, tile = live.unit, live.work.config, live.work.tile
+        name, config, tile = live.name, live.config, live.work.tile
         voxels = live.rows[-1].report.map_voxels
         which = "are free" if self._limit is None else "is left of memory_gb"
         size = f"a smaller --tile-size than {tile.size}" if tile is not None else "tiles (--tile-size 256)"
         return OutgrownError(
-            f"{unit.scene}, {unit.model}, {unit.backend}: after {len(live.rows)} of {len(live.frames)} frames"
+            f"{name.scene}, {name.model}, {name.backend}: after {len(live.rows)} of {len(live.frames)} frames"
             f" the map has {voxels / 1e6:.2g} million voxels of {config.voxel_size:g} m; its table"
             f" {'and statistics' if config.statistics else 'alone'} would take {end_bytes(live) / GB:.2g} GB, and"
             f" {max(0, self._left) / GB:.2g} GB {which}; use {size}, larger voxels (voxel_size), fewer frames (frames),"
@@ -307,7 +312,7 @@ class MemoryBudget:
 
 def end_bytes(live: LiveMap) -> int:
     """Return the bytes that measuring and writing a map takes beyond what it takes already."""
-    config, K = live.work.config, len(live.task.mapping.target)
+    config, K = live.config, len(live.task.mapping.target)
     voxels = live.rows[-1].report.map_voxels
     tables = (1 + (live.truth is not None)) * table_bytes(voxels, K, soft=live.soft)
     return tables + (log_bytes(live.observations, K, soft=live.soft) if config.statistics or config.events else 0)
@@ -315,4 +320,4 @@ def end_bytes(live: LiveMap) -> int:
 
 def _bytes(live: LiveMap) -> int:
     K, voxels = len(live.task.mapping.target), live.rows[-1].report.map_voxels
-    return expected_bytes(live.unit.backend, voxels, live.observations, K, soft=live.soft)
+    return expected_bytes(live.name.backend, voxels, live.observations, K, soft=live.soft)

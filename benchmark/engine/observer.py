@@ -10,11 +10,11 @@ if TYPE_CHECKING:
     from semstab.check import Verdict
     from semstab.config import Config
     from semstab.data.frames import Frame
-    from semstab.data.records import Result, UnitContent
-    from semstab.data.results import Unit
+    from semstab.data.records import Record, RegionFlicker, Result
+    from semstab.data.results import UnitName
     from semstab.data.voxels import VoxelTable
     from semstab.engine.series import FrameRow
-    from semstab.engine.units import Plan, PlannedUnit
+    from semstab.engine.units import Plan, Unit
     from semstab.task import Task
 
 
@@ -28,23 +28,23 @@ class Observer:
 
     wants_color = False
 
-    def run_started(self, plan: Plan, finished: Mapping[str, UnitContent]) -> None:
+    def run_started(self, plan: Plan, finished: Mapping[str, Record | RegionFlicker]) -> None:
         """Take note that the plan is made and nothing fused yet; an earlier start finished these units, by identity."""
 
     def geometry_checked(self, task: Task, verdict: Verdict) -> None:
         """Take note that depth and poses of the task's scene were compared, and do not contradict each other."""
 
-    def group_started(self, task: Task, config: Config, backends: Mapping[Unit, FusionBackend]) -> None:
+    def group_started(self, task: Task, config: Config, backends: Mapping[UnitName, FusionBackend]) -> None:
         """Take note of the maps that the task's frames go into; `config` is that of the first of these units."""
 
-    def frame_fused(self, task: Task, frame: Frame, rows: Mapping[Unit, FrameRow]) -> None:
+    def frame_fused(self, task: Task, frame: Frame, rows: Mapping[UnitName, FrameRow]) -> None:
         """Take note that a frame went into all maps of the group; `frame` holds labels in the run's label space."""
 
     def advanced(self, frames: int, what: str) -> None:
         """Take note that so many frames went into a map, wherever that is; `what` names the unit."""
 
     def unit_finished(
-        self, planned: PlannedUnit, content: UnitContent | None, table: VoxelTable | None, error: str | None
+        self, unit: Unit, record: Record | RegionFlicker | None, table: VoxelTable | None, error: str | None
     ) -> None:
         """Take note that a unit is computed and stored, or failed for the reason in `error`.
 

@@ -1,4 +1,4 @@
-"""The contents of a plan's units, and the result that they make together."""
+"""The records of a plan's units, and the result that they make together."""
 
 from __future__ import annotations
 
@@ -16,14 +16,14 @@ from semstab.config import BACKENDS, BASE, Config
 from semstab.core.process import Stopwatch
 from semstab.data.events import Events
 from semstab.data.labels import sharing_classes
-from semstab.data.records import REGIONS, Failure, Record, Result, Tables, UnitContent
+from semstab.data.records import REGIONS, Failure, Record, RegionFlicker, Result, Tables
 from semstab.data.results import Agreement, VoxelAdvice
 from semstab.data.tiles import Tiles, side_by_side
 from semstab.data.voxels import VoxelTable
 from semstab.datasets import GROUND_TRUTH
 from semstab.engine.folder import Folder
-from semstab.engine.messages import Outcome
 from semstab.engine.units import Plan, must_agree
+from semstab.engine.work import Work
 from semstab.metrics import compare
 from semstab.metrics.agreement import together
 from semstab.statistics import CellObservations, ModelComparison, claimed_together
@@ -32,9 +32,9 @@ from semstab.statistics.model_comparison import Region, Regions, compare_regions
 
 @dataclass
 class UnitResults:
-    """Contents of the units by identity, or their errors; geometry, advice by scene, notes by model, causes."""
+    """Records of the units by identity, or their errors; geometry, advice by scene, notes by model, causes."""
 
-    contents: dict[str, UnitContent] = field(default_factory=dict)
+    records: dict[str, Record | RegionFlicker] = field(default_factory=dict)
     finished_before: int = 0
     geometry: dict[str, Verdict] = field(default_factory=dict)
     advice: dict[str, VoxelAdvice] = field(default_factory=dict)
@@ -43,64 +43,66 @@ class UnitResults:
     causes: dict[str, BaseException] = field(default_factory=dict)
     watch: Stopwatch = field(default_factory=Stopwatch)
 
-    def add_seconds(self, outcome: Outcome) -> None:
+    def finished(self) -> list[Record]:
+        """Return the records of the units that were fused."""
+        return [record for record in self.records.values() if isinstance(record, Record)]
+
+    def add_seconds(self, work: Work) -> None:
         """Add the time that a pass took, by stage."""
-        for stage, seconds in outcome.seconds.items():
+        for stage, seconds in work.seconds.items():
             self.watch.seconds[stage] += seconds
 
 
 def result_of(plan: Plan, folder: Folder, units: UnitResults) -> Result:
     """Return the result of all units that there are: how they agree, and how models compare."""
-    contents, errors, config = units.contents, units.errors, plan.config
-    records = tuple(folder.record(each, contents[each.identity]) for each in plan.units if each.identity in contents)
+    config = plan.config
+    finished = [(unit, kept) for unit in plan.units if isinstance(kept := units.records.get(unit.identity), Record)]
+    records = tuple(folder.record(unit, record) for unit, record in finished)
     tables = Tables(most=len({record.unit.backend for record in records}))
     with units.watch("agreement"):
-        checks = [contents[each.identity].checked for each in plan.units if each.sampled and each.identity in contents]
+        checks = (record.checked for unit, record in finished if unit.sampled)
         agreement = (*filter(None, checks), *_agreements(config, records, tables, must=True))
         compared = tuple(_agreements(config, records, tables, must=False))
     with units.watch("comparisons"):
         comparisons = claimed_together(tuple(_comparisons(config, records, tables)) if config.statistics else ())
     up: dict[str, tuple[float, float, float]] = {}  # of the first model whose base unit has it
-    for each in plan.units:
-        own = contents.get(each.identity)
-        if each.variation.sweep == BASE and own is not None and own.up is not None:
-            up.setdefault(each.unit.scene, own.up)
-    failed = [each for each in plan.every() if each.identity in errors]
+    base = [record for unit, record in finished if unit.variation.sweep == BASE]
+    for record in base:
+        if record.up is not None:
+            up.setdefault(record.unit.scene, record.up)
+    failed = [unit for unit in plan.every() if unit.identity in units.errors]
     return Result(
         name=config.name,
         backend=config.backends[0].name,
         records=records,
-        failures=tuple(Failure(each.unit, each.variation, errors[each.identity]) for each in failed),
+        failures=tuple(Failure(unit.name, unit.variation, units.errors[unit.identity]) for unit in failed),
         agreement=agreement,
         comparisons=comparisons,
         up=up,
         georeference={name: known for name, scene in plan.scenes.items() if (known := scene.georeference) is not None},
         regions=tuple(
-            content.regions for each in plan.regions if (content := contents.get(each.identity)) and content.regions
+            kept for unit in plan.regions if isinstance(kept := units.records.get(unit.identity), RegionFlicker)
         ),
         compared=compared,
         advice=units.advice,
-        notes=_notes_of(plan, contents),
+        notes=_notes_of(base),
         benchmark="" if config.benchmark is None else str(config.benchmark),
     )
 
 
-def advice_of(plan: Plan, contents: Mapping[str, UnitContent]) -> dict[str, VoxelAdvice]:
+def advice_of(plan: Plan, records: Mapping[str, Record | RegionFlicker]) -> dict[str, VoxelAdvice]:
     """Return the voxel size's advice of each scene, from when its base units were computed."""
-    return {
-        each.unit.scene: content.advice
-        for each in plan.units
-        if each.variation.sweep == BASE and (content := contents.get(each.identity)) and content.advice is not None
-    }
+    base = (records.get(unit.identity) for unit in plan.units if unit.variation.sweep == BASE)
+    return {each.unit.scene: each.advice for each in base if isinstance(each, Record) and each.advice is not None}
 
 
-def _notes_of(plan: Plan, contents: Mapping[str, UnitContent]) -> dict[str, tuple[str, ...]]:
+def _notes_of(base: Sequence[Record]) -> dict[str, tuple[str, ...]]:
     """Return the remarks of the check on each scene, from when its base units were computed."""
     notes: dict[str, list[str]] = {}
-    for each in plan.units:
-        if each.variation.sweep == BASE and (content := contents.get(each.identity)) and content.notes:
-            notes.setdefault(each.unit.scene, []).extend(content.notes)
-    return {scene: tuple(dict.fromkeys(own)) for scene, own in notes.items()}
+    for record in base:
+        if record.notes:
+            notes.setdefault(record.unit.scene, []).extend(record.notes)
+    return {scene: tuple(dict.fromkeys(of_scene)) for scene, of_scene in notes.items()}
 
 
 def _agreements(config: Config, records: Sequence[Record], tables: Tables, *, must: bool) -> Iterator[Agreement]:
@@ -217,15 +219,14 @@ def origin(config: Config, command: Sequence[str]) -> dict[str, Any]:
 
 def manifest(plan: Plan, units: UnitResults, executor: str, command: Sequence[str]) -> dict[str, Any]:
     """Return the content of manifest.json: versions, digests of the inputs, seconds by stage, peak memory, counts."""
-    contents, before, failed = units.contents, units.finished_before, len(units.errors)
-    computed = [each for each in plan.every() if each.identity in contents]
-    counts = {"units": len(contents) + failed, "kept": before, "computed": len(contents) - before, "failed": failed}
+    records, before, failed = units.records, units.finished_before, len(units.errors)
+    counts = {"units": len(records) + failed, "kept": before, "computed": len(records) - before, "failed": failed}
     return {
         **origin(plan.config, command),
         "inputs": {
-            f"{each.unit.scene}/{each.unit.model}": contents[each.identity].input
-            for each in computed
-            if each.variation.sweep in (BASE, REGIONS)
+            f"{unit.name.scene}/{unit.name.model}": records[unit.identity].input
+            for unit in plan.every()
+            if unit.identity in records and unit.variation.sweep in (BASE, REGIONS)
         },
         "seconds": dict(units.watch.seconds),
         "units": counts | {"executor": executor},

@@ -13,9 +13,9 @@ import numpy as np
 
 from semstab.core.types import Float64
 from semstab.data.parquet import tile_of
-from semstab.data.records import TRUTH, VOXELS, UnitContent
+from semstab.data.records import TRUTH, VOXELS, Record
 from semstab.data.voxels import VoxelTable
-from semstab.engine.folder import Folder, unit_key
+from semstab.engine.folder import Folder
 from semstab.engine.measurement import (
     Savers,
     analyse_sample,
@@ -23,15 +23,15 @@ from semstab.engine.measurement import (
     no_voxels,
     overview_file,
     pictures_of_outlying,
+    record_of,
     save_overview,
     save_voxels,
-    unit_content,
     unit_savers,
     written,
 )
-from semstab.engine.messages import Job, Outcome, Start, TileTask, Work, failed
 from semstab.engine.tiles import TILE_OBSERVATIONS, TileResult, joined_series
-from semstab.engine.units import PlannedUnit
+from semstab.engine.units import Unit
+from semstab.engine.work import Job, Start, UnitTile, Work
 from semstab.errors import SemstabError
 from semstab.metrics.agreement import together
 from semstab.metrics.summary import TableSums
@@ -44,7 +44,7 @@ GUESS = 4
 UP_VOXELS = 1 << 20
 """The up axis of more voxels is estimated from every n-th."""
 
-TileFrames = tuple[TileTask, list[int] | None]
+TileFrames = tuple[UnitTile, list[int] | None]
 """A tile and the frames that meet it; of the pass over all frames None."""
 
 
@@ -54,10 +54,9 @@ class TiledUnit:
     The results of an earlier start are taken over where they are as they were.
     """
 
-    def __init__(self, planned: PlannedUnit, size: int, folder: Folder, start: Start) -> None:
-        self.planned, self._folder = planned, folder
-        self._work = Work.of(planned, start)
-        self._frames = TileTask(unit_key(planned.identity, planned.task.digest), size)
+    def __init__(self, unit: Unit, size: int, folder: Folder, start: Start) -> None:
+        self._folder, self._work = folder, Work.of(unit, start)
+        self._frames = UnitTile(unit.key, size)
         self._results: dict[str, TileResult] = {}
         self._samples: list[MapSample] = []
         self._bound: int | None = None
@@ -70,8 +69,7 @@ class TiledUnit:
     @property
     def name(self) -> str:
         """Its name in the progress."""
-        unit = self.planned.unit
-        return f"{unit.scene} · {unit.model} · {unit.backend}"
+        return self._work.unit.name.stated
 
     def next_job(self) -> Job | None:
         """Return the next tile; None where there is none, or before the pass over the frames has ended."""
@@ -80,38 +78,37 @@ class TiledUnit:
         task, frames = self._waiting.pop(0)
         return (self._work.in_tile(dataclasses.replace(task, bound=self._bound), frames),)
 
-    def take(self, outcome: Outcome) -> Outcome | None:
-        """Take the outcome of a tile; return that of the unit where it came to its end."""
+    def take(self, work: Work) -> Work | None:
+        """Take a tile that a worker gave back; return the unit where it came to its end."""
         if self._failed:
             return None
-        if outcome.error is not None or outcome.tile is None:
+        if work.error is not None or work.tile is None:
             self._failed = True
-            return dataclasses.replace(outcome, tile=None)
-        self._folder.save_files(outcome)
-        task = self._frames if self._tiles is None else self._tiles[outcome.tile][0]
-        if not self._take_over(task):
+            return work
+        self._folder.save_files(work)
+        if not self._take_over(work.tile):
             self._failed = True
-            return failed([self._work], f"{self.name}: tile {task.name} is not in the folder; start it again")[0]
+            return self._work.failed(f"{self.name}: tile {work.tile.name} is not in the folder; start it again")
         if self._tiles is None:
             self._waiting = self._begin_tiles()
         return self.ended()
 
-    def ended(self) -> Outcome | None:
-        """Return the outcome of the unit once all of its tiles are there."""
+    def ended(self) -> Work | None:
+        """Return the unit with its record once all of its tiles are there."""
         if self._tiles is None or len(self._results) < 1 + len(self._tiles):
             return None
         tiles = {task: self._results[name] for name, (task, _) in self._tiles.items()}
         sample = MapSample.merged(self._samples) if self._samples else None
         try:
-            content = assembled(self.planned, self._results[self._frames.name], tiles, sample, self._work.start)
+            record = assembled(self._work, self._results[self._frames.name], tiles, sample)
         except SemstabError as error:
-            return failed([self._work], error)[0]
-        return Outcome(self.planned.identity, content)
+            return self._work.failed(error)
+        return dataclasses.replace(self._work, record=record)
 
     def step(self) -> int:
         """Return the frames by which the progress advances now: all of the unit's once all tiles are there."""
         parts = 1 + (GUESS if self._tiles is None else len(self._tiles))
-        reached = self.planned.frames * len(self._results) // parts
+        reached = len(self._work.frames) * len(self._results) // parts
         step, self._advanced = max(0, reached - self._advanced), max(reached, self._advanced)
         return step
 
@@ -123,10 +120,10 @@ class TiledUnit:
             task = dataclasses.replace(self._frames, index=index, origin=frames.origin)
             self._tiles[task.name] = task, own
         waiting = [own for own in self._tiles.values() if not self._take_over(own[0])]
-        self._folder.clear(self.planned, {name for result in self._results.values() for name in result.files})
+        self._folder.clear(self._work.unit, {name for result in self._results.values() for name in result.files})
         return waiting
 
-    def _take_over(self, task: TileTask) -> bool:
+    def _take_over(self, task: UnitTile) -> bool:
         """Take a result from the folder, if its files are there as they were."""
         result = TileResult.load(self._folder.path / task.folder / f"{task.name}.npz")
         if result is None or not self._folder.are_whole(result.files):
@@ -141,19 +138,15 @@ class TiledUnit:
 
 
 def assembled(
-    planned: PlannedUnit,
-    frames: TileResult,
-    results: Mapping[TileTask, TileResult],
-    sample: MapSample | None,
-    start: Start,
-) -> UnitContent:
-    """Return the content of a unit from its frames and tiles.
+    work: Work, frames: TileResult, results: Mapping[UnitTile, TileResult], sample: MapSample | None
+) -> Record:
+    """Return the record of a unit from the pass over its frames, its tiles, and the sample of their voxels.
 
     Raises:
         DataError: If no pixel was valid.
     """
-    tasks, tiles, folder = [*results], [*results.values()], start.folder
-    task, config, unit = planned.task, planned.config, planned.unit
+    tasks, tiles, start, folder = [*results], [*results.values()], work.start, work.start.folder
+    unit, task, config = work.unit, work.unit.task, work.unit.config
     sums = functools.reduce(operator.add, (TableSums.read(tile.sums) for tile in tiles)) if tiles else None
     if sums is None or not sums.total[2]:
         raise no_voxels(task, config)
@@ -170,11 +163,11 @@ def assembled(
         with np.load(folder / overview_file(task)) as content:
             arrays = {name: content[name] for name in content.files}
         files |= written(start, {overview_file(task): partial(save_overview, arrays | pictures)})[0]
-    if planned.stored:
+    if unit.stored:
         savers = unit_savers(task, rows, observations, analysis)
         if config.statistics and analysis is not None:
             for each in tasks:
-                savers |= _with_columns(each, unit.slug, analysis, folder)
+                savers |= _with_columns(each, unit.name.slug, analysis, folder)
         files |= written(start, savers)[0]
     reduced = [tile.reduced for tile in tiles if len(tile.reduced)]
     checked = [tile.checked for tile in tiles if tile.checked is not None]
@@ -185,15 +178,15 @@ def assembled(
         reduced=np.sum(reduced, axis=0) if reduced else np.zeros(0),
         checked=together(checked) if checked and len(checked) == len(tiles) else None,
     )
-    content = unit_content(task, config, rows, result, analysis)
-    if not planned.image_space:
-        return content
+    record = record_of(unit, task, rows, result, analysis)
+    if not unit.image_space:
+        return record
     voxels = [folder / name for name in files if name.startswith(f"{VOXELS}/")]
     centers = _centers(voxels, config.voxel_size, -(-int(sums.total[2]) // UP_VOXELS))
-    return in_image_space(content, task, result, centers)
+    return in_image_space(record, task, result, centers)
 
 
-def _with_columns(task: TileTask, slug: str, analysis: Analysis, folder: Path) -> Savers:
+def _with_columns(task: UnitTile, slug: str, analysis: Analysis, folder: Path) -> Savers:
     """Return the file of a tile's voxels, once more with the columns of the statistics."""
     assert task.index is not None
     waiting = folder / task.folder / VOXELS / f"tile={task.index[0]}_{task.index[1]}.parquet"

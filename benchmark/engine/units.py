@@ -29,7 +29,7 @@ from semstab.core.code import Code
 from semstab.data.labels import LabelSpace
 from semstab.data.measures import measures
 from semstab.data.records import REGIONS, Variation
-from semstab.data.results import Unit
+from semstab.data.results import UnitName
 from semstab.data.statistics import CONFIDENCE
 from semstab.datasets import GROUND_TRUTH, Scene
 from semstab.errors import ConfigError
@@ -37,7 +37,7 @@ from semstab.task import Task, applies, frame_indices, open_scenes, selected, ta
 
 logger = logging.getLogger("semstab")
 
-FORMAT = 12
+FORMAT = 13
 """Part of every key: raise it with any change of the numbers that a unit's settings and input lead to, and with a
 setting's default."""
 
@@ -55,47 +55,70 @@ NOISES = tuple(name for name in Perturbation.model_fields if name != "seed")
 
 
 @dataclass(frozen=True, eq=False)
-class PlannedUnit:
-    """A model on a scene, fused by a backend under one variation, and what is wanted of it.
+class Unit:
+    """A model on a scene, fused by a backend under one variation: what is to be computed, and what is wanted of it.
+
+    A worker gets it without its task, and opens that again.
 
     Attributes:
-        config: Its settings as those of a run of its own: one scene, one model, one backend.
-        task: The unit, opened and checked.
+        name: Its scene, model and backend.
+        config: Its settings as those of a run of its own: one scene, one model, one backend, the frames one by one.
+        task: The model on the scene, opened and checked.
         identity: Hash of the settings that its numbers depend on; what shares it is computed once.
+        left_out: Number of selected frames without a file or a pose.
         image_space: Whether its stability in image coordinates is wanted.
         stored: Whether its voxels and its time series are stored.
         assessed: Whether its map gets statistics: one that others are only checked against gets none.
         sampled: Whether its map is checked against the reference on a sample of its voxels.
     """
 
+    name: UnitName
     variation: Variation
     config: Config
     task: Task
     identity: str
-    image_space: bool
-    stored: bool
+    left_out: int = 0
+    image_space: bool = False
+    stored: bool = False
     assessed: bool = True
     sampled: bool = False
 
-    @property
-    def unit(self) -> Unit:
-        """Its scene, model and backend."""
-        return self.task.units[0]
+    @classmethod
+    def of(cls, variation: Variation, config: Config, task: Task, identity: str, **wanted: bool) -> Unit:
+        """Return the unit of a task at these settings, and what is `wanted` of it, see the attributes."""
+        config = config.model_copy(update={"frames": FrameSelection.of(task.indices)})
+        return cls(task.units[0], variation, config, task, identity, task.left_out, **wanted)
+
+    def task_on(self, scene: Scene) -> Task:
+        """Return its task on its open scene: a worker, which got no task, opens it again."""
+        if self.task is not None:
+            return self.task
+        (task,) = tasks_of(scene, self.config)
+        return dataclasses.replace(task, left_out=self.left_out)
+
+    def __getstate__(self) -> dict[str, object]:
+        """Leave out the task: an open scene does not travel."""
+        return {**self.__dict__, "task": None}
 
     @property
-    def frames(self) -> int:
-        """Return how many go into its map."""
-        return len(self.task.indices)
+    def key(self) -> str:
+        """Return the key under which it is stored: the hash of its settings, then one of its input."""
+        return unit_key(self.identity, self.task.digest)
 
     @property
     def regions(self) -> bool:
         """Return whether it is the flicker of regions without classes, and nothing is fused."""
         return self.variation.sweep == REGIONS
 
-    def merged_with(self, other: PlannedUnit) -> PlannedUnit:
+    def merged_with(self, other: Unit) -> Unit:
         """Return the same unit as the other one, with what is wanted of either."""
         wanted = ("image_space", "stored", "assessed", "sampled")
         return dataclasses.replace(other, **{name: getattr(self, name) or getattr(other, name) for name in wanted})
+
+
+def unit_key(identity: str, digest: str) -> str:
+    """Return the key of a unit: the hash of its settings, then one of its input."""
+    return identity + hashlib.blake2b(digest.encode(), digest_size=8).hexdigest()
 
 
 @dataclass(frozen=True, eq=False)
@@ -104,16 +127,16 @@ class Plan:
 
     config: Config
     scenes: Mapping[str, Scene]
-    units: tuple[PlannedUnit, ...]
-    regions: tuple[PlannedUnit, ...]
+    units: tuple[Unit, ...]
+    regions: tuple[Unit, ...]
 
-    def every(self) -> list[PlannedUnit]:
+    def every(self) -> list[Unit]:
         """Return the units, then the regions."""
         return [*self.units, *self.regions]
 
-    def distinct(self) -> dict[str, PlannedUnit]:
+    def distinct(self) -> dict[str, Unit]:
         """Return what is to be computed, by its identity, with all that is wanted of it anywhere."""
-        distinct: dict[str, PlannedUnit] = {}
+        distinct: dict[str, Unit] = {}
         for each in (*self.regions, *self.units):
             known = distinct.get(each.identity)
             distinct[each.identity] = each if known is None else each.merged_with(known)
@@ -125,10 +148,10 @@ class Plan:
         backends: dict[tuple[str, str], list[str]] = {}
         for each in self.units:
             if each.variation.sweep in (BASE, BACKENDS):
-                backends.setdefault((each.unit.scene, each.unit.model), []).append(each.unit.backend)
+                backends.setdefault((each.name.scene, each.name.model), []).append(each.name.backend)
         apart = tuple(backend.name for backend in self.config.fused_by() if not must_agree(backend))
         return tuple(
-            dataclasses.replace(each.task, backends=tuple(backends[each.unit.scene, each.unit.model]), apart=apart)
+            dataclasses.replace(each.task, backends=tuple(backends[each.name.scene, each.name.model]), apart=apart)
             for each in self.units
             if each.variation.sweep == BASE
         )
@@ -176,7 +199,7 @@ def _base_settings(config: Config, scene: str, models: list[str] | None) -> Conf
     )
 
 
-def _base_units(config: Config, scenes: Mapping[str, Scene]) -> Iterator[PlannedUnit]:
+def _base_units(config: Config, scenes: Mapping[str, Scene]) -> Iterator[Unit]:
     for name, scene in scenes.items():
         fused = config.models
         if fused is None:
@@ -194,9 +217,8 @@ def _base_units(config: Config, scenes: Mapping[str, Scene]) -> Iterator[Planned
             sampled = _is_sampled(config, config.backends[0])
             if config.video_measures == "dis" and scene.missing(task.indices[0], color=True):
                 raise ConfigError(f"{name}: there are no images for optical flow; use --video-measures depth")
-            yield PlannedUnit(
-                Variation(BASE), one, task, identity(one, task), image_space=True, stored=True, sampled=sampled
-            )
+            wanted = {"image_space": True, "stored": True, "sampled": sampled}
+            yield Unit.of(Variation(BASE), one, task, identity(one, task), **wanted)
 
 
 def _is_sampled(config: Config, backend: BackendConfig) -> bool:
@@ -216,7 +238,7 @@ def _check_classes(critical: Sequence[str], task: Task) -> None:
             raise ConfigError(f"critical_classes: '{name}' is no class of {space.name}: {', '.join(space.classes)}")
 
 
-def _planned_regions(config: Config, scenes: Mapping[str, Scene]) -> Iterator[PlannedUnit]:
+def _planned_regions(config: Config, scenes: Mapping[str, Scene]) -> Iterator[Unit]:
     space = LabelSpace("regions", ("region", "none"))  # regions have no classes, but a label space has two
     for name, scene in scenes.items():
         for model in selected(config.region_maps, scene.models, scene.regions, "region map", name):
@@ -225,23 +247,25 @@ def _planned_regions(config: Config, scenes: Mapping[str, Scene]) -> Iterator[Pl
             task = Task(scene, model, frames, space.mapping_to(space), ("none",))
             content = settings.model_dump(mode="json", include=OF_REGIONS, exclude_defaults=True)
             key = _hash(content, {"regions": [name, model], "frames": frames})
-            yield PlannedUnit(Variation(REGIONS), settings, task, key, image_space=False, stored=False)
+            yield Unit.of(Variation(REGIONS), settings, task, key)
 
 
-def _varied_units(config: Config, base: Sequence[PlannedUnit], scenes: Mapping[str, Scene]) -> Iterator[PlannedUnit]:
+def _varied_units(config: Config, base: Sequence[Unit], scenes: Mapping[str, Scene]) -> Iterator[Unit]:
     compared: dict[str, list[str]] = {}
     for each in base:
-        compared.setdefault(each.unit.scene, []).append(each.unit.model)
+        compared.setdefault(each.name.scene, []).append(each.name.model)
     for variation, part, value in _variations(config):
         for each in _restricted(base, part, variation.sweep):
-            varied = each.config.model_copy(update=_changed_settings(config, variation, value, each.config))
-            (task,) = tasks_of(scenes[each.unit.scene], varied, compared[each.unit.scene])
+            settings = _base_settings(config, each.name.scene, [each.name.model])
+            varied = settings.model_copy(update=_changed_settings(config, variation, value, settings))
+            (task,) = tasks_of(scenes[each.name.scene], varied, compared[each.name.scene])
             _check_count(variation, task)
             left, (backend, *_) = variation.sweep == BACKENDS, varied.backends
             reference = left and backend.name not in [named.name for named in config.backends]
             assessed = varied.statistics or not reference
             sampled = left and _is_sampled(config, backend)
-            yield PlannedUnit(variation, varied, task, identity(varied, task), False, left, assessed, sampled)
+            wanted = {"stored": left, "assessed": assessed, "sampled": sampled}
+            yield Unit.of(variation, varied, task, identity(varied, task), **wanted)
 
 
 def _variations(config: Config) -> Iterator[tuple[Variation, Part, Any]]:
@@ -317,10 +341,10 @@ def _hash(settings: Mapping[str, Any], content: Mapping[str, Any]) -> str:
     return hashlib.blake2b(text.encode(), digest_size=8).hexdigest()
 
 
-def _restricted(base: Sequence[PlannedUnit], part: Part, name: str) -> list[PlannedUnit]:
-    _check_names(part.scenes, [each.unit.scene for each in base], f"{name}.scenes")
-    _check_names(part.models, [each.unit.model for each in base], f"{name}.models")
-    return [each for each in base if applies(part, each.unit.scene, each.unit.model)]
+def _restricted(base: Sequence[Unit], part: Part, name: str) -> list[Unit]:
+    _check_names(part.scenes, [each.name.scene for each in base], f"{name}.scenes")
+    _check_names(part.models, [each.name.model for each in base], f"{name}.models")
+    return [each for each in base if applies(part, each.name.scene, each.name.model)]
 
 
 def _check_names(wanted: Iterable[str] | None, known: Sequence[str], where: str) -> None:

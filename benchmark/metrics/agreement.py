@@ -15,7 +15,7 @@ import numpy.typing as npt
 from semstab.core.types import Float64, Int32, Int64, Mask
 from semstab.data.events import Events
 from semstab.data.measures import dominant, measures
-from semstab.data.results import Agreement, Deviation, Mismatch, Unit
+from semstab.data.results import Agreement, Deviation, Mismatch, UnitName
 from semstab.data.voxels import VoxelTable
 from semstab.errors import DataError
 
@@ -112,7 +112,12 @@ SUMS = ("evidence", "drift_sum", "self_sum", "frame_entropy_sum")
 
 
 def compare(
-    a: VoxelTable, b: VoxelTable, units: tuple[Unit, Unit], *, tolerance: float = TOLERANCE, voxel_share: float = 0.0
+    a: VoxelTable,
+    b: VoxelTable,
+    units: tuple[UnitName, UnitName],
+    *,
+    tolerance: float = TOLERANCE,
+    voxel_share: float = 0.0,
 ) -> Agreement:
     """Compare two maps of the same frames, voxel by voxel, in every column of the voxel table and every measure.
 

@@ -16,7 +16,7 @@ import rerun.blueprint as rrb
 
 from semstab.core.types import Float64, UInt8
 from semstab.data.labels import Color, LabelSpace
-from semstab.data.results import RECURRENT, Unit
+from semstab.data.results import RECURRENT, UnitName
 from semstab.data.voxels import VoxelTable
 from semstab.engine.units import Plan
 from semstab.metrics import CATEGORIES, CATEGORY_COLORS
@@ -371,7 +371,7 @@ def _below(scene: str, tasks: list[Task]) -> rrb.Container:
 def _plot(scene: str, name: str, tasks: list[Task]) -> rrb.TimeSeriesView:
     """Return a series of all models; backends that must agree share one line, except for their times."""
     lines = [
-        entity(name, Unit(scene, task.model, backend))
+        entity(name, UnitName(scene, task.model, backend))
         for task in tasks
         for backend in task.backends
         if name.endswith("_ms") or backend == drawn(task) or backend in task.apart
@@ -415,7 +415,7 @@ def _comparison(task: Task, first: str, second: str, bounds: SceneBounds | None)
     plots = [
         rrb.TimeSeriesView(
             origin=path(scene, "series", name),
-            contents=[entity(name, Unit(scene, model, backend)) for backend in (first, second)],
+            contents=[entity(name, UnitName(scene, model, backend)) for backend in (first, second)],
             name=SERIES[name].plot,
         )
         for name in COMPARED

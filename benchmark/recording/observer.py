@@ -23,14 +23,14 @@ from semstab.core.types import Float64, Int64
 from semstab.data.frames import Frame
 from semstab.data.labels import LabelSpace
 from semstab.data.measures import measures
-from semstab.data.records import Result, UnitContent
-from semstab.data.results import Unit, UnitSummary
+from semstab.data.records import Record, RegionFlicker, Result
+from semstab.data.results import UnitName, UnitSummary
 from semstab.data.voxels import VoxelTable
 from semstab.datasets import Scene
 from semstab.engine.folder import load_result
 from semstab.engine.observer import Observer
 from semstab.engine.series import FrameRow
-from semstab.engine.units import Plan, PlannedUnit, make_plan
+from semstab.engine.units import Plan, Unit, make_plan
 from semstab.errors import ConfigError, SemstabError, summarize_error
 from semstab.recording import timeline
 from semstab.recording.camera import COARSE_SIDE, SceneLog, over_camera, stride_of
@@ -178,30 +178,30 @@ class Recording(Observer):
         self._clock = Clock()
         self._fused: FusionBackend | None = None  # the map that is drawn
         self._group: GroupLog | None = None  # the model on a scene that is being fused
-        self._unfinished: set[Unit] = set()  # of the group
-        self._logged: set[Unit] = set()
+        self._unfinished: set[UnitName] = set()  # of the group
+        self._logged: set[UnitName] = set()
         self._not_assessed: set[tuple[str, str]] = set()  # scenes and models
         self._sent = 0
         self._others = "all other files are complete, and the same command makes the recording again"
 
-    def run_started(self, plan: Plan, finished: Mapping[str, UnitContent]) -> None:
+    def run_started(self, plan: Plan, finished: Mapping[str, Record | RegionFlicker]) -> None:
         """Store the plan, which gives layout, names and colours."""
         self._plan = plan
         for name in dict.fromkeys(task.scene.name for task in plan.tasks):
             self._scenes[name] = SceneLog([task for task in plan.tasks if task.scene.name == name])
 
-    def group_started(self, task: Task, config: Config, backends: Mapping[Unit, FusionBackend]) -> None:
+    def group_started(self, task: Task, config: Config, backends: Mapping[UnitName, FusionBackend]) -> None:
         """Follow the map that is drawn."""
         self._end_group()
         self._unfinished = {*backends}
         self._fused = next((each for unit, each in backends.items() if unit.backend == self._drawn(task)), None)
 
-    def frame_fused(self, task: Task, frame: Frame, rows: Mapping[Unit, FrameRow]) -> None:
+    def frame_fused(self, task: Task, frame: Frame, rows: Mapping[UnitName, FrameRow]) -> None:
         """Log a row of each time series, the camera, and the map."""
         voxels = next((row.report.map_voxels for unit, row in rows.items() if unit.backend == self._drawn(task)), 0)
         self._log_frame(task, frame, rows, voxels)
 
-    def _log_frame(self, task: Task, frame: Frame, rows: Mapping[Unit, FrameRow], voxels: int) -> None:
+    def _log_frame(self, task: Task, frame: Frame, rows: Mapping[UnitName, FrameRow], voxels: int) -> None:
         stream, background = self._opened()
         self._clock.set(stream, frame.index, frame.timestamp)
         group = self._group or self._begin(task, frame.T_wc[:3, 3])
@@ -211,14 +211,14 @@ class Recording(Observer):
         group.log(stream, frame, voxels, background)
 
     def unit_finished(
-        self, planned: PlannedUnit, content: UnitContent | None, table: VoxelTable | None, error: str | None
+        self, unit: Unit, record: Record | RegionFlicker | None, table: VoxelTable | None, error: str | None
     ) -> None:
         """Log the unit's voxels and final numbers, at the time of its last frame."""
-        if planned.unit not in self._unfinished or self._group is None:
+        if unit.name not in self._unfinished or self._group is None:
             return
-        self._unfinished.remove(planned.unit)
-        if content is not None and content.summary is not None and table is not None:
-            self._log_unit(self._group, content.summary, table)
+        self._unfinished.remove(unit.name)
+        if isinstance(record, Record) and table is not None:
+            self._log_unit(self._group, record.summary, table)
         if not self._unfinished:
             self._end_group()
 
@@ -441,5 +441,5 @@ def _plan_of(run: Path, config: Config, result: Result) -> Plan:
         assert record.series is not None
         frames = [frame for frame, *_ in timeline.read_rows(record.series)]
         task = Task(cast(Scene, scene), unit.model, frames, space.mapping_to(space), (unit.backend,))
-        units.append(PlannedUnit(record.variation, config, task, record.key, image_space=False, stored=True))
+        units.append(Unit.of(record.variation, config, task, record.key, stored=True))
     return Plan(config, {}, tuple(units), ())

@@ -13,7 +13,7 @@ import rerun as rr
 
 from semstab.core.palette import model_color
 from semstab.data.digests import require_unchanged
-from semstab.data.results import Unit
+from semstab.data.results import UnitName
 from semstab.engine.series import COLUMNS, FrameColumn
 from semstab.engine.units import Plan
 from semstab.errors import DataError, summarize_error
@@ -92,18 +92,18 @@ SERIES = {column.key: column for column in (*COLUMNS, UPDATED) if column.plot}
 """The time series by name."""
 
 
-def entity(name: str, unit: Unit) -> str:
+def entity(name: str, unit: UnitName) -> str:
     """Return the entity of a series."""
     backend = () if SERIES[name].of_model else (unit.backend,)
     return path(unit.scene, "series", name, unit.model, *backend)
 
 
-def columns(unit: Unit, task: Task) -> list[str]:
+def columns(unit: UnitName, task: Task) -> list[str]:
     """Return the names of the unit's series."""
     return [name for name, own in SERIES.items() if not own.of_model or unit.backend == task.backends[0]]
 
 
-def log_row(stream: rr.RecordingStream, unit: Unit, task: Task, cells: Mapping[str, Any]) -> None:
+def log_row(stream: rr.RecordingStream, unit: UnitName, task: Task, cells: Mapping[str, Any]) -> None:
     """Log the defined values of a row of the CSV at the stream's time."""
     row = {**cells, "updated_voxels": float(cells["voxels"]) - float(cells["new_voxels"])}
     for name in columns(unit, task):
@@ -128,7 +128,7 @@ def read_rows(file: Path) -> list[tuple[int, float | None, dict[str, str]]]:
         raise _damaged(file, error) from error
 
 
-def log_file(stream: rr.RecordingStream, unit: Unit, task: Task, file: Path, clock: Clock) -> None:
+def log_file(stream: rr.RecordingStream, unit: UnitName, task: Task, file: Path, clock: Clock) -> None:
     """Log a unit's time series from its CSV.
 
     Raises:

@@ -10,13 +10,13 @@ from types import MappingProxyType
 from typing import TYPE_CHECKING
 
 from semstab.core.files import write_text
-from semstab.data.records import Result, UnitContent
+from semstab.data.records import Record, RegionFlicker, Result
 from semstab.engine.observer import Observer
 from semstab.report.tables import write_tables
 
 if TYPE_CHECKING:
     from semstab.data.voxels import VoxelTable
-    from semstab.engine.units import PlannedUnit
+    from semstab.engine.units import Unit
     from semstab.report.figures.topdown import FromAbove
 
 __all__ = ["Reporting", "write_report"]
@@ -30,13 +30,13 @@ class Reporting(Observer):
         self._above: dict[str, FromAbove] = {}
 
     def unit_finished(
-        self, planned: PlannedUnit, content: UnitContent | None, table: VoxelTable | None, error: str | None
+        self, unit: Unit, record: Record | RegionFlicker | None, table: VoxelTable | None, error: str | None
     ) -> None:
         """Store the voxels that are seen from above, while the table is in memory."""
-        if table is not None and content is not None and content.up is not None and planned.image_space:
+        if table is not None and isinstance(record, Record) and record.up is not None and unit.image_space:
             from semstab.report.figures.topdown import FromAbove
 
-            self._above[planned.unit.slug] = FromAbove.of(table, content.up)
+            self._above[unit.name.slug] = FromAbove.of(table, record.up)
 
     def run_finished(self, result: Result) -> None:
         """Write tables and report, or nothing where every unit failed."""

@@ -17,7 +17,7 @@ from semstab.check import Verdict
 from semstab.config import BASE
 from semstab.core.types import THESE_FRAMES
 from semstab.data.measures import headlines, measures
-from semstab.data.records import Failure, Record, Result, UnitContent
+from semstab.data.records import Failure, Record, RegionFlicker, Result
 from semstab.data.results import Agreement, UnitSummary
 from semstab.data.statistics import UNDEFINED, Estimate, short
 from semstab.engine.executors import InProcess
@@ -508,7 +508,7 @@ class ProgressBar(Observer):
         self.notes: list[str] = []
         self._printed = time.monotonic()
 
-    def run_started(self, plan: Plan, finished: Mapping[str, UnitContent]) -> None:
+    def run_started(self, plan: Plan, finished: Mapping[str, Record | RegionFlicker]) -> None:
         """Show the bar: the frames of every unit that is to be computed are its total."""
         units = plan.distinct()
         if finished:
@@ -519,7 +519,7 @@ class ProgressBar(Observer):
             if scene.placed is not None:
                 self.notes.append(f"{scene.name}: {scene.placed}")
         missing = units.keys() - finished.keys()
-        self.begin(sum(units[identity].frames for identity in missing))
+        self.begin(sum(len(units[identity].task.indices) for identity in missing))
 
     def begin(self, frames: int) -> None:
         """Show the bar, of so many frames."""

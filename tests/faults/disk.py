@@ -24,8 +24,8 @@ from typing import Any
 
 import kills
 
-from semstab.engine.messages import TILES
 from semstab.engine.tiles import TileResult
+from semstab.engine.work import TILES
 
 PAGE = 4096
 MARK = "SEMSTAB_OWN_MOUNTS"

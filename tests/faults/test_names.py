@@ -18,7 +18,7 @@ from typer.testing import CliRunner
 import semstab
 from semstab.cli import app
 from semstab.data.labels import LabelSpace
-from semstab.data.results import Unit, slug
+from semstab.data.results import UnitName, slug
 from semstab.engine.folder import require_file_names
 from semstab.errors import ConfigError
 from semstab.exports import export
@@ -48,7 +48,7 @@ def test_a_file_name_is_short_plain_and_visible(name) -> None:
 
 def test_names_that_share_a_file_are_refused_and_usual_ones_stay(tmp_path) -> None:
     """Two names with one digest of five bytes."""
-    one, other = Unit("a#>@$ b", "a", "numpy"), Unit("a#>@:+b", "a", "numpy")
+    one, other = UnitName("a#>@$ b", "a", "numpy"), UnitName("a#>@:+b", "a", "numpy")
     assert one.slug == other.slug
     with pytest.raises(ConfigError, match="would be written to one file"):
         require_file_names(tmp_path / "out", [one, other])

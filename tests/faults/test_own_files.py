@@ -19,7 +19,7 @@ import semstab
 from semstab.convert import convert
 from semstab.core.files import read_json
 from semstab.core.json_form import from_json
-from semstab.data.records import UnitContent
+from semstab.data.records import Record
 from semstab.engine import load_result
 from semstab.errors import LONGEST_LINE, SemstabError
 from semstab.predict.folder import PredictionFolder
@@ -86,7 +86,7 @@ def read_again(file: Path) -> None:
 
 
 def read_unit(file: Path) -> None:
-    from_json(UnitContent, read_json(file), file)
+    from_json(Record, read_json(file), file)
 
 
 def converted_again(file: Path) -> None:

@@ -35,7 +35,7 @@ from semstab.data.events import Events
 from semstab.data.frames import Frame, Intrinsics
 from semstab.data.georeference import Georeference, wkt
 from semstab.data.labels import LabelSpace
-from semstab.data.records import UnitContent
+from semstab.data.records import Record
 from semstab.data.voxels import VoxelTable
 from semstab.datasets import open_dataset
 from semstab.datasets.files.depth import read_depth_map, read_dmap, read_mvei
@@ -242,7 +242,7 @@ def of_results(folder: Path) -> Iterator[Kind]:
         "observations/*.parquet": CellObservations.load,
         "sums/*.parquet": ClusterSums.load,
         "overview/*.npz": Overview.load,
-        "units/*.json": lambda file: from_json(UnitContent, read_json(file), file),
+        "units/*.json": lambda file: from_json(Record, read_json(file), file),
         "summary.json": lambda _: read_result(run),
         "manifest.json": lambda _: read_result(run),
         "frames/*.csv": lambda _: semstab.load(run).series(model="a"),

@@ -1,4 +1,4 @@
-"""Messages to a worker, and what comes back: small enough for another machine."""
+"""Work: a unit, or a tile of one, as a worker gets it and gives it back; small enough for another machine."""
 
 from __future__ import annotations
 
@@ -7,11 +7,11 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
-from semstab.config import Config, FrameSelection, as_range
+from semstab.config import as_range
 from semstab.core.files import TEMPORARY
-from semstab.data.records import UnitContent
+from semstab.data.records import Record, RegionFlicker
 from semstab.data.voxels import Extent, VoxelTable
-from semstab.engine.units import PlannedUnit
+from semstab.engine.units import Unit
 from semstab.errors import OUT_OF_MEMORY, OutgrownError, SemstabError, summarize_error
 
 TILES = "tiles"
@@ -41,7 +41,7 @@ class Start:
 
 
 @dataclass(frozen=True)
-class TileTask:
+class UnitTile:
     """One tile of the map of a unit; without an index, the pass over all frames that fuses nothing.
 
     Attributes:
@@ -78,42 +78,57 @@ class TileTask:
         return Extent((x, y), (x + self.size, y + self.size), self.origin)
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Work:
-    """A unit to compute, or a tile of one, and what is wanted of it; see `semstab.engine.units.PlannedUnit`.
+    """A unit, or a tile of one, as a worker gets it and gives it back.
+
+    A worker gets a start, a unit, the frames and the tile. It gives the same back with a record, or with files of a
+    tile, or with the one line that says why there is neither.
 
     Attributes:
-        config: Settings with the frames one by one: those of its sequence that all label sources of the plan have.
-        left_out: Number of selected frames without a file or a pose.
-        regions: Whether it is the flicker of regions without classes, and nothing is fused.
+        frames: Indices of the frames to read.
         tile: The tile of a unit in tiles; None for all of a unit.
+        record: What is kept of the unit.
+        error: The reason why the work failed, in one line.
+        files: Further files by their path in the folder, where the worker does not see that folder.
+        cause: The exception, where the work failed in this very process; trace where it was raised.
+        table: The voxels of a unit that observers watch, where it was fused in this process.
+        seconds: Seconds that its pass took, by stage; of the last work of a pass only.
     """
 
     start: Start
-    scene: str
-    model: str
-    identity: str
-    config: Config
-    image_space: bool = False
-    stored: bool = False
-    assessed: bool = True
-    sampled: bool = False
-    left_out: int = 0
-    regions: bool = False
-    tile: TileTask | None = None
+    unit: Unit
+    frames: Sequence[int]
+    tile: UnitTile | None = None
+    record: Record | RegionFlicker | None = None
+    error: str | None = None
+    files: Mapping[str, bytes] = field(default_factory=dict)
+    cause: BaseException | None = None
+    trace: str = ""
+    table: VoxelTable | None = None
+    seconds: Mapping[str, float] = field(default_factory=dict)
 
     @classmethod
-    def of(cls, planned: PlannedUnit, start: Start) -> Work:
-        """Return the whole of a planned unit."""
-        unit, wanted = planned.unit, (planned.image_space, planned.stored, planned.assessed, planned.sampled)
-        config = planned.config.model_copy(update={"frames": FrameSelection.of(planned.task.indices)})
-        own = (unit.scene, unit.model, planned.identity, config)
-        return cls(start, *own, *wanted, planned.task.left_out, planned.regions)
+    def of(cls, unit: Unit, start: Start) -> Work:
+        """Return the whole of a unit as work."""
+        return cls(start, unit, as_range(unit.task.indices))
 
-    def in_tile(self, tile: TileTask, frames: Sequence[int] | None = None) -> Work:
+    def in_tile(self, tile: UnitTile, frames: Sequence[int] | None = None) -> Work:
         """Return the same of one tile and these frames alone."""
-        selection = {} if frames is None else {"frames": FrameSelection.of(as_range(frames))}
-        return replace(self, config=self.config.model_copy(update=selection), tile=tile)
+        return replace(self, tile=tile, frames=self.frames if frames is None else as_range(frames))
+
+    def failed(self, error: str | Exception) -> Work:
+        """Return it with the line of an error; one that is not semstab's own says its type."""
+        if isinstance(error, str):
+            return replace(self, error=error)
+        trace = "" if isinstance(error, SemstabError) else "".join(traceback.format_exception(error))
+        if isinstance(error, (OutgrownError, MemoryError)):
+            error = error.with_traceback(None)  # its frames would keep the map in memory
+        return replace(self, error=_one_line(error), cause=error, trace=trace)
+
+    def __getstate__(self) -> dict[str, object]:
+        """Leave out the exception, which may not travel, and the voxels, which are in the folder."""
+        return {**self.__dict__, "cause": None, "table": None}
 
     @property
     def fuses(self) -> bool:
@@ -123,7 +138,7 @@ class Work:
     @property
     def watched(self) -> bool:
         """Return whether observers see its frames and its map: it is stored, and fused whole."""
-        return self.stored and self.tile is None
+        return self.unit.stored and self.tile is None
 
     @property
     def measures_images(self) -> bool:
@@ -138,45 +153,6 @@ class Work:
 
 Job = tuple[Work, ...]
 """Works that read the same sequence, in one pass over its frames if the memory allows."""
-
-
-@dataclass(frozen=True)
-class Outcome:
-    """The outcome of a work: the content of its file, or the one line that says why there is none.
-
-    Attributes:
-        tile: Name of the tile that was computed, or could not be.
-        files: Further files by their path in the folder, where the worker does not see that folder.
-        cause: The exception, where the work failed in this very process; trace where it was raised.
-        table: The voxels of a unit that observers watch, where it was fused in this process.
-        seconds: Seconds that its pass took, by stage; of the last outcome of a pass only.
-    """
-
-    identity: str
-    content: UnitContent | None = None
-    tile: str | None = None
-    error: str | None = None
-    files: Mapping[str, bytes] = field(default_factory=dict)
-    cause: BaseException | None = field(default=None, compare=False)
-    trace: str = ""
-    table: VoxelTable | None = field(default=None, compare=False)
-    seconds: Mapping[str, float] = field(default_factory=dict)
-
-    def __getstate__(self) -> dict[str, object]:
-        """Leave out the exception, which may not travel, and the voxels, which are in the folder."""
-        return {**self.__dict__, "cause": None, "table": None}
-
-
-def failed(works: Iterable[Work], error: str | Exception) -> list[Outcome]:
-    """Return the outcomes of works that could not be computed; an error that is not semstab's own says its type."""
-    trace, cause = "", None
-    if not isinstance(error, str):
-        trace = "" if isinstance(error, SemstabError) else "".join(traceback.format_exception(error))
-        if isinstance(error, (OutgrownError, MemoryError)):
-            error = error.with_traceback(None)  # its frames would keep the map in memory
-        cause, error = error, _one_line(error)
-    tiles = [(work.identity, None if work.tile is None else work.tile.name) for work in works]
-    return [Outcome(own, tile=tile, error=error, cause=cause, trace=trace) for own, tile in tiles]
 
 
 def _one_line(error: Exception) -> str:
@@ -196,7 +172,7 @@ def jobs_of(works: Iterable[Work], width: int) -> list[Job]:
     """
     sequences: dict[tuple[str, str], list[Work]] = {}
     for work in works:
-        sequences.setdefault((work.scene, work.model), []).append(work)
+        sequences.setdefault((work.unit.name.scene, work.unit.name.model), []).append(work)
     jobs: list[Job] = [tuple(sequence) for sequence in sequences.values()]
     while len(jobs) < width:
         divisible = [k for k, job in enumerate(jobs) if all(_halves(job))]
