@@ -25,7 +25,9 @@ import semstab
 from semstab.cli import app
 from semstab.comparison import differences, gate_report
 from semstab.comparison import gate as judging
-from semstab.comparison.gate import GateResult, Judgement, gate, gate_config, parse
+from semstab.comparison.gate import gate, gate_config
+from semstab.comparison.gate_result import GateResult, Judgement
+from semstab.comparison.gate_rules import parse
 from semstab.comparison.runs import open_run, save_summary
 from semstab.data.measures import Measure, margin, registered, sbd
 from semstab.data.statistics import Interval

@@ -15,7 +15,8 @@ from semstab.data.statistics import OutlyingFrames, short
 from semstab.datasets import GROUND_TRUTH
 from semstab.metrics import macro_mean
 from semstab.report.means import ENOUGH, by_model, pooled
-from semstab.report.tables.stability import comparable, one_in
+from semstab.report.tables.backends import one_in
+from semstab.report.tables.stability import comparable
 from semstab.statistics.frame_disagreement import LEAST_FRAMES, LEAST_PLACES
 from semstab.statistics.verdict import LIMITS
 

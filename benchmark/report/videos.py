@@ -21,7 +21,7 @@ from semstab.metrics.image_space import mean_over_scenes
 from semstab.report.charts import Line, line_chart, sample
 from semstab.report.html import filled, lone_pictures, table_block
 from semstab.report.narrative import nearly_all, outlying_line
-from semstab.report.tables.stability import flicker_of_videos
+from semstab.report.tables.flicker import flicker_of_videos
 from semstab.report.tables.table import Column, Group, Table, relations
 from semstab.report.tables.video_measures import video_measure_tables
 from semstab.report.terminal import ProgressBar
