@@ -18,9 +18,11 @@ import typer
 from typer.core import TyperCommand, TyperGroup
 
 from semstab import __version__
+from semstab.cli.dataset_commands import check, convert, predict
 from semstab.cli.options import say
-from semstab.cli.result_commands import calibrate, compare, conform, export, gate, leaderboard, list_, relabel
-from semstab.cli.run_commands import benchmark, check, convert, filters, predict, run, show, study, view
+from semstab.cli.result_commands import calibrate, compare, conform, export, gate, leaderboard, relabel
+from semstab.cli.run_commands import benchmark, filters, run, study
+from semstab.cli.show_commands import list_, show, view
 from semstab.core.process import configure_process
 from semstab.errors import OUT_OF_MEMORY, ConfigError, SemstabError, summarize_error
 
