@@ -244,7 +244,7 @@ def relabel(
     from rich.console import Console
 
     from semstab.convert import frame_bar
-    from semstab.exports.relabel import Belief
+    from semstab.exports.fused_labels import Belief
     from semstab.exports.relabel import relabel as write
     from semstab.statistics.acceptance import AcceptanceThresholds
 
