@@ -131,7 +131,7 @@ def executor_of(jobs: int, scheduler: str | None) -> Executor:
 
 @contextlib.contextmanager
 def naming(out: Path) -> Iterator[None]:
-    """Let an interruption say in which folder the same command goes on."""
+    """Name the folder in which the same command resumes, where it is interrupted."""
     try:
         yield
     except KeyboardInterrupt as error:

@@ -61,7 +61,7 @@ scenes, label_sources = _beginning(lambda ctx: [*_opened(ctx).scenes, "all"]), _
 
 
 SETTINGS, LABELS, CHECKS, MACHINE = "Settings", "Labels", "Checks", "Machine"
-"""The panels of the help below that of the options which most people need."""
+"""The panels of the help, below the options that most people need."""
 
 
 def own_defaults() -> Path | None:
@@ -213,7 +213,7 @@ UNRECORDED = Execution(rerun="off")
 
 @dataclass(frozen=True)
 class Measurement:
-    """What a run fuses and measures: settings of the configuration, those of --set and --option with them."""
+    """The settings of a run that options set: what is fused and measured."""
 
     taxonomy: Annotated[str | None, typer.Option(
         help="Taxonomy to fuse in: a name or a YAML file.", show_default="the dataset's; city: uavid7",
@@ -222,7 +222,7 @@ class Measurement:
     pixel_stride: Annotated[int | None, typer.Option(
         help="Use every n-th pixel of each axis.", show_default="1", rich_help_panel=SETTINGS)] = None
     top_k: Annotated[int | None, typer.Option(
-        "--top-k", help="Fuse the so many largest soft scores of each pixel.", show_default="all",
+        "--top-k", help="Fuse only the K largest scores of each pixel.", show_default="all",
         rich_help_panel=SETTINGS)] = None
     frames: Frames = None
     device: Annotated[str | None, typer.Option(
@@ -276,7 +276,7 @@ def chosen(
     frames: str | None = None,
     seed: int | None = None,
 ) -> dict[str, Any]:
-    """Return options as settings, those of --set (`settings`) and of --option (`options`) on top."""
+    """Return options as settings; --set (`settings`) and --option (`options`) have priority."""
     from semstab.config.settings import in_full
     from semstab.core.files import parse_yaml
 

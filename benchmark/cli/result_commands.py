@@ -114,8 +114,8 @@ def leaderboard(
     from semstab.leaderboard.board import boards, lines, write_site
     from semstab.leaderboard.definition import load_benchmark
 
-    own = {each.id: each for each in map(load_benchmark, definition or ())}
-    made = boards(folder, own)
+    definitions = {each.id: each for each in map(load_benchmark, definition or ())}
+    made = boards(folder, definitions)
     print_lines(lines(made), quiet=quiet)
     if out is not None:
         write_site(made, out)

@@ -55,19 +55,19 @@ def show(
         say(f"failed: {line}")
     if not result.select():
         raise DataError(f"{run}: no unit finished; {run / 'failures.log'} has more where it exists; run it again")
-    there = {table.name: table for table in tables(result)}
+    by_name = {table.name: table for table in tables(result)}
     if figures is not None:
         from semstab.report.figures import write_figures
 
         print_lines(map(str, write_figures(result, run, svg=figures is FigureFormat.svg)))
     elif not what:
         print_answer(result, Console(), out=run)
-        listed = f"tables  {', '.join(there)}"
+        listed = f"tables  {', '.join(by_name)}"
         print_lines(textwrap.wrap(listed, 80, initial_indent="  ", subsequent_indent=" " * 10))
     for name in what or ():
-        matching = [table for key, table in there.items() if key.startswith(FORMER_TABLES.get(name, name))]
+        matching = [table for key, table in by_name.items() if key.startswith(FORMER_TABLES.get(name, name))]
         if not matching:
-            raise ConfigError(f"{run}: no table '{name}'; the tables are {', '.join(there)}")
+            raise ConfigError(f"{run}: no table '{name}'; the tables are {', '.join(by_name)}")
         print_lines(f"{to_terminal(table)}\n" for table in matching)
 
 

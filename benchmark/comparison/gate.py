@@ -14,6 +14,7 @@ from pydantic import BaseModel, ConfigDict, Field
 from semstab.comparison.gate_evaluation import (
     LOST,
     GateRuns,
+    Pair,
     assess,
     coverage_counts,
     is_lost,
@@ -23,7 +24,7 @@ from semstab.comparison.gate_evaluation import (
     with_values,
 )
 from semstab.comparison.gate_result import GateResult, Judgement, Undecided
-from semstab.comparison.gate_rules import ALL, parse
+from semstab.comparison.gate_rules import ALL, Rule, parse
 from semstab.comparison.runs import RunHandle, open_run, shared_scenes
 from semstab.comparison.tables import COVERAGE, FLICKER
 from semstab.config import read_yaml, validated
@@ -101,54 +102,65 @@ def gate(new: str | os.PathLike[str], against: str | os.PathLike[str] | None, co
           passes: alpha > 0.6: 0.94...
     """
     parsed = [parse(text) for text in config.rules]
-    own = open_run(new)
+    run = open_run(new)
     base = None if against is None else open_run(against)
-    scenes = tuple(own.scenes) if base is None else shared_scenes([base, own])
-    runs, judgements = GateRuns(own, base, scenes), list[Judgement]()
-    notes = list(_notes(own, base, scenes))
+    scenes = tuple(run.scenes) if base is None else shared_scenes([base, run])
+    runs, judgements, notes = GateRuns(run, base, scenes), list[Judgement](), _notes(run, base, scenes)
     for given in parsed:
-        rules = given.of_each(own.scenes[scenes[0]].classes)
-        for rule in rules:
-            require_data(rule, own, base, scenes)
-        if given.class_name == ALL:
-            rules, absent = with_values(rules, runs)
-            notes += [
-                f"{given.text}: left out, as seen nowhere twice in {where}: {', '.join(names)}"
-                for where, names in absent.items()
-            ]
+        rules, notes_of_rules = _rules(given, runs)
+        notes += notes_of_rules
         for rule in rules:
             pairs = runs.pairs(rule)
             if given.class_name == ALL and is_lost(rule, pairs):
-                base_value = float(np.nanmean([value_of(rule, old) for _, old in pairs if old is not None]))
-                lost = dataclasses.replace(UNKNOWN, undecided=LOST)
-                judgements.append(Judgement(rule, "undecided", lost, math.nan, base_value))
+                judgements.append(_of_lost_class(rule, pairs))
                 continue
             require_values(rule, pairs)
             judgements.append(assess(rule, pairs, config.level / len(rules), config.scope))
             notes += [*coverage_counts(judgements[-1], pairs), *(runs.common[1] if runs.on_common(rule) else ())]
     notes += _without_frames(judgements, config.scope)
-    new_run, against_run = ("" if run is None else str(run) for run in (own, base))
+    baseline = "" if base is None else str(base)
     return GateResult(
-        new_run, against_run, scenes, config.level, config.undecided, tuple(judgements), tuple(dict.fromkeys(notes))
+        str(run), baseline, scenes, config.level, config.undecided, tuple(judgements), tuple(dict.fromkeys(notes))
     )
 
 
-def _notes(own: RunHandle, base: RunHandle | None, scenes: Sequence[str]) -> list[str]:
-    judged = [
-        f"{scene}: {run.name} is {why}"
-        for scene in scenes
-        for run in (own, base)
-        if run is not None and (why := run.scenes[scene].judged)
+def _rules(given: Rule, runs: GateRuns) -> tuple[tuple[Rule, ...], list[str]]:
+    """Return the rules that a given one stands for, all of which the runs have data for, and notes on others."""
+    rules = given.of_each(runs.new.scenes[runs.scenes[0]].classes)
+    for rule in rules:
+        require_data(rule, runs.new, runs.base, runs.scenes)
+    if given.class_name != ALL:
+        return rules, []
+    rules, absent = with_values(rules, runs)
+    return rules, [
+        f"{given.text}: left out, as seen nowhere twice in {where}: {', '.join(names)}"
+        for where, names in absent.items()
     ]
-    left = [scene for scene in own.scenes if scene not in scenes]
+
+
+def _of_lost_class(rule: Rule, pairs: Sequence[Pair]) -> Judgement:
+    """Return that a rule is undecided, with the mean of the baseline over the scenes where it has the class."""
+    base = float(np.nanmean([value_of(rule, old) for _, old in pairs if old is not None]))
+    return Judgement(rule, "undecided", dataclasses.replace(UNKNOWN, undecided=LOST), math.nan, base)
+
+
+def _notes(run: RunHandle, base: RunHandle | None, scenes: Sequence[str]) -> list[str]:
+    """Return notes on maps that say little, and on scenes that only one of the runs has."""
+    warned = [
+        f"{scene}: {each.name} is {why}"
+        for scene in scenes
+        for each in (run, base)
+        if each is not None and (why := each.scenes[scene].judged)
+    ]
+    left = [scene for scene in run.scenes if scene not in scenes]
     missing = [scene for scene in (base.scenes if base else ()) if scene not in scenes]
     text = [f"only the run has these scenes, which are left out: {', '.join(left)}"] if left else []
     text += [f"only the baseline has these scenes, which are left out: {', '.join(missing)}"] if missing else []
-    return judged + text
+    return warned + text
 
 
 def _without_frames(judgements: Sequence[Judgement], wanted: Scope) -> list[str]:
-    """Return which rules are judged for these frames, because the run does not tell frames apart in its map."""
+    """Return a note on rules whose intervals are for these frames, because the run has no sums by frame."""
     names = [
         each.rule.text
         for each in judgements

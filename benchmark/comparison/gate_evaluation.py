@@ -36,14 +36,14 @@ from semstab.statistics.intervals import counted, estimate, mean_of, mean_over_f
 from semstab.statistics.verdict import LEAST_CLASSES
 
 
-def require_data(rule: Rule, own: RunHandle, base: RunHandle | None, scenes: Sequence[str]) -> None:
+def require_data(rule: Rule, new: RunHandle, base: RunHandle | None, scenes: Sequence[str]) -> None:
     """Raise ConfigError or DataError for a rule whose scene, class, baseline or sums the runs do not have."""
     if rule.change is not None and base is None:
         raise ConfigError(f"rule '{rule.text}': a {rule.change} needs a baseline; give --against RUN")
     if rule.scene is not None and rule.scene not in scenes:
         raise ConfigError(f"rule '{rule.text}': no scene '{rule.scene}'; {nearest(rule.scene, scenes)}")
     for scene in [rule.scene] if rule.scene else scenes:
-        entries = [run.scenes[scene] for run in (own, base) if run is not None and (run is own or rule.change)]
+        entries = [run.scenes[scene] for run in (new, base) if run is not None and (run is new or rule.change)]
         if rule.class_name is not None and rule.class_name not in entries[0].classes:
             raise ConfigError(
                 f"rule '{rule.text}': no class '{rule.class_name}'; {nearest(rule.class_name, entries[0].classes)}"
@@ -57,7 +57,7 @@ def require_data(rule: Rule, own: RunHandle, base: RunHandle | None, scenes: Seq
         if len({entry.sums.voxel_size for entry in entries}) > 1:
             sizes = [entry.sums.voxel_size for entry in entries]
             raise DataError(
-                f"{own.where}: its voxels have {sizes[0]:g} m, those of the baseline {sizes[1]:g} m; run it with"
+                f"{new.where}: its voxels have {sizes[0]:g} m, those of the baseline {sizes[1]:g} m; run it with"
                 f" --voxel-size {sizes[1]:g}"
             )
 
@@ -100,7 +100,7 @@ def _k(rule: Rule, entry: Entry) -> int | None:
 class GateRuns:
     """The new run and its baseline, on the scenes of both."""
 
-    own: RunHandle
+    new: RunHandle
     base: RunHandle | None
     scenes: tuple[str, ...]
 
@@ -115,7 +115,7 @@ class GateRuns:
         notes: list[str] = []
         base = self.base.scenes if self.base is not None else {}
         for scene in filter(base.get, self.scenes):
-            new, old = self.own.scenes[scene], base[scene]
+            new, old = self.new.scenes[scene], base[scene]
             paired = on_common_observations({"the baseline": old, "the run": new})
             if paired is not None:
                 (old, new), compared, of_pairing = paired
@@ -129,25 +129,25 @@ class GateRuns:
         if self.on_common(rule):
             return [self.common[0][scene] for scene in named]
         base = self.base.scenes if self.base is not None and rule.change else {}
-        return [(self.own.scenes[scene], base.get(scene)) for scene in named]
+        return [(self.new.scenes[scene], base.get(scene)) for scene in named]
 
 
 def with_values(rules: Sequence[Rule], runs: GateRuns) -> tuple[tuple[Rule, ...], dict[str, list[str]]]:
     """Return the rules of classes that have a value everywhere, and the other classes by the run that has none.
 
     A class that only the baseline has stays: the run has lost it, and no drop of a measure shows that. Where no class
-    is left the rules stay, of which the first then says what it needs.
+    is left all rules are returned, and the first of them raises the error.
     """
-    there, absent = list[Rule](), dict[str, list[str]]()
+    with_value, absent = list[Rule](), dict[str, list[str]]()
     for rule in rules:
         pairs = runs.pairs(rule)
         entries = (entry for pair in pairs for entry in pair if entry is not None)
         lacking = next((entry.where for entry in entries if math.isnan(value_of(rule, entry))), None)
         if lacking is None or is_lost(rule, pairs):
-            there.append(rule)
+            with_value.append(rule)
         else:
             absent.setdefault(lacking, []).append(str(rule.class_name))
-    return tuple(there or rules), absent if there else {}
+    return tuple(with_value or rules), absent if with_value else {}
 
 
 LOST = "the baseline has this class, and the run gives it to no location that was seen twice"
@@ -165,7 +165,7 @@ NOTHING = "no location that it needs was seen twice"
 SCORES = "one run has labels and the other scores, which spread their evidence; run both as labels"
 
 OF_EVIDENCE = (PSA, VOXEL_ALPHA, RECURRENT_VSS, SBD_EXCESS, ECE)
-"""Measures that depend on the output of a model, labels or scores, as do those of the register."""
+"""Measures that depend on the output of a model, labels or scores, as do all measures of the register."""
 
 
 def require_values(rule: Rule, pairs: Sequence[Pair]) -> None:
@@ -267,7 +267,7 @@ def coverage_counts(judgement: Judgement, pairs: Sequence[Pair]) -> list[str]:
     if not judgement.counted:
         return []
     shares = [shares_of(new.sums, base.sums) for new, base in pairs if base is not None]
-    voxels, observations = (float(np.mean([own[name] for own in shares])) for name in ("voxels", "observations"))
+    voxels, observations = (float(np.mean([share[name] for share in shares])) for name in ("voxels", "observations"))
     where = f" of {judgement.rule.scene}" if judgement.rule.scene else ""
     return [
         f"coverage{where}: {100 * voxels:.1f} % of the baseline's voxels with OP >= 2,"

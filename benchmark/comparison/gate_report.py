@@ -105,8 +105,8 @@ def _ends(result: GateResult) -> str:
 
 
 def _scenes(result: GateResult) -> str:
-    some = ", ".join(result.scenes[:3])
-    return some if len(result.scenes) <= 3 else f"mean of {len(result.scenes)} scenes: {some}, ..."
+    first = ", ".join(result.scenes[:3])
+    return first if len(result.scenes) <= 3 else f"mean of {len(result.scenes)} scenes: {first}, ..."
 
 
 # --- Files ------------------------------------------------------------------------------------------------------------

@@ -82,7 +82,7 @@ class Judgement:
 
     @property
     def about(self) -> str:
-        """The scope of the interval: what varies."""
+        """The scope of the interval, see `Interval`."""
         return self.interval.scope
 
     def frames_needed(self, level: float) -> int | None:

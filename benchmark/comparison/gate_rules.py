@@ -64,7 +64,7 @@ MEASURES = (
     GateMeasure(PRECISION, "precision", of_all=False, of_class=True, if_missing=TRUTH),
     GateMeasure(IOU, "iou", of_all=False, of_class=True, if_missing=TRUTH),
 )
-"""Measures in the order of lists, before those of the register."""
+"""Measures in the order of lists; the measures of the register follow."""
 
 
 def gate_measures() -> tuple[GateMeasure, ...]:
@@ -83,7 +83,7 @@ def measure_named(name: str, where: str) -> GateMeasure:
         ConfigError: If there is no such measure; the message starts with `where`.
     """
     known = gate_measures()
-    named = {_plain(own): each for each in reversed(known) for own in (each.name, each.quantity.title, *each.also)}
+    named = {_plain(word): each for each in reversed(known) for word in (each.name, each.quantity.title, *each.also)}
     if _plain(name) not in named:
         raise ConfigError(f"{where}: no measure '{name}'; {nearest(_plain(name), [each.name for each in known])}")
     return named[_plain(name)]

@@ -80,8 +80,8 @@ class Belief:
 
     def settings(self) -> dict[str, object]:
         """Return the criteria for JSON."""
-        own = {field.name: getattr(self, field.name) for field in dataclasses.fields(self)}
-        return own | {"thresholds": None if self.thresholds is None else self.thresholds.model_dump(by_alias=True)}
+        criteria = {field.name: getattr(self, field.name) for field in dataclasses.fields(self)}
+        return criteria | {"thresholds": None if self.thresholds is None else self.thresholds.model_dump(by_alias=True)}
 
 
 class FusedLabels:
@@ -101,38 +101,38 @@ class FusedLabels:
         everywhere = dataclasses.replace(frame, labels=np.zeros(frame.shape, np.uint8), scores=None)
         points = back_project(everywhere).T
         labels, fused = np.full(len(points), UNSEEN), np.full(frame.shape, UNSEEN)
-        own = (
+        vote = (
             observe(frame.every(pixel_stride), self._tiles.voxel_size, self._K) if self._belief.leave_one_out else None
         )
         for tile, pixels in self._tiles.holding(points):
-            labels[pixels] = self._labels(self._lookups[tile], points[pixels], own)
+            labels[pixels] = self._labels(self._lookups[tile], points[pixels], vote)
         fused[everywhere.valid] = labels
         return fused
 
-    def _labels(self, lookup: VoxelLookup, points: Float64, own: Observations | None) -> Int64:
+    def _labels(self, lookup: VoxelLookup, points: Float64, vote: Observations | None) -> Int64:
         """Return the classes (n,) of points in a tile."""
         voxel = lookup.rows(points)
         met = voxel != NONE
         rows, inverse = np.unique(voxel[met], return_inverse=True)
         seen = rows_of(lookup.table, rows)
-        if own is not None:
-            seen = _without(own, lookup, seen, rows)
+        if vote is not None:
+            seen = _without(vote, lookup, seen, rows)
         label = np.where(self._belief.of(seen), dominant(seen), UNSTABLE)
         labels = np.full(len(points), UNSEEN)
         labels[met] = label[inverse]
         return labels
 
 
-def _without(own: Observations, lookup: VoxelLookup, seen: VoxelTable, rows: Int64) -> VoxelTable:
+def _without(vote: Observations, lookup: VoxelLookup, seen: VoxelTable, rows: Int64) -> VoxelTable:
     """Return the voxels of a tile that a frame sees, `rows` of it, without the frame's own vote."""
-    centers = np.add(own.index, 0.5, dtype=np.float64) * seen.voxel_size
+    centers = np.add(vote.index, 0.5, dtype=np.float64) * seen.voxel_size
     seen_rows = lookup.rows(centers)
-    here = seen_rows != NONE
-    at = np.searchsorted(rows, seen_rows[here])
+    met = seen_rows != NONE
+    at = np.searchsorted(rows, seen_rows[met])
     evidence, op, self_sum = seen.evidence[:], seen.op.copy(), seen.self_sum.copy()
-    evidence[at] = np.abs(np.round(evidence[at] - own.s_bar[here], DECIMALS))
+    evidence[at] = np.abs(np.round(evidence[at] - vote.s_bar[met], DECIMALS))
     op[at] -= 1
-    self_sum[at] -= (own.s_bar[here] ** 2).sum(axis=1)
+    self_sum[at] -= (vote.s_bar[met] ** 2).sum(axis=1)
     return dataclasses.replace(seen, evidence=Evidence.of(evidence), op=op, self_sum=self_sum)
 
 

@@ -11,6 +11,7 @@ import numpy as np
 from semstab.core.types import Int64
 from semstab.data.frames import Frame
 from semstab.exports.fused_labels import UNSEEN, UNSTABLE
+from semstab.statistics.correctness import mean_iou
 
 
 @dataclass(frozen=True)
@@ -25,9 +26,7 @@ class Accuracy:
     def of(cls, confusion: Int64) -> Accuracy:
         """Return the accuracy of pixels (K, K) by true and given class; a class without pixels does not count."""
         right, n = confusion.diagonal(), int(confusion.sum())
-        union = confusion.sum(axis=0) + confusion.sum(axis=1) - right
-        there = union > 0
-        miou = float((right[there] / union[there]).mean()) if there.any() else math.nan
+        miou = mean_iou(right, confusion.sum(axis=1), confusion.sum(axis=0))
         return cls(n, float(right.sum() / n) if n else math.nan, miou)
 
 
@@ -98,9 +97,9 @@ class Tally:
         self.counts = dict.fromkeys(("pixels", "confirmed", "changed", "filled", "unseen", "unstable"), 0)
         self._confusion = {name: np.zeros((K, K), np.int64) for name in ("all_before", "before", "after", "all_after")}
 
-    def add(self, own: Frame, fused: Int64, truth: Frame | None) -> None:
+    def add(self, frame: Frame, fused: Int64, truth: Frame | None) -> None:
         """Count the pixels of a frame, its fused rows (H, W), and its ground truth in the same classes."""
-        before = np.where(own.predicted == own.ignore_id, UNSEEN, own.predicted.astype(np.int64))
+        before = np.where(frame.predicted == frame.ignore_id, UNSEEN, frame.predicted.astype(np.int64))
         had, has = before >= 0, fused >= 0
         masks = {
             "pixels": np.ones(fused.shape, np.bool_),

@@ -38,8 +38,8 @@ ONE_CLASS = 0.9
 
 def noted(result: Result) -> Iterator[str]:
     """Yield what `check` notes of the scenes: labels or images that are not registered to the depth, and the like."""
-    for scene, own in result.notes.items():
-        yield from (f"{scene}: {text}" if len(result.scenes) > 1 else text for text in own)
+    for scene, notes in result.notes.items():
+        yield from (f"{scene}: {text}" if len(result.scenes) > 1 else text for text in notes)
 
 
 def warnings(result: Result) -> Iterator[str]:
@@ -90,11 +90,11 @@ def _one_class_covers(runs: Sequence[UnitSummary]) -> Iterator[str]:
     for run in filter(_one_class, runs):
         largest = max(run.table.classes, key=lambda row: row.voxels)
         covering.setdefault(largest.name, []).append((run.unit.model, largest.share))
-    for name, own in covering.items():
-        all_of_them = len(own) == len(runs)
-        of = "" if all_of_them else f" of {', '.join(dict.fromkeys(model for model, _ in own))}"
-        more = " or more" if len({f"{share:.0%}" for _, share in own}) > 1 else ""
-        least = min(share for _, share in own)
+    for name, shares in covering.items():
+        all_of_them = len(shares) == len(runs)
+        of = "" if all_of_them else f" of {', '.join(dict.fromkeys(model for model, _ in shares))}"
+        more = " or more" if len({f"{share:.0%}" for _, share in shares}) > 1 else ""
+        least = min(share for _, share in shares)
         covers = f"'{name}' covers {round(100 * least)}%{more} of the map{of}, and determines most of its numbers"
         if least >= NOTHING_ELSE:
             yield f"{covers}; what is left without it is too little to assess: take another model, or another scene"
@@ -175,7 +175,7 @@ def _suspicions(record: Record) -> Iterator[str]:
 
 
 def _traffic(record: Record) -> Iterator[str]:
-    """Yield that most disagreement is of what moves, where frames would agree much better without it."""
+    """Yield a warning where most disagreement is at classes that move, and frames agree much better without them."""
     cells = None if record.statistics is None else record.statistics.cells
     if cells is None or (moving := cells.moving) is None or moving.disagreement < MOSTLY_MOVING:
         return

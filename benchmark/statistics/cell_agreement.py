@@ -19,7 +19,7 @@ from semstab.statistics.observations import CellObservations
 from semstab.statistics.verdict import LIMITS, Limits
 
 LITTLE, MUCH = 0.01, 0.1
-"""The shares of the disagreement from which on a class that moves, and all of them together, are looked into."""
+"""The shares of the disagreement from which on a class that moves, and all of them together, are analysed."""
 
 
 def cell_agreement(
@@ -44,8 +44,10 @@ def cell_agreement(
     assert fine is not None
     names, named = sums.classes or tuple(str(k) for k in range(table.K)), set(critical) & set(sums.classes)
     locations = np.bincount(dominant(table)[table.op >= 2], minlength=table.K).tolist()
-    own, evidence = scope_of(sums, scope), fine["evidence"].sum(axis=0)
-    alphas = confidence_intervals(spec_of(sums, "alpha", k, own) for k in range(table.K) if table.K <= MOST_CLASSES)
+    scope_of_cells, evidence = scope_of(sums, scope), fine["evidence"].sum(axis=0)
+    alphas = confidence_intervals(
+        spec_of(sums, "alpha", k, scope_of_cells) for k in range(table.K) if table.K <= MOST_CLASSES
+    )
     n, largest = float(fine["observations"].sum()), int(evidence.argmax())
     disagreement = _disagreement(evidence / n if n else evidence, np.array([alpha.value for alpha in alphas]))
     moving = [k for k in labels.moving(names) if k < len(disagreement) and disagreement[k] >= LITTLE]
@@ -75,18 +77,18 @@ def cell_agreement(
 
 
 def moving_classes(cells: CellObservations, sums: ClusterSums, moving: Sequence[int]) -> MovingClasses | None:
-    """Return what locations of these classes have of the disagreement, and alpha without them; `sums` are of all.
+    """Return the share of the disagreement at locations of these classes, and alpha without them; None without any.
 
-    None where so few cells leave no disagreement to share.
+    The sums are of all cells.
     """
 
-    def disagreeing(own: ClusterSums, alpha: float) -> float:
-        fine = own.fine
+    def disagreeing(of: ClusterSums, alpha: float) -> float:
+        fine = of.fine
         assert fine is not None
         return float(fine["observations"].sum()) * (1 - alpha) * (1 - chance_of(fine))
 
     rest = sums_of_cells(cells.without(moving))
-    whole, alpha = (min(value(own, "alpha"), 1.0) for own in (sums, rest))  # extrapolated to cells without a size
+    whole, alpha = (min(value(each, "alpha"), 1.0) for each in (sums, rest))  # extrapolated to cells without a size
     if not (everywhere := disagreeing(sums, whole)) > 0:
         return None
     share = 1 - disagreeing(rest, alpha) / everywhere
@@ -98,6 +100,6 @@ def _disagreement(shares: Float64, alpha: Float64) -> Float64:
 
     A class against all others disagrees with the probability (1 - alpha) 2 p (1 - p).
     """
-    own = np.nan_to_num((1 - alpha) * shares[: len(alpha)] * (1 - shares[: len(alpha)])).clip(min=0)
-    total = own.sum()
-    return own / total if total > 0 else np.full(len(own), np.nan)
+    weight = np.nan_to_num((1 - alpha) * shares[: len(alpha)] * (1 - shares[: len(alpha)])).clip(min=0)
+    total = weight.sum()
+    return weight / total if total > 0 else np.full(len(weight), np.nan)

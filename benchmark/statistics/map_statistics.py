@@ -98,8 +98,8 @@ class Analysis:
         """Return the numbers of each frame by its index, as the time series names them; see `LoneDisagreement`."""
         if self.lone is None:
             return {}
-        found = self.summary.outlying_frames
-        named = {each.frame for each in found.frames} if found else set()
+        outlying = self.summary.outlying_frames
+        named = {each.frame for each in outlying.frames} if outlying else set()
         rows = zip(self.lone.frame.tolist(), self.lone.share.tolist(), self.lone.null.tolist(), strict=True)
         return {
             frame: {"lone_percent": 100 * share, "lone_null_percent": 100 * null, "outlying": int(frame in named)}
@@ -172,8 +172,8 @@ def analyse(
 ) -> Analysis:
     """Return all statistics of one map; the same seed gives the same numbers.
 
-    Intervals are at CONFIDENCE, those of all other numbers for these frames; undefined numbers are NaN, and a section
-    that cannot be computed is None.
+    Intervals are at CONFIDENCE, and for these frames where `scope` does not apply; undefined numbers are NaN, and a
+    section that cannot be computed is None.
 
     Args:
         sample: The map, or a sample of it, with its log and the ground truth.
@@ -316,7 +316,7 @@ def _strata(
         means = sums / count
     return tuple(
         StratumStatistics(
-            stratum.name, stratum.voxels, stratum.means, **dict(zip(BY_STRATUM, own.tolist(), strict=True))
+            stratum.name, stratum.voxels, stratum.means, **dict(zip(BY_STRATUM, of_stratum.tolist(), strict=True))
         )
-        for stratum, own in zip(whole.strata, means, strict=True)
+        for stratum, of_stratum in zip(whole.strata, means, strict=True)
     )

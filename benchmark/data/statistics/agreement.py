@@ -122,9 +122,9 @@ class RangeAgreement:
 
     @property
     def is_told(self) -> bool:
-        """Return whether the number is for people: labels may be unreliable farther out, and are reliable near by.
+        """Return whether the number is printed: labels are reliable near by and may not be farther out, or at no range.
 
-        Or they are so at no range; what is not known either way is the verdict's to say.
+        Where neither is known, the verdict alone is printed.
         """
         return self.low < self.farthest and (self.reliable > 0 or self.high == 0)
 
@@ -135,15 +135,15 @@ class RangeAgreement:
 
     @property
     def parts(self) -> tuple[str, str]:
-        """Return the number, and what belongs to it: ('up to 30 m', '(20 to 50 m)')."""
+        """Return the number, and its interval or the reason: ('up to 30 m', '(20 to 50 m)')."""
         if self.reliable:
             ends = "" if self.low == self.high else f"{self.low:g} to {self.high:g} m"
             far = "the farthest seen" if self.reliable == self.farthest else ""
             note = ", ".join(filter(None, (ends, far)))
             return f"up to {self.reliable:g} m", note and f"({note})"
         first = next((row for row in self.strata if not math.isnan(row.alpha.value)), self.strata[0])
-        found = f"(alpha {first.alpha.text()} from {first.low:g} to {first.high:g} m)"
-        return "at no range", found
+        text = f"(alpha {first.alpha.text()} from {first.low:g} to {first.high:g} m)"
+        return "at no range", text
 
 
 @dataclass(frozen=True)

@@ -51,7 +51,7 @@ class FlipRates:
 
 @dataclass(frozen=True)
 class DriftStatistics:
-    """SBD in bits, and that of the same observations in random order, over the `voxels` where that is known."""
+    """SBD in bits, and SBD of the same observations in random order, the null, over the `voxels` that have one."""
 
     voxels: int
     sbd: Interval
@@ -90,8 +90,8 @@ class OutlyingFrames:
     """The frames that stand alone more often than frames of the same quality do.
 
     Attributes:
-        judged: Number of views that could be judged; 0 where they are too few for one to stand out.
-        unjudged: Number of views that see too few places which two other views saw.
+        judged: Number of views that were tested; 0 where they are too few for one to stand out.
+        unjudged: Number of views that see too few places which two other views saw, and were not tested.
         usual: Mean excess of the frames that are not named.
         frames: Those that are named, the largest excess first.
     """

@@ -76,8 +76,8 @@ def _by_method(result: Result) -> dict[str, dict[str, ImageSpace]]:
 
 
 def _numbers(scenes: Iterable[ImageSpace]) -> Row:
-    own = mean_over_scenes(scenes)
+    mean = mean_over_scenes(scenes)
     return (
-        own.flicker_percent, own.compensated_flicker_percent, 100 * own.compensated_share, own.vc8, own.vc16,
-        own.self_vc8, own.self_vc16,
+        mean.flicker_percent, mean.compensated_flicker_percent, 100 * mean.compensated_share, mean.vc8, mean.vc16,
+        mean.self_vc8, mean.self_vc16,
     )  # fmt: skip

@@ -62,7 +62,7 @@ def overview(result: Result) -> list[Table]:
     records = result.select()
     if not records:
         return []
-    rows = tuple(_row(name, own) for name, own in by_model(records).items())
+    rows = tuple(_row(name, of_model) for name, of_model in by_model(records).items())
     caption = (
         f"{settings(records)} The means are pooled over the voxels of all scenes; alpha and flicker are macro means of"
         f" the scenes; pixel flicker includes the camera's motion. {SBD_OVER}"
@@ -138,15 +138,15 @@ def persistence(result: Result) -> list[Table]:
         return []
     columns = (Column("persistence", "Persistence"), VOXELS, SHARE, *of_measures())
     groups = []
-    for name, own in by_model(records).items():
-        together = pooled(own)
+    for name, of_model in by_model(records).items():
+        together = pooled(of_model)
         rows = (*together.strata, *together.well_seen)
         groups.append(Group(name, tuple(_means_row(row) for row in rows), _means_row(together.recurrent)))
     caption = (
         f"{settings(records)} The means are pooled: they run over the voxels of all scenes together. The last row is"
         " the recurrent voxels. A voxel seen once has no SBD; if its pixels agree, its VSS is 1 and its entropy is 0."
     )
-    if any(split_last([record.summary.table for record in own]) for own in by_model(records).values()):
+    if any(split_last([record.summary.table for record in of_model]) for of_model in by_model(records).values()):
         caption += " If most voxels are in the last stratum, its parts follow."
     return [Table("persistence", "Stability by observation persistence", caption, columns, tuple(groups))]
 

@@ -147,11 +147,11 @@ def to_csv(table: Table) -> str:
     text = io.StringIO()
     writer = csv.writer(text, lineterminator="\n")
     parts = [_csv_parts([row[k] for _, row in table.rows()]) for k in range(len(table.columns))]
-    keys = [[f"{column.key}{part}" for part in own] for column, own in zip(table.columns, parts, strict=True)]
+    keys = [[f"{column.key}{part}" for part in names] for column, names in zip(table.columns, parts, strict=True)]
     last = [csv_text(table.benchmark)] if table.benchmark else []
     writer.writerow([*_leading(table, table.by), *itertools.chain(*keys), *(["benchmark"] if last else [])])
     for group, row in table.rows():
-        cells = (_csv_cells(column, cell, own) for column, cell, own in zip(table.columns, row, parts, strict=True))
+        cells = (_csv_cells(column, cell, names) for column, cell, names in zip(table.columns, row, parts, strict=True))
         writer.writerow([*_leading(table, group), *itertools.chain(*cells), *last])
     return text.getvalue()
 

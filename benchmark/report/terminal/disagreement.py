@@ -13,12 +13,12 @@ from semstab.report.narrative import outlying_line
 from semstab.report.terminal.layout import WIDTH, cut
 
 MAJORITY = 0.5
-"""A class with this share of the map or more is not listed beside others of several models: all disagree with it."""
+"""A class with this share of the map or more is not listed for several models: all other classes disagree with it."""
 
 CONFUSED = "confused with"
 CLASS_HEAD = ("classes that disagree most", "alpha", CONFUSED, "of map", "disagreement")
 CLASS_COLUMNS, LEAST_CLASS = 32, 28
-"""The columns of a line of classes beside its two names, and the least of the first name."""
+"""The columns of a line of classes without its two names, and the least width of the first name."""
 
 CONTRIBUTES = 0.01
 """The least share of the disagreement of a class that is listed."""
@@ -28,15 +28,18 @@ MOST_CLASSES = {1: 5, 2: 3}
 
 
 def class_lines(records: Sequence[Record], width: int, begin: str = "") -> Iterator[str]:
-    """Yield the classes with most of the disagreement, and which class is not listed; names without a beginning."""
+    """Yield a line for each of the classes with most of the disagreement, and the classes that are not listed.
+
+    Names of models are printed without their common beginning `begin`.
+    """
     names = list(dict.fromkeys(record.unit.model for record in records))
     most, alone = MOST_CLASSES.get(len(records), 1), len(names) == 1
     rows: list[tuple[str, str, str, str, str]] = []
     left_out: dict[str, None] = {}
     for name in names:
-        own = [record for record in records if record.unit.model == name]
-        classes, shares = class_means(own), _class_shares(own)
-        others = {k: v for record in own for k, v in record.summary.table.confused_with.items()}
+        of_model = [record for record in records if record.unit.model == name]
+        classes, shares = class_means(of_model), _class_shares(of_model)
+        others = {k: v for record in of_model for k, v in record.summary.table.confused_with.items()}
         listed = sorted(
             (key for key, (_, disagreement) in classes.items() if disagreement >= CONTRIBUTES and key in shares),
             key=lambda key: -classes[key][1],
@@ -67,7 +70,9 @@ def class_means(records: Sequence[Record]) -> dict[str, tuple[float, float]]:
         for row in () if statistics.cells is None else statistics.cells.classes:
             if not (math.isnan(row.alpha.value) or math.isnan(row.disagreement)):
                 known.setdefault(row.name, []).append((row.alpha.value, row.disagreement))
-    return {name: (macro_mean([a for a, _ in own]), macro_mean([d for _, d in own])) for name, own in known.items()}
+    return {
+        name: (macro_mean([a for a, _ in values]), macro_mean([d for _, d in values])) for name, values in known.items()
+    }
 
 
 def _class_shares(records: Sequence[Record]) -> dict[str, float]:
@@ -82,11 +87,11 @@ def _class_shares(records: Sequence[Record]) -> dict[str, float]:
 def outlying_lines(records: Sequence[Record]) -> Iterator[str]:
     """Yield the frames that stand out; of several maps only where there are some."""
     for record in records:
-        found = None if record.statistics is None else record.statistics.outlying_frames
-        if found is None or (len(records) > 1 and not found.frames):
+        outlying = None if record.statistics is None else record.statistics.outlying_frames
+        if outlying is None or (len(records) > 1 and not outlying.frames):
             continue
         scene = record.unit.scene if len({each.unit.scene for each in records}) > 1 else ""
         of = ", ".join(name for name in (scene, record.unit.model) if name) if len(records) > 1 else ""
         yield from textwrap.wrap(
-            outlying_line(found, of), WIDTH, initial_indent="  ", subsequent_indent="    ", break_on_hyphens=False
+            outlying_line(outlying, of), WIDTH, initial_indent="  ", subsequent_indent="    ", break_on_hyphens=False
         )

@@ -18,7 +18,7 @@ def head_lines(name: str, result: Result, runs: Sequence[UnitSummary], width: in
     frames = sorted({run.frames for run in runs})
     counts = f"{frames[0]} to {frames[-1]}" if len(frames) > 1 else f"{frames[0]}"
     cells = [run.statistics.cells for run in runs if run.statistics is not None]
-    views = min((own.views for own in cells if own is not None and own.views < own.frames), default=None)
+    views = min((each.views for each in cells if each is not None and each.views < each.frames), default=None)
     seen = "" if views is None else f" of {views} distinct views"
     chosen = " (chosen)" if any(advice.chosen for advice in result.advice.values()) else ""
     classes = " and ".join(map(str, sorted({run.table.K for run in runs})))
@@ -41,7 +41,7 @@ def _geometry(result: Result) -> str:
 
 
 def _scope(runs: Sequence[UnitSummary]) -> str:
-    """Return that intervals and verdicts are for the frames of a run alone, where these are too few for more."""
+    """Return a note where intervals and verdicts are for the frames of a run alone, as they are too few for more."""
     alphas = [run.statistics.headline.alpha for run in runs if run.statistics is not None]
     few = [alpha for alpha in alphas if alpha.scope == THESE_FRAMES and alpha.frames]
     of = "" if len(few) == len(alphas) else f" in {len(few)} of {len(alphas)} rows"

@@ -44,21 +44,21 @@ def cut(name: str, size: int) -> str:
 
 
 LONG_NAME = 16
-"""Characters from which on a model's name is written without what all names begin with."""
+"""Length from which on names of models are printed without their common beginning."""
 
 
 def common_beginning(names: Sequence[str]) -> str:
-    """Return what the names of models begin with, up to a sign between words; '' where that makes none much shorter."""
+    """Return the common beginning of the names of models, up to a space, '_' or '-'; '' where it is short."""
     same = itertools.takewhile(lambda letters: len({*letters}) == 1, zip(*names, strict=False))
-    found = re.match(r".*[ _-]", "".join(letters[0] for letters in same))
-    begin = found[0] if found and len(names) > 1 else ""
+    to_last_sign = re.match(r".*[ _-]", "".join(letters[0] for letters in same))
+    begin = to_last_sign[0] if to_last_sign and len(names) > 1 else ""
     return begin if len(begin) > LEAST_NAME and max(map(len, names)) > LONG_NAME and begin not in names else ""
 
 
 def percents(shares: Sequence[float]) -> list[str]:
-    """Return shares of one whole in percent, rounded so that they sum to what the shares do; '-' where undefined.
+    """Return shares of one whole in percent, rounded so that they keep their sum; '-' where undefined.
 
-    Those whose rounding down loses most are rounded up.
+    The shares that rounding down makes smaller by most are rounded up.
     """
     if any(map(math.isnan, shares)):
         return [percent(share) for share in shares]

@@ -110,8 +110,8 @@ def _where(result: Result, out: Path | None, seconds: float | None) -> Iterator[
         stages = {STAGE_NAMES.get(k, k): v for k, v in result.manifest.get("seconds", {}).items() if k != "all"}
         longest = sorted(stages, key=lambda name: -stages[name])[:3]
         parts = ", ".join(f"{name} {stages[name]:.0f}" for name in longest if stages[name] >= 1)
-        here = result.manifest.get("units", {}).get("executor") == InProcess.name
-        what = f"longest stages{'' if here else ', all workers'}"  # of all workers they may exceed the run's time
+        in_process = result.manifest.get("units", {}).get("executor") == InProcess.name
+        what = f"longest stages{'' if in_process else ', all workers'}"  # of all workers they may exceed the run's time
         yield f"  {seconds:.0f} s{f' ({what}: {parts})' if parts else ''}"
     if speeds := _speeds(result):
         yield from wrapped(f"predicted: {speeds}")

@@ -23,7 +23,7 @@ DRIFT = ("sbd_excess", "sbd_known")
 WITH_TRUTH = ("known", "right", "observed", "observed_right", "consistent", "consistent_wrong")
 BY_TRUE_CLASS = ("class_known", "class_right", "class_predicted")
 WITHOUT_FRAMES = (*DRIFT, "calibrated", "gap")
-"""Sums that belong to no frame: they stand in rows whose frame is -1, as those of the register of measures."""
+"""Sums that belong to no frame: they stand in rows whose frame is -1, as do sums of the register of measures."""
 
 
 def of_measure(key: str) -> tuple[str, str]:
@@ -33,9 +33,9 @@ def of_measure(key: str) -> tuple[str, str]:
 
 @functools.lru_cache(maxsize=16)
 def layout(K: int, *, truth: bool, measured: tuple[str, ...] = ()) -> Mapping[str, slice]:
-    """Return the columns of the sums for each name; those by class have K columns, `gap` one for each bin.
+    """Return the columns of the sums by name: K columns for sums by class, one for each bin for `gap`, else one.
 
-    Those of the measures with these keys come last.
+    Columns of the measures with the keys `measured` come last.
     """
     by_class = K <= MOST_CLASSES
     widths = [(name, 1) for name in PLAIN] + [("evidence", K)]
@@ -79,7 +79,7 @@ class FirstColumns(NamedTuple):
 
     @classmethod
     def of(cls, K: int, *, truth: bool) -> FirstColumns:
-        """Return those of a layout."""
+        """Return the first columns of a layout with K classes."""
         columns = layout(K, truth=truth)
         return cls(*(columns[name].start if name in columns else -1 for name in cls._fields))
 
@@ -90,9 +90,9 @@ def width(K: int, *, truth: bool, measured: tuple[str, ...] = ()) -> int:
 
 
 def column_names(K: int, *, truth: bool, measured: tuple[str, ...] = ()) -> list[str]:
-    """Return the names of the columns in a file."""
+    """Return the name of each column in a file: NAME, or NAME_k for class or bin k."""
     return [
-        f"{name}_{k}" if own.stop - own.start > 1 else name
-        for name, own in layout(K, truth=truth, measured=measured).items()
-        for k in range(own.stop - own.start)
+        f"{name}_{k}" if where.stop - where.start > 1 else name
+        for name, where in layout(K, truth=truth, measured=measured).items()
+        for k in range(where.stop - where.start)
     ]

@@ -32,15 +32,15 @@ def iou_of(sums: Float64) -> Float64:
 
 
 def miou_of(sums: Float64) -> Float64:
-    """Return its mean (...,) over the classes that are true or predicted anywhere.
+    """Return mean intersection over union (...,) over the classes that are true or predicted anywhere.
 
-    The sums are a count twice, then the same three.
+    The sums (..., 2 + 3 K) are a count twice, then of each class the right, the true and the predicted.
     """
     right, true, predicted = np.split(sums[..., 2:], 3, axis=-1)
     union = true + predicted - right
-    there = union.real > 0
+    defined = union.real > 0
     with np.errstate(invalid="ignore", divide="ignore"):
-        mean: Float64 = np.where(there, right / np.where(there, union, 1), 0).sum(axis=-1) / there.sum(axis=-1)
+        mean: Float64 = np.where(defined, right / np.where(defined, union, 1), 0).sum(axis=-1) / defined.sum(axis=-1)
     return mean
 
 
@@ -53,7 +53,7 @@ def ece_of(sums: Float64) -> Float64:
 
 
 def class_alpha_of(sums: Float64) -> Float64:
-    """Return alpha (...,) of a class against all others, from sums apart, observations, evidence, own squares."""
+    """Return alpha (...,) of a class against all others from the sums `CLASS_SUMS` (..., 4)."""
     apart, n, total, squares = np.moveaxis(sums, -1, 0)
     with np.errstate(invalid="ignore", divide="ignore"):
         expected = 2 * ((n - 1) * total - total**2 + squares) / (n * (n - 1))
@@ -126,7 +126,7 @@ predicted (precision), and intersection over union."""
 
 
 def summed() -> tuple[Measure, ...]:
-    """Return the measures of the register that have sums over the voxels; others have their own over observations."""
+    """Return the measures of the register whose sums are over voxels; the other ones have sums over observations."""
     return tuple(measure for measure in measures() if measure.key not in FUNCTIONALS)
 
 
@@ -140,31 +140,33 @@ def functional(key: str, k: int | None = None) -> Functional:
     """Return the number that a key stands for: of all classes, or of class k."""
     if k is not None:
         return BY_CLASS[key]
-    return FUNCTIONALS[key] if key in FUNCTIONALS else mean_over_voxels({own.key: own for own in summed()}[key])
+    if key in FUNCTIONALS:
+        return FUNCTIONALS[key]
+    return mean_over_voxels({measure.key: measure for measure in summed()}[key])
 
 
 def parts_of(sums: ClusterSums, number: Functional) -> tuple[tuple[ClusterSums, float], ...]:
     """Return the sums that a number is of, each with its weight; none where they are missing."""
     of = {"map": sums, "fine": sums.fine, "coarse": sums.coarse}
-    there = [(part, weight) for name, weight in number.parts if (part := of[name]) is not None]
-    known = all(set(number.names) <= set(part.layout) for part, _ in there)
-    return tuple(there) if known and len(there) == len(number.parts) else ()
+    present = [(part, weight) for name, weight in number.parts if (part := of[name]) is not None]
+    known = all(set(number.names) <= set(part.layout) for part, _ in present)
+    return tuple(present) if known and len(present) == len(number.parts) else ()
 
 
 def columns_of(part: ClusterSums, key: str, k: int | None = None) -> Float64:
     """Return the sums (m, C) of a part that a number is of."""
-    own = [part[name] for name in functional(key, k).names]
+    selected = [part[name] for name in functional(key, k).names]
     if k is not None:
-        own = [columns[:, min(k, columns.shape[1] - 1)][:, None] for columns in own]
-    return np.concatenate(own, axis=1)
+        selected = [columns[:, min(k, columns.shape[1] - 1)][:, None] for columns in selected]
+    return np.concatenate(selected, axis=1)
 
 
 def value(sums: ClusterSums, key: str, k: int | None = None) -> float:
     """Return the number; NaN where undefined."""
     number = functional(key, k)
     parts = parts_of(sums, number)
-    own = [weight * float(number.of(columns_of(part, key, k).sum(axis=0))) for part, weight in parts]
-    return sum(own) if own else math.nan
+    weighted = [weight * float(number.of(columns_of(part, key, k).sum(axis=0))) for part, weight in parts]
+    return sum(weighted) if weighted else math.nan
 
 
 def frames_of(sums: ClusterSums, key: str, k: int | None = None) -> int:

@@ -11,14 +11,14 @@ import numpy.typing as npt
 from semstab.core.types import Float64, Int32, Int64, Mask
 
 MOST_CELLS, MOST_GROUPS = 256, 64
-"""Most cubes of space and groups of frames that are kept apart."""
+"""Largest number of cubes of space, and of groups of frames."""
 
 MOST_SUMS = 2**24
-"""Most numbers in the sums: with thousands of classes fewer groups of frames are kept apart."""
+"""Most numbers in the sums: with thousands of classes there are fewer groups of frames."""
 
 
 def most_groups(K: int) -> int:
-    """Return how many groups of frames are kept apart with K classes."""
+    """Return the largest number of groups of frames with K classes."""
     return max(1, min(MOST_GROUPS, MOST_SUMS // (MOST_CELLS * K)))
 
 
@@ -79,14 +79,14 @@ def distinct_rows(rows: npt.NDArray[np.integer]) -> tuple[Int64, Int64]:
 
 
 def cubes_of(
-    index: tuple[Int32, Int32, Int32], voxel_size: float, edge: float | None = None, some: Mask | None = None
+    index: tuple[Int32, Int32, Int32], voxel_size: float, edge: float | None = None, counted: Mask | None = None
 ) -> tuple[Int32, Int32, float]:
     """Return the cubes (G, 3) that hold voxels of index columns (n,), the cube (n,) of each voxel, and their edge.
 
-    A cube is floor(voxel centre / edge). Only `some` (n,) of the voxels count, the others are in -1. The edge, unless
+    A cube is floor(voxel centre / edge). Only the voxels `counted` (n,) count, the others are in -1. The edge, unless
     it is given, is the smallest power of 2 metres, no smaller than a voxel, that leaves at most MOST_CELLS cubes.
     """
-    rows = np.arange(len(index[0])) if some is None else np.flatnonzero(some)
+    rows = np.arange(len(index[0])) if counted is None else np.flatnonzero(counted)
     doubled = edge is None
     edge = 2.0 ** math.ceil(math.log2(voxel_size) - 1e-9) if edge is None else edge
     scale = voxel_size / edge

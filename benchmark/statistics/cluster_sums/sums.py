@@ -100,16 +100,16 @@ class ClusterSums:
         return len(self.index.cubes)
 
     def coarsened(self, edge: float, step: int) -> ClusterSums:
-        """Return the sums of larger cubes, or groups of frames; step 0 forgets those of the map, not of its cells.
+        """Return the sums of larger cubes, or groups of frames; step 0 forgets the frames of the map, not of its cells.
 
-        Cubes of the cells are then at least as large as those of the map.
+        Cubes of the cells are then at least as large as cubes of the map.
         """
-        cells = (own and own.coarsened(max(edge, own.edge), own.step) for own in (self.fine, self.coarse))
+        cells = (part and part.coarsened(max(edge, part.edge), part.step) for part in (self.fine, self.coarse))
         fine, coarse = cells
         return dataclasses.replace(self._map_coarsened(edge, step), fine=fine, coarse=coarse)
 
     def _map_coarsened(self, edge: float, step: int) -> ClusterSums:
-        """Return the same, with the sums of cells as they are."""
+        """Return the sums of the map in larger cubes or groups of frames, with the sums of cells unchanged."""
         cell = _joined(self.cell, edge / self.edge)
         known = step and self.step
         frame = _joined(self.frame, step // self.step) if known else np.full(len(cell), -1)
@@ -127,7 +127,7 @@ class ClusterSums:
         )
 
     def without_truth(self) -> ClusterSums:
-        """Return the sums without those of ground truth."""
+        """Return the sums without the columns of ground truth."""
         names = layout(self.K, truth=False, measured=self.measured)
         return dataclasses.replace(self, columns=self.of(tuple(names)), truth=False)
 
@@ -156,7 +156,7 @@ class ClusterSums:
 
     @classmethod
     def load(cls, path: str | Path) -> ClusterSums:
-        """Read a file that `save` wrote; sums that it lacks are NaN, and those of other names are left out.
+        """Read a file that `save` wrote; sums that it lacks are NaN, and columns of other names are left out.
 
         Raises:
             DataError: If the file is missing, damaged or of another kind.
@@ -190,9 +190,9 @@ class ClusterSums:
             for number, (edge, step, voxel_size, fused) in enumerate(
                 zip(meta.edge, meta.step, meta.voxel_size, meta.fused, strict=True)
             ):
-                own, truth, measures_of = part == number, meta.truth and not number, () if number else measured
-                sums = columns[own, : width(meta.K, truth=truth, measured=measures_of)]
-                cell, frame = np.stack([key[own] for key in keys[:3]], axis=1), keys[3][own]
+                rows, truth, measures_of = part == number, meta.truth and not number, () if number else measured
+                sums = columns[rows, : width(meta.K, truth=truth, measured=measures_of)]
+                cell, frame = np.stack([key[rows] for key in keys[:3]], axis=1), keys[3][rows]
                 where = cell.astype(np.int32), frame.astype(np.int32), sums, edge, step
                 parts.append(cls(*where, voxel_size, meta.K, meta.classes, truth, fused, measures_of))
         whole, *cells = parts
@@ -248,7 +248,7 @@ def _key(values: npt.NDArray[Any], name: str) -> npt.NDArray[Any]:
 
 
 def aligned(*parts: ClusterSums) -> tuple[ClusterSums, ...]:
-    """Return the sums at the finest cubes and groups of frames that all of them have, those of cells alike.
+    """Return the sums, of maps and of their cells, at the finest cubes and groups of frames that all of them have.
 
     Raises:
         DataError: If they have different columns.
