@@ -100,15 +100,12 @@ def corrected(lists: Sequence[Sequence[Contrast]]) -> list[tuple[Contrast, ...]]
     """
     rows = [row for contrasts in lists for row in contrasts]
     p_values = np.array([row.difference.p_value for row in rows])
-    for family in (np.array([_is_tested(row) is tested for row in rows], bool) for tested in (True, False)):
+    tested = np.array([row.measure == ALPHA.key and not row.of for row in rows], bool)
+    for family in (tested, ~tested):
         p_values[family] = holm(p_values[family].tolist())
     of_rows = iter(p_values.tolist())
     better = {quantity.key: quantity.sign for quantity in (*quantities(), *BY_CLASS)}
     return [tuple(_with_change(row, next(of_rows), better[row.measure]) for row in contrasts) for contrasts in lists]
-
-
-def _is_tested(row: Contrast) -> bool:
-    return row.measure == ALPHA.key and not row.of
 
 
 def _with_change(row: Contrast, p_holm: float, sign: float) -> Contrast:

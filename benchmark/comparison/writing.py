@@ -240,13 +240,11 @@ def _recorded(comparison: ComparisonData) -> Iterator[tuple[tuple[str, str], tup
         yield (scene.scene, against.other), (title, shown.table, shown.change, shown.right, areas)
 
 
-def _has_files(folder: Path) -> bool:
-    return any(not file.name.startswith(TEMPORARY) for file in folder.iterdir())  # a killed comparison leaves those
-
-
 def _require_own(folder: Path) -> None:
     """Raise ConfigError where the folder holds something else than a comparison, as a run."""
     if folder.is_file():
         raise ConfigError(f"{folder}: it is a file; name a folder")
-    if folder.is_dir() and _has_files(folder) and not (folder / CONTENT).exists():
+    if not folder.is_dir() or (folder / CONTENT).exists():
+        return
+    if any(not file.name.startswith(TEMPORARY) for file in folder.iterdir()):  # a killed comparison leaves those
         raise ConfigError(f"{folder}: it is not empty and holds no comparison; choose another folder")

@@ -67,7 +67,8 @@ def warnings(result: Result) -> Iterator[str]:
                 f"{_name(run, result)}: top_k leaves out {cut.mean:.2%} of a pixel's scores on average,"
                 f" {cut.most:.2%} at most; no belief changes by more than that"
             )
-    once = sum(_seen_once(run) for run in runs) / max(1, sum(run.table.voxels for run in runs))
+    seen_once = sum(row.voxels for run in runs for row in run.table.strata if row.name == "OP=1")
+    once = seen_once / max(1, sum(run.table.voxels for run in runs))
     if once >= MOSTLY_ONCE:
         yield (
             f"{once:.0%} of the voxels were seen once and look consistent for that reason; larger voxels or more"
@@ -86,10 +87,12 @@ def warnings(result: Result) -> Iterator[str]:
 
 
 def _one_class_covers(runs: Sequence[UnitSummary]) -> Iterator[str]:
+    """Yield which classes cover most of a map, so that they determine most of its numbers."""
     covering: dict[str, list[tuple[str, float]]] = {}
-    for run in filter(_one_class, runs):
-        largest = max(run.table.classes, key=lambda row: row.voxels)
-        covering.setdefault(largest.name, []).append((run.unit.model, largest.share))
+    for run in runs:
+        if max(row.share for row in run.table.classes) >= ONE_CLASS:
+            largest = max(run.table.classes, key=lambda row: row.voxels)
+            covering.setdefault(largest.name, []).append((run.unit.model, largest.share))
     for name, shares in covering.items():
         all_of_them = len(shares) == len(runs)
         of = "" if all_of_them else f" of {', '.join(dict.fromkeys(model for model, _ in shares))}"
@@ -186,10 +189,6 @@ def _traffic(record: Record) -> Iterator[str]:
     )
 
 
-def _seen_once(run: UnitSummary) -> int:
-    return sum(row.voxels for row in run.table.strata if row.name == "OP=1")
-
-
 def _name(run: UnitSummary, result: Result) -> str:
     return f"{run.unit.scene}, {run.unit.model}" if len(result.scenes) > 1 else run.unit.model
 
@@ -211,11 +210,6 @@ def _size(scene: str, advice: VoxelAdvice, result: Result) -> str:
     if advice.chosen or advice.suggested <= advice.voxel_size:
         return ""
     return f"{where}{size} are so small that noise splits locations: --voxel-size {advice.suggested:g}"
-
-
-def _one_class(run: UnitSummary) -> bool:
-    """Return whether one class covers most of the map, so that it determines most of the numbers."""
-    return max(row.share for row in run.table.classes) >= ONE_CLASS
 
 
 def mixed(runs: Sequence[UnitSummary]) -> bool:

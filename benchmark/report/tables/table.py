@@ -184,7 +184,7 @@ def to_latex(table: Table) -> str:
         [
             rf"\begin{{{environment}}}[t]",
             r"\centering",
-            rf"\caption{{{_latex(_sentence(table.title))} {_latex(table.caption)}}}",
+            rf"\caption{{{_latex(table.title.removesuffix('.') + '.')} {_latex(table.caption)}}}",
             rf"\label{{tab:{table.name}}}",
             size,
             r"\setlength{\tabcolsep}{4pt}",
@@ -288,10 +288,6 @@ def _csv_cells(column: Column, cell: Cell, parts: Sequence[str]) -> list[str]:
     else:
         values = [cell.mean, cell.sd] if isinstance(cell, Spread) else [cell, math.nan, math.nan]
     return ["" if math.isnan(value) else column.number(value).replace(",", "") for value in values[: len(parts)]]
-
-
-def _sentence(text: str) -> str:
-    return text if text.endswith(".") else f"{text}."
 
 
 def _pipes(cells: list[str]) -> str:
