@@ -218,25 +218,14 @@ def analyse(
         lone = lone_disagreement(cells)
         outlying = outlying_frames(lone, len(cells.views), name=frame_name)
     agreement_of_cells = None if cells is None else cell_agreement(cells, sums, table, scope, critical, limits)
+    stability = verdict(
+        name or "model", headline=headline, cells=agreement_of_cells, flips=flips, voxels=repeats, share=repeated.share,
+        limits=limits,
+    )  # fmt: skip
     summary = MapStatistics(
-        schema=SCHEMA,
-        name=name,
-        seed=seed,
-        K=table.K,
-        voxel_size=table.voxel_size,
-        voxels=whole.voxels,
-        observations=whole.observations,
-        repeated=repeated,
-        cubes=len(cubes.cell),
-        verdict=verdict(
-            name or "model",
-            headline=headline,
-            cells=agreement_of_cells,
-            flips=flips,
-            voxels=repeated.voxels,
-            share=repeated.share,
-            limits=limits,
-        ),
+        schema=SCHEMA, name=name, seed=seed, K=table.K, voxel_size=table.voxel_size,
+        voxels=whole.voxels, observations=whole.observations, repeated=repeated, cubes=len(cubes.cell),
+        verdict=stability,
         agreement=_agreement(means, class_agreement_of(class_sums(table, events), table.classes)),
         flipping=flips,
         headline=headline,
@@ -249,7 +238,7 @@ def analyse(
         strata=_strata(whole, table, columns, edges),
         outlying_frames=outlying,
         ranges=None if cells is None else range_agreement(cells, scope, limits),
-    )
+    )  # fmt: skip
     return Analysis(summary, whole, sums, sample, shares, drawn, lone)
 
 
