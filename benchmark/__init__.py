@@ -19,7 +19,8 @@ if TYPE_CHECKING:
     from semstab.engine.folder import load_result
     from semstab.errors import ConfigError, DataError, MissingDependencyError, SemstabError
     from semstab.exports import export
-    from semstab.exports.relabel import Belief, relabel
+    from semstab.exports.fused_labels import Belief
+    from semstab.exports.relabel import relabel
     from semstab.online import FusedResult, TemporalStability, fuse
     from semstab.report.saved_run import load
     from semstab.settings import load_config, load_study
@@ -66,7 +67,7 @@ __all__ = [
 ]  # fmt: skip
 
 _HOMES = {
-    "AcceptanceThresholds": "statistics.acceptance", "Belief": "exports.relabel", "Config": "config",
+    "AcceptanceThresholds": "statistics.acceptance", "Belief": "exports.fused_labels", "Config": "config",
     "ConfigError": "errors", "DataError": "errors", "Events": "data.events", "Frame": "data.frames",
     "GateConfig": "comparison.gate", "Intrinsics": "data.frames", "LabelSpace": "data.labels",
     "MissingDependencyError": "errors", "Result": "data.records", "SemstabError": "errors", "VoxelTable": "data.voxels",

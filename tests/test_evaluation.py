@@ -109,7 +109,7 @@ def test_the_classes_with_most_of_the_disagreement_are_listed(tmp_path, monkeypa
     largest = sorted((row for row in classes if row.disagreement >= 0.01), key=lambda row: -row.disagreement)
     assert listed_classes(one)[0] == [row.name for row in largest]
     covering = max(one.record().summary.table.classes, key=lambda row: row.share)
-    monkeypatch.setattr(terminal, "MAJORITY", covering.share)
+    monkeypatch.setattr("semstab.report.terminal.disagreement.MAJORITY", covering.share)
     assert covering.name in listed_classes(one)[0]
     both, after = listed_classes(semstab.run(configure(root), out=tmp_path / "both", report=False))
     assert f"a: {covering.name}" not in both

@@ -24,8 +24,10 @@ from typer.testing import CliRunner
 import semstab
 from semstab.cli import app
 from semstab.comparison import differences, gate_report
-from semstab.comparison import gate as judging
-from semstab.comparison.gate import GateResult, Judgement, gate, gate_config, parse
+from semstab.comparison.gate import gate, gate_config
+from semstab.comparison.gate_evaluation import LOST, bounded
+from semstab.comparison.gate_result import GateResult, Judgement, negative, verdict
+from semstab.comparison.gate_rules import parse
 from semstab.comparison.runs import open_run, save_summary
 from semstab.data.measures import Measure, margin, registered, sbd
 from semstab.data.statistics import Interval
@@ -82,8 +84,8 @@ def test_a_rule_that_is_none_is_said_in_one_line(text, line):
 ])  # fmt: skip
 def test_what_an_interval_says_of_a_rule(text, low, high, expected):
     found = Interval((low + high) / 2, low, high)
-    assert judging.verdict(parse(text), found) == expected
-    assert judging.verdict(parse(text), dataclasses.replace(found, undecided="too few")) == "undecided"
+    assert verdict(parse(text), found) == expected
+    assert verdict(parse(text), dataclasses.replace(found, undecided="too few")) == "undecided"
 
 
 def test_settings_come_from_a_file_and_the_command(tmp_path):
@@ -124,15 +126,15 @@ def test_a_planted_fault_fails_itself_passes_and_three_frames_are_undecided():
 
     def outcome(new, old, rule=rule):
         k = None if rule.class_name is None else 1
-        return judging.verdict(rule, judging.bounded(rule, new, old, k=k))
+        return verdict(rule, bounded(rule, new, old, k=k))
 
     assert outcome(sums(faulty, truth), base) == "fails"
     assert outcome(base, base) == "passes"
     assert outcome(base, base.without_truth()) == "passes"
     assert outcome(sums(faulty, truth), base, parse("class b: alpha drop < 0.02")) == "fails"
     assert outcome(sums(faulty, truth), base, parse("look accuracy drop < 0.02")) == "fails"
-    fixed = judging.bounded(rule, sums(faulty, truth), base, scope="these frames")
-    loose = judging.bounded(rule, sums(faulty, truth), base)
+    fixed = bounded(rule, sums(faulty, truth), base, scope="these frames")
+    loose = bounded(rule, sums(faulty, truth), base)
     assert fixed.high - fixed.low < loose.high - loose.low
     assert outcome(sums(faulty[:, :3], truth), sums(labels[:, :3], truth)) == "undecided"
     assert outcome(sums(labels[:, :3], truth), sums(labels[:, :3], truth)) == "passes"  # the very same
@@ -178,7 +180,7 @@ def test_a_class_that_the_run_has_lost_does_not_pass(run, doorless):
     wall, door, window = found.judgements
     assert (wall.verdict, window.verdict) == ("passes", "passes")
     assert (door.rule.class_name, door.verdict) == ("door", "undecided")
-    assert door.reason == judging.LOST
+    assert door.reason == LOST
     assert math.isnan(door.new)
     (alone,) = gate(f"{run}:a", None, gate_config(rules=["class door: alpha > 0"])).judgements
     assert door.base == pytest.approx(alone.new, abs=0.05)
@@ -191,13 +193,13 @@ def test_a_class_that_the_run_has_lost_does_not_pass(run, doorless):
 def test_a_class_that_is_nowhere_has_no_value_and_ends_are_one_sided():
     labels, truth = models()
     log = log_of(labels, K=3, index=grid(16))
-    found = judging.bounded(parse("class c: recall > 0.5"), cluster_sums_of(log.table(), log, truth), k=2)
+    found = bounded(parse("class c: recall > 0.5"), cluster_sums_of(log.table(), log, truth), k=2)
     assert math.isnan(found.value)
-    assert judging.verdict(parse("class c: recall > 0.5"), found) == "undecided"
+    assert verdict(parse("class c: recall > 0.5"), found) == "undecided"
     (labels, truth), (other, _) = models(), models(seed=1)
     new, base = sums(labels, truth), sums(other, truth)
     for key in ("alpha", "observation_accuracy"):
-        found = judging.bounded(parse(f"{key.replace('_', ' ')} rise < 1"), new, base)
+        found = bounded(parse(f"{key.replace('_', ' ')} rise < 1"), new, base)
         both = difference(new, base, key, same_frames=True, level=0.9)
         assert (found.value, found.low, found.high) == (both.value, both.low, both.high)
         assert found.value == pytest.approx(value(new, key) - value(base, key))
@@ -410,16 +412,16 @@ def test_coverage_of_the_same_frames_is_a_count_and_of_other_frames_an_estimate(
     labels, truth = models(frames=5)
     rule, lost = parse("coverage drop < 0.05"), labels.copy()
     lost[: round(0.127 * len(labels))] = -1
-    found = judging.bounded(rule, seen_sums(lost, truth), sums(labels, truth))
+    found = bounded(rule, seen_sums(lost, truth), sums(labels, truth))
     assert found.low == found.high == found.value == pytest.approx((lost[:, 0] < 0).mean())
     assert (found.p_value, found.scope, found.frames) == (0.0, "these frames", 5)
-    assert judging.verdict(rule, found) == "fails"
-    assert judging.verdict(parse("coverage drop < 0.2"), found) == "passes"
-    assert judging.verdict(parse("coverage rise > 0"), judging.negative(found)) == "fails"
-    same = judging.bounded(rule, sums(labels, truth), sums(labels, truth))
+    assert verdict(rule, found) == "fails"
+    assert verdict(parse("coverage drop < 0.2"), found) == "passes"
+    assert verdict(parse("coverage rise > 0"), negative(found)) == "fails"
+    same = bounded(rule, sums(labels, truth), sums(labels, truth))
     assert (same.low, same.high, math.isnan(same.p_value)) == (0.0, 0.0, True)
     longer, _ = models(frames=9)
-    other = judging.bounded(rule, seen_sums(lost, truth), sums(longer, truth))
+    other = bounded(rule, seen_sums(lost, truth), sums(longer, truth))
     assert other.value == pytest.approx(found.value)
     assert other.low < other.value < other.high
 
@@ -443,9 +445,9 @@ def test_frames_without_any_label_are_of_the_same_flight():
 
 def test_a_count_that_is_the_limit_is_decided():
     zero = Interval(0.0, 0.0, 0.0)
-    assert judging.verdict(parse("coverage drop < 0"), zero) == "fails"
-    assert judging.verdict(parse("coverage drop <= 0"), zero) == "passes"
-    assert judging.verdict(parse("coverage rise >= 0"), zero) == "passes"
+    assert verdict(parse("coverage drop < 0"), zero) == "fails"
+    assert verdict(parse("coverage drop <= 0"), zero) == "passes"
+    assert verdict(parse("coverage rise >= 0"), zero) == "passes"
 
 
 @pytest.fixture(scope="module")

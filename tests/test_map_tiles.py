@@ -38,7 +38,8 @@ from semstab.engine.observer import Observer
 from semstab.engine.tiles import tiles_met
 from semstab.errors import ConfigError, DataError, OutgrownError
 from semstab.exports import export, maps
-from semstab.exports.relabel import Belief, relabel
+from semstab.exports.fused_labels import Belief
+from semstab.exports.relabel import relabel
 from semstab.statistics import model_comparison
 from semstab.statistics.cluster_sums import ClusterSums
 from semstab.testing import random_frames

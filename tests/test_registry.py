@@ -64,7 +64,7 @@ def test_an_import_that_fails_inside_is_a_missing_dependency(monkeypatch, error)
 
 def test_the_list_says_what_is_not_ready(monkeypatch, capsys):
     from semstab import models
-    from semstab.cli.result_commands import list_
+    from semstab.cli.show_commands import list_
 
     original = registry.importlib.import_module
 
@@ -83,7 +83,7 @@ def test_the_list_says_what_is_not_ready(monkeypatch, capsys):
 
 
 def test_the_list_names_packages_that_are_not_installed(monkeypatch, capsys):
-    from semstab.cli.result_commands import list_
+    from semstab.cli.show_commands import list_
 
     found = registry.importlib.util.find_spec
     monkeypatch.setattr(registry.importlib.util, "find_spec", lambda name: None if name == "torch" else found(name))
@@ -97,7 +97,7 @@ def test_the_list_names_packages_that_are_not_installed(monkeypatch, capsys):
 
 def test_the_list_imports_no_engine():
     heavy = "open3d", "torch", "transformers", "rerun", "numba"
-    code = "from semstab.cli.result_commands import list_; list_(); import sys; print({*sys.argv} & {*sys.modules})"
+    code = "from semstab.cli.show_commands import list_; list_(); import sys; print({*sys.argv} & {*sys.modules})"
     done = subprocess.run([sys.executable, "-c", code, *heavy], capture_output=True, text=True, check=True)
     assert done.stdout.splitlines()[-1] == "set()"
 

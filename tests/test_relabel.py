@@ -21,7 +21,8 @@ from semstab.data.frames import Frame, Intrinsics
 from semstab.data.labels import LabelSpace
 from semstab.data.tiles import Tiles
 from semstab.errors import ConfigError, DataError
-from semstab.exports.relabel import UNSEEN, UNSTABLE, Belief, FusedLabels, relabel
+from semstab.exports.fused_labels import UNSEEN, UNSTABLE, Belief, FusedLabels
+from semstab.exports.relabel import relabel
 from semstab.metrics import CATEGORIES, categories
 from semstab.statistics import psa
 

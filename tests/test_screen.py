@@ -8,7 +8,7 @@ import pytest
 from semstab.core.palette import MODEL_COLORS, dash, marker, model_color
 from semstab.data.statistics import short
 from semstab.metrics import CATEGORY_COLORS
-from semstab.report.tables.stability import one_in
+from semstab.report.tables.backends import one_in
 from semstab.report.terminal import laid_out, percents
 
 

@@ -13,12 +13,13 @@ from striped_floor import K, fused, sampled
 from striped_floor import flight as over_stripes
 
 from semstab.core.json_form import to_json
+from semstab.data.earlier import SUMS
 from semstab.data.measures import Measure, dominant, entropy, margin, registered, sbd, vss
 from semstab.errors import DataError
 from semstab.metrics.agreement import rows_of
 from semstab.statistics.accumulate import cluster_sums_of, sums_of_cells
 from semstab.statistics.agreement import class_agreement, consistency_posterior, krippendorff_alpha, psa
-from semstab.statistics.cluster_sums import EARLIER_NAMES, FUNCTIONALS, MOST_CLASSES, ClusterSums, aligned, value
+from semstab.statistics.cluster_sums import FUNCTIONALS, MOST_CLASSES, ClusterSums, aligned, value
 from semstab.statistics.correctness import correctness
 from semstab.statistics.drift import expected_sbd
 from semstab.statistics.intervals import (
@@ -179,7 +180,7 @@ def test_an_older_file_has_its_sums_by_their_names_of_then(tmp_path):
     about = json.loads(content.schema.metadata[b"semstab"])
     about |= {name: about[name][0] for name in ("edge", "step", "voxel_size", "fused")}
     about |= {"schema": 3, "kind": "InfluenceSums"}
-    then = {name: old for old, name in EARLIER_NAMES.items()}
+    then = {name: old for old, name in SUMS.items()}
     content = content.rename_columns([then.get(name, name) for name in content.column_names])
     pq.write_table(content.replace_schema_metadata({"semstab": json.dumps(about)}), tmp_path / "old.parquet")
     np.testing.assert_array_equal(ClusterSums.load(tmp_path / "old.parquet").columns, whole.columns)

@@ -38,7 +38,7 @@ def test_cubes_are_the_smallest_of_which_few_enough_hold_the_voxels(spread):
     rng = np.random.default_rng(spread)
     index = np.unique(rng.integers(-spread, spread, size=(6000, 3)), axis=0).astype(np.int32)
     some = rng.random(len(index)) < 0.5
-    cell, of, edge = cubes_of(tuple(index.T), 0.3, some=some)
+    cell, of, edge = cubes_of(tuple(index.T), 0.3, counted=some)
     at = {size: np.floor((index[some] + 0.5) * (0.3 / size)) for size in (edge, edge / 2)}
     assert len(np.unique(at[edge], axis=0)) == len(cell) <= 256
     assert edge == 0.5 or len(np.unique(at[edge / 2], axis=0)) > 256

@@ -18,7 +18,7 @@ GONE = (
 TRANSLATED = {
     ROOT / name
     for name in (
-        "benchmark/backbones.py", "benchmark/cli/__init__.py", "benchmark/cli/run_commands.py",
+        "benchmark/backbones.py", "benchmark/cli/__init__.py", "benchmark/cli/show_commands.py",
         "benchmark/core/registry.py", "benchmark/data/earlier.py", "benchmark/settings.py",
         "datasets/files/options.py",
     )

@@ -18,9 +18,11 @@ import typer
 from typer.core import TyperCommand, TyperGroup
 
 from semstab import __version__
+from semstab.cli.dataset_commands import check, convert, predict
 from semstab.cli.options import say
-from semstab.cli.result_commands import calibrate, compare, conform, export, gate, leaderboard, list_, relabel
-from semstab.cli.run_commands import benchmark, check, convert, filters, predict, run, show, study, view
+from semstab.cli.result_commands import calibrate, compare, conform, export, gate, leaderboard, relabel
+from semstab.cli.run_commands import benchmark, filters, run, study
+from semstab.cli.show_commands import list_, show, view
 from semstab.core.process import configure_process
 from semstab.errors import OUT_OF_MEMORY, ConfigError, SemstabError, summarize_error
 
@@ -56,8 +58,8 @@ def interruptible() -> Iterator[None]:
             raise KeyboardInterrupt(came[0]) from error
         raise
     finally:
-        for own, before in ended.items():
-            signal.signal(own, before)
+        for ending, before in ended.items():
+            signal.signal(ending, before)
         sys.unraisablehook = hook
 
 
@@ -69,7 +71,7 @@ RESUMED = ("run", "study", "benchmark", "filters", "predict", "convert")
 
 
 def _interrupted(command: str | None, folder: Path | None) -> str:
-    """Return what is left of a command that a signal ended, in a folder that the command line may not name."""
+    """Return the message of a command that a signal ended; its folder may not be on the command line."""
     if command in RESUMED:
         again = "the same --out" if folder is None else f"--out {folder}"
         return f"interrupted; finished work is stored, and the same command with {again} resumes there"
@@ -146,10 +148,10 @@ class Group(TyperGroup):
 
     def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
         """Put `run` in front of bare options, and replace earlier names."""
-        own = {"--help", "-h", "--version", "--install-completion", "--show-completion"}
-        if not args or (args[0].startswith("-") and args[0] not in own):
+        of_group = {"--help", "-h", "--version", "--install-completion", "--show-completion"}
+        if not args or (args[0].startswith("-") and args[0] not in of_group):
             args = ["run", *args]
-        if args[0] not in self.commands and args[0] not in own and _is_path(args[0]):
+        if args[0] not in self.commands and args[0] not in of_group and _is_path(args[0]):
             args = ["run", "--data", *args]
         if args[0] in OF_PATHS and len(args) > 1 and not args[1].startswith("-"):
             args = [args[0], "--data", *args[1:]]
@@ -159,20 +161,20 @@ class Group(TyperGroup):
         """Return the command that the first word names; it may also have been meant as a path."""
         word = args[0]
         if word not in self.commands and not word.startswith("-") and not ctx.resilient_parsing:
-            here = [path.name for path in Path().iterdir()]
-            near = difflib.get_close_matches(word, [*self.commands, *here], n=1)
+            paths = [path.name for path in Path().iterdir()]
+            near = difflib.get_close_matches(word, [*self.commands, *paths], n=1)
             hint = f"did you mean '{near[0]}'?" if near else f"commands: {', '.join(self.commands)}"
             raise ConfigError(f"'{word}' is no command, and there is no such file or folder; {hint}")
         return super().resolve_command(ctx, args)
 
     def format_help(self, ctx: Any, formatter: Any) -> None:
         """Write the group's own help, with the options of `run` in it."""
-        own = self.params
-        self.params = [*own, *self.commands["run"].params]
+        params = self.params
+        self.params = [*params, *self.commands["run"].params]
         try:
             super().format_help(ctx, formatter)
         finally:
-            self.params = own
+            self.params = params
 
     def invoke(self, ctx: Any) -> Any:
         """Report every error in one line; bad input gives exit code 2."""

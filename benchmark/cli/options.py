@@ -1,13 +1,17 @@
-"""Define the options that commands share, and build settings from them."""
+"""Define the options that commands share, one by one and in groups, and build settings from them."""
 
 from __future__ import annotations
 
+import dataclasses
+import functools
 import importlib
+import inspect
 import operator
 import os
 from collections.abc import Callable, Iterable
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, get_type_hints
 
 import typer
 
@@ -57,7 +61,7 @@ scenes, label_sources = _beginning(lambda ctx: [*_opened(ctx).scenes, "all"]), _
 
 
 SETTINGS, LABELS, CHECKS, MACHINE = "Settings", "Labels", "Checks", "Machine"
-"""The panels of the help below that of the options which most people need."""
+"""The panels of the help, below the options that most people need."""
 
 
 def own_defaults() -> Path | None:
@@ -135,6 +139,134 @@ Quiet = Annotated[bool, typer.Option("--quiet", "-q", help="Print nothing but er
 # fmt: on
 
 
+# Groups of options: a command takes a group as one argument, and the command line has each of its fields as an option.
+
+
+def grouped(command: Callable[..., None]) -> Callable[..., None]:
+    """Replace each argument of a command that is a group, a dataclass of options, by the options of its fields.
+
+    The default of an argument, a group itself, gives the defaults of these options.
+    """
+    hints = get_type_hints(command, include_extras=True)
+    groups: dict[str, Any] = {}
+    options: list[inspect.Parameter] = []
+    for parameter in inspect.signature(command).parameters.values():
+        hint, kind = hints[parameter.name], inspect.Parameter.KEYWORD_ONLY
+        if not dataclasses.is_dataclass(hint):
+            options.append(parameter.replace(annotation=hint, kind=kind))
+            continue
+        groups[parameter.name] = hint
+        default, of_fields = parameter.default, get_type_hints(hint, include_extras=True)
+        for field in dataclasses.fields(hint):
+            value = field.default if default is inspect.Parameter.empty else getattr(default, field.name)
+            options.append(inspect.Parameter(field.name, kind, default=value, annotation=of_fields[field.name]))
+
+    @functools.wraps(command)
+    def flat(**values: Any) -> None:
+        for name, group in groups.items():
+            values[name] = group(**{field.name: values.pop(field.name) for field in dataclasses.fields(group)})
+        command(**values)
+
+    flat.__annotations__ = {option.name: option.annotation for option in options}
+    flat.__dict__["__signature__"] = inspect.Signature(options)
+    return flat
+
+
+# fmt: off
+@dataclass(frozen=True)
+class Source:
+    """The scenes and label maps that a command reads."""
+
+    data: DataFolder = None
+    dataset: DatasetName = None
+    scene: Scenes = None
+    model: Models = None
+
+
+@dataclass(frozen=True)
+class Prediction:
+    """A model that makes the labels in memory, and filters over the labels."""
+
+    predict: Predicted = None
+    classes: Classes = None
+    filters: Filters = None
+
+    @property
+    def model_options(self) -> dict[str, Any]:
+        """The options of the model that the command line sets."""
+        return {} if self.classes is None else {"classes": self.classes}
+
+
+@dataclass(frozen=True)
+class Execution:
+    """How a configuration is run: the processes, the recording, and what is written."""
+
+    overwrite: Overwrite = False
+    rerun: Rerun = None
+    report: Report = "on"
+    jobs: Jobs = 1
+    scheduler: Scheduler = None
+
+
+UNRECORDED = Execution(rerun="off")
+
+
+@dataclass(frozen=True)
+class Measurement:
+    """The settings of a run that options set: what is fused and measured."""
+
+    taxonomy: Annotated[str | None, typer.Option(
+        help="Taxonomy to fuse in: a name or a YAML file.", show_default="the dataset's; city: uavid7",
+        autocompletion=taxonomies, rich_help_panel=SETTINGS)] = None
+    voxel_size: VoxelSize = None
+    pixel_stride: Annotated[int | None, typer.Option(
+        help="Use every n-th pixel of each axis.", show_default="1", rich_help_panel=SETTINGS)] = None
+    top_k: Annotated[int | None, typer.Option(
+        "--top-k", help="Fuse only the K largest scores of each pixel.", show_default="all",
+        rich_help_panel=SETTINGS)] = None
+    frames: Frames = None
+    device: Annotated[str | None, typer.Option(
+        help="CPU:0, or CUDA:0 for backends that take a device.", show_default="the backend's own",
+        rich_help_panel=MACHINE)] = None
+    check: Annotated[str | None, typer.Option(
+        metavar="sample|BACKEND|none", show_default="sample",
+        help="Check voxel by voxel against the numpy reference on a random sample, or against a backend on all.",
+        rich_help_panel=CHECKS)] = None
+    seed: Annotated[int | None, typer.Option(
+        help="Seed of a simulated dataset.", show_default="0", rich_help_panel=SETTINGS)] = None
+    settings: Annotated[list[str] | None, typer.Option(
+        "--set", metavar="KEY=VALUE", help="Any setting, e.g. dataset.options.width=640.",
+        rich_help_panel=SETTINGS)] = None
+    options: DatasetOptions = None
+    trust_geometry: TrustGeometry = False
+    events: Annotated[bool | None, typer.Option(
+        "--events", help="Also write the log of observations.", rich_help_panel=SETTINGS)] = None
+    statistics: Annotated[bool | None, typer.Option(
+        "--statistics", help="Also measure drift and accuracy, and compare models; takes longer.")] = None
+    video_measures: Annotated[str | None, typer.Option(
+        "--video-measures", metavar="depth|dis", show_default="none",
+        help="Also VC and TC as papers report them, by depth and pose, or by optical flow between images.")] = None
+    scope: ScopeOption = None
+
+    def content(self, source: Source, backends: list[str] | None, tile_size: str | None) -> dict[str, Any]:
+        """Return the settings of a run by their names in a file of settings."""
+        named = {
+            "backends": backends, "scenes": source.scene, "models": source.model, "taxonomy": self.taxonomy,
+            "voxel_size": self.voxel_size, "pixel_stride": self.pixel_stride, "top_k": self.top_k,
+            "check": self.check, "events": self.events, "statistics": self.statistics,
+            "video_measures": self.video_measures, "scope": self.scope,
+            "check_geometry": False if self.trust_geometry else None,
+            "tile_size": int(tile_size) if tile_size is not None and tile_size.isdigit() else tile_size,
+        }
+        content = chosen(
+            named, self.settings, self.options, source.dataset, source.data, self.frames, self.seed
+        )
+        if self.check in ("none", "off"):
+            content["check"] = None
+        return content
+# fmt: on
+
+
 def chosen(
     named: dict[str, Any],
     settings: list[str] | None,
@@ -144,7 +276,7 @@ def chosen(
     frames: str | None = None,
     seed: int | None = None,
 ) -> dict[str, Any]:
-    """Return options as settings, those of --set (`settings`) and of --option (`options`) on top."""
+    """Return options as settings; --set (`settings`) and --option (`options`) have priority."""
     from semstab.config.settings import in_full
     from semstab.core.files import parse_yaml
 

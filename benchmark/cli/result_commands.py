@@ -1,4 +1,4 @@
-"""Define the commands over finished runs: compare, gate, leaderboard, calibrate, export, relabel; conform and list."""
+"""Define the commands over finished runs: compare, gate, leaderboard, calibrate, export, relabel; and conform."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from semstab.cli.options import Quiet, ScopeOption, Verbose, own_defaults, print_lines, say
+from semstab.cli.options import Quiet, ScopeOption, Verbose, print_lines, say
 
 
 def compare(
@@ -114,8 +114,8 @@ def leaderboard(
     from semstab.leaderboard.board import boards, lines, write_site
     from semstab.leaderboard.definition import load_benchmark
 
-    own = {each.id: each for each in map(load_benchmark, definition or ())}
-    made = boards(folder, own)
+    definitions = {each.id: each for each in map(load_benchmark, definition or ())}
+    made = boards(folder, definitions)
     print_lines(lines(made), quiet=quiet)
     if out is not None:
         write_site(made, out)
@@ -244,7 +244,7 @@ def relabel(
     from rich.console import Console
 
     from semstab.convert import frame_bar
-    from semstab.exports.relabel import Belief
+    from semstab.exports.fused_labels import Belief
     from semstab.exports.relabel import relabel as write
     from semstab.statistics.acceptance import AcceptanceThresholds
 
@@ -256,78 +256,3 @@ def relabel(
             progress=bar,
         )  # fmt: skip
     print_lines(report.lines(), quiet=quiet)
-
-
-# The command list.
-
-
-KINDS = {
-    "backends": "backend", "datasets": "dataset", "models": "model", "filters": "filter", "taxonomies": "taxonomy",
-    "studies": "study", "benchmarks": "benchmark",
-}  # fmt: skip
-"""The kinds of things that `list` lists, in the plural."""
-
-
-def _kind(text: str | None) -> str | None:
-    """Return a kind by its name in the singular or the plural; raises ConfigError if there is none."""
-    if text is None or text in KINDS.values():
-        return text
-    if text not in KINDS:
-        from semstab.config import nearest
-        from semstab.errors import ConfigError
-
-        raise ConfigError(f"list {text}: there is no such kind; {nearest(text, [*KINDS])}")
-    return KINDS[text]
-
-
-def list_(
-    kind: Annotated[
-        str | None, typer.Argument(metavar="KIND", help="Only backends, datasets, models, filters, taxonomies, ...")
-    ] = None,
-    check: Annotated[bool, typer.Option("--check", help="Also load each one, which takes seconds.")] = False,
-) -> None:
-    """List backends, datasets, models, filters, taxonomies, studies and benchmarks, with 'ready' or what is missing.
-
-    Below stand the settings of your own: ~/.config/semstab/config.yaml.
-    """
-    import yaml
-    from rich.console import Console
-    from rich.markup import escape
-    from rich.table import Table
-
-    from semstab import backends, datasets, models
-    from semstab.config import read_yaml
-    from semstab.data.labels import LabelSpace, shipped_taxonomies
-    from semstab.errors import MissingDependencyError
-    from semstab.predict import filters
-    from semstab.settings import load_study, shipped_benchmarks, shipped_studies
-
-    table = Table(show_edge=False)
-    for name in ("kind", "name", "", "description"):
-        table.add_column(name)
-    wanted = _kind(kind)
-    for registry in (backends.REGISTRY, datasets.REGISTRY, models.REGISTRY, filters.REGISTRY):
-        for name, entry in sorted(registry.entries().items()) if wanted in (None, registry.kind) else ():
-            missing = registry.missing(name)
-            if check and not missing:
-                try:
-                    registry.load(name)
-                except MissingDependencyError as error:
-                    missing = str(error)
-            ready = f"[yellow]{escape(missing)}" if missing else "[green]ready"
-            table.add_row(registry.kind, name, ready, escape(entry.summary))
-    for name in shipped_taxonomies() if wanted in (None, "taxonomy") else ():
-        space = LabelSpace.load(name)
-        table.add_row("taxonomy", name, "[green]ready", f"K = {len(space)}: {', '.join(space.classes)}")
-    for name in shipped_studies() if wanted in (None, "study") else ():
-        table.add_row("study", name, "[green]ready", load_study(name).description)
-    for name, file in shipped_benchmarks().items() if wanted in (None, "benchmark") else ():
-        table.add_row("benchmark", name, "[green]ready", read_yaml(file)["description"])
-    console = Console()
-    console.print(table)
-    if (own := own_defaults()) is None:
-        console.print("no settings of your own: ~/.config/semstab/config.yaml, or SEMSTAB_CONFIG", markup=False)
-    else:
-        console.print(f"settings of your own, where no --config is given: {own}", markup=False)
-        content = yaml.safe_dump(read_yaml(own), sort_keys=False, allow_unicode=True)
-        print_lines(f"  {line}" for line in content.splitlines())

@@ -25,21 +25,22 @@ def calibrate_run(run: str | Path, *, precision: float = 0.95, confidence: float
     Raises:
         ConfigError, DataError: As `open_run` does, and for a scene whose ground truth was not fused.
     """
-    own = open_run(run)
+    handle = open_run(run)
     maps, sampled = [], 1.0
-    for scene, entry in own.scenes.items():
+    for scene, entry in handle.scenes.items():
         record = entry.with_voxels("a calibration")
         if record.truth_file is None:
             raise ConfigError(
-                f"{own.where}: ground truth of {scene} was not fused; run it with --statistics, on a scene that has it"
+                f"{handle.where}: ground truth of {scene} was not fused;"
+                " run it with --statistics, on a scene that has it"
             )
         maps.append(_with_truth(record, record.truth_file))
         sampled = min(sampled, share_of(record.summary.table.voxels))
     first = maps[0][0]
     for table, _ in maps[1:]:
         if (table.classes, table.voxel_size) != (first.classes, first.voxel_size):
-            raise DataError(f"{own.where}: its scenes differ in classes or voxel size; calibrate on one at a time")
-    on = f"{own.model} on {', '.join(own.scenes)}"
+            raise DataError(f"{handle.where}: its scenes differ in classes or voxel size; calibrate on one at a time")
+    on = f"{handle.model} on {', '.join(handle.scenes)}"
     on += f", 1 in {round(1 / sampled)} of the locations of a large map" if sampled < 1 else ""
     return calibrate(maps, precision=precision, confidence=confidence, on=on)
 
@@ -49,10 +50,10 @@ def _with_truth(record: Record, truth_file: Path) -> tuple[VoxelTable, Truth]:
     share, parts = share_of(record.summary.table.voxels), []
     files = [file for file in (record.voxels_file, truth_file) if file is not None]
     for table, truth in side_by_side([Tiles.open(file, VoxelTable) for file in files]):
-        some = table.rows(in_share(table, share))
-        parts.append((some, join_truth(some, truth).label))
+        drawn = table.rows(in_share(table, share))
+        parts.append((drawn, join_truth(drawn, truth).label))
     order = np.lexsort(np.concatenate([table.index for table, _ in parts]).T[::-1])
-    label = np.concatenate([own for _, own in parts])[order]
+    label = np.concatenate([labels for _, labels in parts])[order]
     return VoxelTable.joined([table for table, _ in parts]), Truth(label >= 0, label)
 
 
@@ -63,14 +64,15 @@ def lines(result: AcceptanceThresholds) -> Iterator[str]:
         f" {result.confidence:g}; they were calibrated on {result.calibrated_on}"
     )
     width = min(max(map(len, result.classes), default=0), 20)
-    for name, own in result.classes.items():
-        right = f"{own.by:<6} >= {own.at_least:<5.3g} right in {own.precision:.3f}, at least {own.low:.3f}"
-        if not own.voxels:
+    for name, threshold in result.classes.items():
+        evidence = f"{threshold.by:<6} >= {threshold.at_least:<5.3g}"
+        right = f"{evidence} right in {threshold.precision:.3f}, at least {threshold.low:.3f}"
+        if not threshold.voxels:
             yield f"  {name[:width]:<{width}}  never: no label of this class has a known truth"
-        elif own.never:
-            yield f"  {name[:width]:<{width}}  never; best {right} ({own.voxels:,} voxels)"
+        elif threshold.never:
+            yield f"  {name[:width]:<{width}}  never; best {right} ({threshold.voxels:,} voxels)"
         else:
-            yield f"  {name[:width]:<{width}}  {right}: {own.left:.0%} left"
+            yield f"  {name[:width]:<{width}}  {right}: {threshold.left:.0%} left"
     yield f"{result.left:.1%} of the voxels are left"
-    if any(own.never for own in result.classes.values()):
+    if any(threshold.never for threshold in result.classes.values()):
         yield "more locations in other scenes may show more: errors near each other count as few"

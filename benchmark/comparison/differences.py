@@ -74,8 +74,8 @@ def by_class(common: Common, base: Entry, number: int) -> tuple[Contrast, ...]:
     The locations follow from the ground truth, or else from all runs together, so that no run chooses its own.
     """
     names = base.classes or tuple(str(k) for k in range(base.sums.K))
-    own = list(_of_locations(common, names, number)) if common.tables else []
-    rows = [*_against_all(common, names, number), *own]
+    of_locations = list(_of_locations(common, names, number)) if common.tables else []
+    rows = [*_against_all(common, names, number), *of_locations]
     order = {quantity.key: rank for rank, quantity in enumerate(BY_CLASS)}
     return tuple(sorted(rows, key=lambda row: (names.index(row.of), order[row.measure])))
 
@@ -96,19 +96,16 @@ def over_scenes(result: Sequence[Sequence[Contrast]]) -> tuple[Contrast, ...]:
 def corrected(lists: Sequence[Sequence[Contrast]]) -> list[tuple[Contrast, ...]]:
     """Return lists with corrected p-values, and the change that each shows.
 
-    Alpha over all classes is what is tested: it is corrected for the runs alone, all that describes for all of it.
+    The test is of alpha over all classes: it is corrected for the runs alone, descriptive numbers for all of them.
     """
-    rows = [row for own in lists for row in own]
+    rows = [row for contrasts in lists for row in contrasts]
     p_values = np.array([row.difference.p_value for row in rows])
-    for family in (np.array([_is_tested(row) is tested for row in rows], bool) for tested in (True, False)):
+    tested = np.array([row.measure == ALPHA.key and not row.of for row in rows], bool)
+    for family in (tested, ~tested):
         p_values[family] = holm(p_values[family].tolist())
     of_rows = iter(p_values.tolist())
     better = {quantity.key: quantity.sign for quantity in (*quantities(), *BY_CLASS)}
-    return [tuple(_with_change(row, next(of_rows), better[row.measure]) for row in own) for own in lists]
-
-
-def _is_tested(row: Contrast) -> bool:
-    return row.measure == ALPHA.key and not row.of
+    return [tuple(_with_change(row, next(of_rows), better[row.measure]) for row in contrasts) for contrasts in lists]
 
 
 def _with_change(row: Contrast, p_holm: float, sign: float) -> Contrast:
@@ -186,14 +183,15 @@ def flicker_difference(new: Flicker, base: Flicker, *, paired: bool = True, leve
     """Return the mean flicker of one run less another's, by frame where both have the same ones."""
     if paired and len(new.keys() & base.keys()) > 1:
         return _with_p_value(difference_over_frames(new, base, level))
-    each = [mean_over_frames(np.array([*own]), np.array([*own.values()]), level) for own in (new, base)]
+    each = [mean_over_frames(np.array([*flicker]), np.array([*flicker.values()]), level) for flicker in (new, base)]
     return unpaired(each[0], each[1])
 
 
 def _flicker(base: Flicker, other: Flicker, *, paired: bool) -> Contrast:
     frames = base.keys() & other.keys() if paired else set()
     before, after = (
-        mean(np.array([own[frame] for frame in (frames if len(frames) > 1 else own)])) for own in (base, other)
+        mean(np.array([flicker[frame] for frame in (frames if len(frames) > 1 else flicker)]))
+        for flicker in (base, other)
     )
     return Contrast(FLICKER.key, "", before, after, flicker_difference(other, base, paired=paired), math.nan, "")
 
@@ -310,7 +308,7 @@ def find(
         overall=_over_all(scenes),
         scenes=tuple(scenes),
     )
-    ups = {scene: up for each in reversed(handles) for scene, own in each.scenes.items() if (up := own.up)}
+    ups = {scene: up for each in reversed(handles) for scene, entry in each.scenes.items() if (up := entry.up)}
     return ComparisonData(result, changes, ups)
 
 
@@ -321,8 +319,8 @@ def _scene(scene: str, runs: Sequence[RunHandle], scope: Scope) -> tuple[SceneCo
     everything = corrected([contrasts(common, entries[0], entries[n], n) for n in numbers])
     classes = corrected([by_class(common, entries[0], n) for n in numbers])
     against, changes = [], {}
-    for n, own, of_classes in zip(numbers, everything, classes, strict=True):
-        result = Against(names[n], own, of_classes)
+    for n, of_all, of_classes in zip(numbers, everything, classes, strict=True):
+        result = Against(names[n], of_all, of_classes)
         if common.regions is not None:
             worse, named = worse_areas(common, n), entries[n].named
             changes[names[n]] = worse.changes
@@ -354,13 +352,13 @@ def _scene_comparison(
 def _over_all(scenes: Sequence[SceneComparison]) -> tuple[Against, ...]:
     """Return macro means; for one scene its own results."""
     if len(scenes) == 1:
-        return tuple(Against(own.other, own.contrasts, own.by_class) for own in scenes[0].against)
+        return tuple(Against(against.other, against.contrasts, against.by_class) for against in scenes[0].against)
     runs = list(zip(*(scene.against for scene in scenes), strict=True))
-    everything = corrected([over_scenes([own.contrasts for own in run]) for run in runs])
-    classes = corrected([over_scenes([own.by_class for own in run]) for run in runs])
+    everything = corrected([over_scenes([against.contrasts for against in run]) for run in runs])
+    classes = corrected([over_scenes([against.by_class for against in run]) for run in runs])
     return tuple(
-        Against(run[0].other, own, of_classes, *(sum(getattr(each, name) for each in run) for name in _COUNTS))
-        for run, own, of_classes in zip(runs, everything, classes, strict=True)
+        Against(run[0].other, of_all, of_classes, *(sum(getattr(each, name) for each in run) for name in _COUNTS))
+        for run, of_all, of_classes in zip(runs, everything, classes, strict=True)
     )
 
 

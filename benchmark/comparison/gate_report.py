@@ -9,7 +9,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from xml.etree import ElementTree
 
-from semstab.comparison.gate import POWER, GateResult, Verdict
+from semstab.comparison.gate_result import POWER, GateResult, Verdict
 from semstab.core.files import write_text
 from semstab.core.json_form import to_json
 from semstab.errors import ConfigError
@@ -105,8 +105,8 @@ def _ends(result: GateResult) -> str:
 
 
 def _scenes(result: GateResult) -> str:
-    some = ", ".join(result.scenes[:3])
-    return some if len(result.scenes) <= 3 else f"mean of {len(result.scenes)} scenes: {some}, ..."
+    first = ", ".join(result.scenes[:3])
+    return first if len(result.scenes) <= 3 else f"mean of {len(result.scenes)} scenes: {first}, ..."
 
 
 # --- Files ------------------------------------------------------------------------------------------------------------

@@ -78,7 +78,7 @@ class Changed:
 
     def rows(self, where: Mask) -> Changed:
         """Return some of them (n,)."""
-        true, right = (None if own is None else own[where] for own in (self.true, self.right))
+        true, right = (None if column is None else column[where] for column in (self.true, self.right))
         return Changed(self.table.rows(where), self.change[where], self.label[where], true, right)
 
     @classmethod
@@ -87,8 +87,8 @@ class Changed:
         order = np.lexsort(np.concatenate([part.table.index for part in parts]).T[::-1])
 
         def column(name: str) -> Any:
-            own = [getattr(part, name) for part in parts]
-            return None if own[0] is None else np.concatenate(own)[order]
+            columns = [getattr(part, name) for part in parts]
+            return None if columns[0] is None else np.concatenate(columns)[order]
 
         table = VoxelTable.joined([part.table for part in parts])
         return cls(table, *(column(name) for name in ("change", "label", "true", "right")))
@@ -126,12 +126,12 @@ def worse_areas(common: Common, number: int) -> Worse:
     """Return the areas of a run that got worse than the base; frames are known where observations were stored."""
     compared = worse = better = 0
     left, shown = list[Changed](), list[Changed]()
-    for own in _changed(common, number):
-        compared += len(own.change)
-        worse += int(np.count_nonzero(own.change <= -WORSE))
-        better += int(np.count_nonzero(own.change >= WORSE))
-        left.append(own.rows(own.matters))
-        shown.append(own.rows(own.matters | in_share(own.table, common.shown)))
+    for changed in _changed(common, number):
+        compared += len(changed.change)
+        worse += int(np.count_nonzero(changed.change <= -WORSE))
+        better += int(np.count_nonzero(changed.change >= WORSE))
+        left.append(changed.rows(changed.matters))
+        shown.append(changed.rows(changed.matters | in_share(changed.table, common.shown)))
     result, seen = Changed.joined(left), Changed.joined(shown)
     index = result.table.index
     area, improved_alike = _clusters(index, result.label, -result.change, WORSE)
@@ -147,15 +147,15 @@ def worse_areas(common: Common, number: int) -> Worse:
 
     def numbers(table: VoxelTable) -> tuple[Int64, Int64 | None]:
         """Return the areas of some voxels (n,), which hold those that matter among them."""
-        own, theirs = voxel_keys(table.index, index)
-        at = np.minimum(np.searchsorted(own, theirs), max(len(own) - 1, 0))
-        there = own[at] == theirs if len(own) else np.zeros(len(theirs), np.bool_)
-        wrong = None if wrong_area is None else _put(len(own), at[there], wrong_area[there])
-        return _put(len(own), at[there], area[there]), wrong
+        keys, theirs = voxel_keys(table.index, index)
+        at = np.minimum(np.searchsorted(keys, theirs), max(len(keys) - 1, 0))
+        known = keys[at] == theirs if len(keys) else np.zeros(len(theirs), np.bool_)
+        wrong = None if wrong_area is None else _put(len(keys), at[known], wrong_area[known])
+        return _put(len(keys), at[known], area[known]), wrong
 
     def parts() -> Iterator[dict[str, npt.NDArray[Any]]]:
-        for own in _changed(common, number):
-            yield _columns(own, *numbers(own.table))
+        for changed in _changed(common, number):
+            yield _columns(changed, *numbers(changed.table))
 
     changes = Changes(seen, compared, worse, better, *numbers(seen.table), parts)
     top_frames = () if observations is None else _top_frames(observations.among(area > 0, result.label))
@@ -175,12 +175,12 @@ def _put(n: int, at: Int64, values: Int64) -> Int64:
     return result
 
 
-def _columns(own: Changed, area: Int64, wrong_area: Int64 | None) -> dict[str, npt.NDArray[Any]]:
-    table = own.table
-    columns: dict[str, npt.NDArray[Any]] = {"ix": table.ix, "iy": table.iy, "iz": table.iz, "change": own.change}
+def _columns(changed: Changed, area: Int64, wrong_area: Int64 | None) -> dict[str, npt.NDArray[Any]]:
+    table = changed.table
+    columns: dict[str, npt.NDArray[Any]] = {"ix": table.ix, "iy": table.iy, "iz": table.iz, "change": changed.change}
     columns["area"] = area.astype(np.int32)
-    if own.right is not None and wrong_area is not None:
-        columns |= {"right_change": own.right.astype(np.int8), "wrong_area": wrong_area.astype(np.int32)}
+    if changed.right is not None and wrong_area is not None:
+        columns |= {"right_change": changed.right.astype(np.int8), "wrong_area": wrong_area.astype(np.int32)}
     return columns
 
 
@@ -194,7 +194,7 @@ def _clusters(index: Int32, label: Int64, loss: Float64, least: float) -> tuple[
     """
     area, mass = _connected(index, label, loss, loss >= least)
     _, others = _connected(index, label, -loss, loss <= -least)
-    return area, np.array([np.count_nonzero(others >= own - 1e-9) for own in mass], dtype=np.int64)
+    return area, np.array([np.count_nonzero(others >= observed - 1e-9) for observed in mass], dtype=np.int64)
 
 
 def _connected(index: Int32, label: Int64, loss: Float64, where: Mask) -> tuple[Int64, Float64]:
@@ -227,8 +227,8 @@ def _touching(index: Int32, label: Int64) -> tuple[Int64, Int64]:
     for dx, dy, dz in itertools.product((0, 1), (-1, 0, 1), (-1, 0, 1)):
         if (step := (dx * size[1] + dy) * size[2] + dz) > 0:
             at = np.minimum(np.searchsorted(key, key + step), len(key) - 1)
-            there = np.flatnonzero((key[at] == key + step) & (label[at] == label))
-            result.append((there, at[there]))
+            matched = np.flatnonzero((key[at] == key + step) & (label[at] == label))
+            result.append((matched, at[matched]))
     first, second = zip(*result, strict=True)
     return np.concatenate(first), np.concatenate(second)
 
@@ -326,7 +326,7 @@ def _observations(common: Common, number: int, index: Int32, voxel_size: float) 
 def _rows_of(log: Events, index: Int32, voxel_size: float) -> tuple[Int64, Int64, Float64]:
     """Return for each observation the row of the voxel that holds its cell, or -1, its frame and its shares."""
     centre = (np.stack([log.ix, log.iy, log.iz], axis=1) + 0.5) * log.voxel_size
-    own, wanted = voxel_keys(np.floor(centre / voxel_size).astype(np.int32), index)
-    at = np.minimum(np.searchsorted(wanted, own), max(len(wanted) - 1, 0))
-    row = np.where(wanted[at] == own, at, -1) if len(wanted) else np.full(len(own), -1)
+    keys, wanted = voxel_keys(np.floor(centre / voxel_size).astype(np.int32), index)
+    at = np.minimum(np.searchsorted(wanted, keys), max(len(wanted) - 1, 0))
+    row = np.where(wanted[at] == keys, at, -1) if len(wanted) else np.full(len(keys), -1)
     return row[log.voxel].astype(np.int64), log.frame.astype(np.int64), log.evidence[:]

@@ -183,7 +183,7 @@ def _with_observations(common: Common, names: Sequence[str], records: Sequence[R
         return replace(common, notes=(OTHER_OBSERVATIONS, *common.notes), same_frames=False, frames_differ=True)
     shared, pixels = _compared(names, samples)
     cells = shared.sums.values()
-    sums = (replace(own, fine=of.fine, coarse=of.coarse) for own, of in zip(common.sums, cells, strict=True))
+    sums = (replace(part, fine=of.fine, coarse=of.coarse) for part, of in zip(common.sums, cells, strict=True))
     notes, logs = _fewer_frames(samples), tuple(shared.logs.values())
     return replace(
         common, basis="observations", notes=(*common.notes, *notes, *pixels), sums=tuple(sums), logs=logs,
@@ -204,7 +204,7 @@ def _compared(names: Iterable[str], samples: Sequence[CellObservations]) -> tupl
     Where their pixels have different sizes, the pixels that a run left without a label are unknown.
     """
     shared = compared_observations(dict(zip(names, samples, strict=True)))
-    footprints = [float(np.median(own.views.footprint)) if len(own.views) else math.nan for own in samples]
+    footprints = [float(np.median(sample.views.footprint)) if len(sample.views) else math.nan for sample in samples]
     if not max(footprints) > ALIKE * min(footprints):
         return shared, ()
     compared = replace(shared.compared, ignored=(), order_ignored=shared.compared.order, bounded=True)
@@ -218,10 +218,10 @@ def on_common_observations(
 
     None where nothing can be paired on observations: alpha is then of each run's own.
     """
-    own = [*entries.values()]
-    if _other_frame_of_reference(own) or _no_voxels(own):
+    runs = [*entries.values()]
+    if _other_frame_of_reference(runs) or _no_voxels(runs):
         return None
-    samples = _observations_of_the_same_frames([entry.record for entry in own if entry.record is not None])
+    samples = _observations_of_the_same_frames([entry.record for entry in runs if entry.record is not None])
     if not samples:
         return None
     shared, notes = _compared(entries, samples)
@@ -229,7 +229,7 @@ def on_common_observations(
         return None
     alike = [
         replace(entry, small=(replace(entry.sums, fine=of.fine, coarse=of.coarse), entry.flicker))
-        for entry, of in zip(own, shared.sums.values(), strict=True)
+        for entry, of in zip(runs, shared.sums.values(), strict=True)
     ]
     return alike, shared.compared, notes
 
@@ -244,7 +244,7 @@ def _of_whole_maps(basis: Basis, note: str, entries: Sequence[Entry]) -> Common:
     sums = tuple(entry.sums for entry in entries)
     without = [entry.where for entry in entries if not entry.sums.truth]
     if 0 < len(without) < len(entries):
-        sums = tuple(own.without_truth() for own in sums)
+        sums = tuple(part.without_truth() for part in sums)
         missing = f"{without[0]} holds no ground truth (run it with --statistics): correctness is not compared"
         return Common(basis, (note, missing), sums)
     return Common(basis, (note,), sums)
@@ -256,7 +256,7 @@ def _sums(table: VoxelTable, label: Int64 | None) -> ClusterSums:
 
 def _same_frames(observations: Sequence[CellObservations]) -> bool:
     """Return whether frames of one index were taken from one position, and flights share most frames."""
-    first, *others = (own.views for own in observations)
+    first, *others = (each.views for each in observations)
     for other in others:
         _, one, same = np.intersect1d(first.frame, other.frame, return_indices=True)
         if 2 * len(one) < min(len(first), len(other)):
@@ -268,10 +268,10 @@ def _same_frames(observations: Sequence[CellObservations]) -> bool:
 
 def _fewer_frames(observations: Sequence[CellObservations]) -> tuple[str, ...]:
     """Return a note where a run left out frames that others have."""
-    if len({own.frames for own in observations}) == 1:
+    if len({each.frames for each in observations}) == 1:
         return ()
-    both = len(functools.reduce(np.intersect1d, [own.views.frame for own in observations]))
-    listed = " and ".join(str(own.frames) for own in observations)
+    both = len(functools.reduce(np.intersect1d, [each.views.frame for each in observations]))
+    listed = " and ".join(str(each.frames) for each in observations)
     return (f"the runs fused {listed} frames: alpha is of the {both} views that all have; flicker is left out",)
 
 
@@ -281,12 +281,12 @@ def _fewer_frames(observations: Sequence[CellObservations]) -> tuple[str, ...]:
 def _other_frame_of_reference(entries: Sequence[Entry]) -> str:
     """Return why coordinates do not show the same locations; empty where they do."""
     first, *others = (entry.georeference for entry in entries)
-    for entry, own in zip(entries[1:], others, strict=True):
-        if (own is None) != (first is None):
-            without = entry if own is None else entries[0]
+    for entry, views in zip(entries[1:], others, strict=True):
+        if (views is None) != (first is None):
+            without = entry if views is None else entries[0]
             return f"{without.where} has no georeference, and the other has one"
-        if own is not None and first is not None and own != first:
-            differing = "coordinate reference systems" if own.crs != first.crs else "frames of the coordinates"
+        if views is not None and first is not None and views != first:
+            differing = "coordinate reference systems" if views.crs != first.crs else "frames of the coordinates"
             return f"the {differing} of {entries[0].where} and {entry.where} differ"
     return ""
 

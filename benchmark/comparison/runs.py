@@ -37,7 +37,7 @@ from semstab.statistics.cluster_sums import ClusterSums
 from semstab.statistics.verdict import ADVICE
 
 Flicker = Mapping[int, float]
-"""Percent of the pixels whose label differs from that of the frame before, camera motion removed, by frame index."""
+"""Percent of the pixels whose label differs from the label in the frame before, camera motion removed, by frame."""
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -162,7 +162,7 @@ def open_runs(named: Sequence[str | os.PathLike[str]]) -> tuple[RunHandle, ...]:
     models = [run.model for run in runs]
     both = [f"{folder}:{model}" for folder, model in zip(folders, models, strict=True)]
     whole = [f"{run.source}:{run.model}" for run in runs]
-    names = next((own for own in (models, folders, both) if len({*own}) == len({*whole})), whole)
+    names = next((naming for naming in (models, folders, both) if len({*naming}) == len({*whole})), whole)
     names = [run.model if run.source is None else name for name, run in zip(names, runs, strict=True)]
     times = [names[: i + 1].count(name) for i, name in enumerate(names)]
     names = [name if nth == 1 else f"{name} ({nth})" for name, nth in zip(names, times, strict=True)]
@@ -236,18 +236,18 @@ def _require_same_scene(scene: str, one: Entry, other: Entry) -> None:
         )
 
 
-def _chosen(path: Path, there: Sequence[str], wanted: str) -> str:
+def _chosen(path: Path, models: Sequence[str], wanted: str) -> str:
     if wanted:
-        if wanted not in there:
-            raise ConfigError(f"{path}: no model '{wanted}'; {nearest(wanted, there)}")
+        if wanted not in models:
+            raise ConfigError(f"{path}: no model '{wanted}'; {nearest(wanted, models)}")
         return wanted
-    own = [name for name in there if name != GROUND_TRUTH] or list(there)
-    if not own:
+    predicted = [name for name in models if name != GROUND_TRUTH] or list(models)
+    if not predicted:
         raise ConfigError(f"{path}: it holds no finished unit")
-    if len(own) > 1:
-        listed = ", ".join(own[:4]) + (", ..." if len(own) > 4 else "")
-        raise ConfigError(f"{path}: it holds several label sources ({listed}); name one: {path}:{own[0]}")
-    return own[0]
+    if len(predicted) > 1:
+        listed = ", ".join(predicted[:4]) + (", ..." if len(predicted) > 4 else "")
+        raise ConfigError(f"{path}: it holds several label sources ({listed}); name one: {path}:{predicted[0]}")
+    return predicted[0]
 
 
 def _flicker(file: Path | None) -> Flicker:
@@ -309,13 +309,13 @@ def save_summary(run: RunHandle, path: str | Path, most: int = 1_000_000, *, sin
         DataError: If even the coarsest sums need more.
     """
     scenes = tuple(
-        _Scene(**_numbers(own), name=name, frames=(*own.flicker,), flicker=(*own.flicker.values(),))
-        for name, own in run.scenes.items()
+        _Scene(**_numbers(entry), name=name, frames=(*entry.flicker,), flicker=(*entry.flicker.values(),))
+        for name, entry in run.scenes.items()
     )
     content = json.dumps({"kind": KIND, "schema": SCHEMA, **to_json(_Content(run.model, scenes, {**run.about}))})
-    sums = [own.sums for own in run.scenes.values()]
+    sums = [entry.sums for entry in run.scenes.values()]
     while len(data := _archive(content, sums, single=single)) > most:
-        coarser = [_coarser(own) for own in sums]
+        coarser = [_coarser(each) for each in sums]
         if all(np.array_equal(a.cell, b.cell) and a.step == b.step for a, b in zip(coarser, sums, strict=True)):
             raise DataError(f"{path}: a summary of {len(sums)} scenes takes {len(data)} bytes; use fewer scenes")
         sums = coarser
@@ -350,19 +350,19 @@ def load_summary(path: str | Path) -> RunHandle:
     scenes = {}
     with ScratchFolder() as folder:
         part = folder / "sums.parquet"
-        for own, data in zip(content.scenes, files, strict=True):
+        for numbers, data in zip(content.scenes, files, strict=True):
             part.write_bytes(data)
             try:
                 sums = ClusterSums.load(part)
             except DataError as error:
-                raise DataError(f"{path}: the sums of {own.name} are damaged; write the summary again") from error
-            flicker = dict(zip(own.frames, own.flicker, strict=True))
-            scenes[own.name] = Entry(**_numbers(own), where=str(path), small=(sums, flicker))
+                raise DataError(f"{path}: the sums of {numbers.name} are damaged; write the summary again") from error
+            flicker = dict(zip(numbers.frames, numbers.flicker, strict=True))
+            scenes[numbers.name] = Entry(**_numbers(numbers), where=str(path), small=(sums, flicker))
     return RunHandle(content.model, path, content.model, scenes, content.about)
 
 
-def _numbers(own: EntryNumbers) -> dict[str, Any]:
-    return {field.name: getattr(own, field.name) for field in dataclasses.fields(EntryNumbers)}
+def _numbers(numbers: EntryNumbers) -> dict[str, Any]:
+    return {field.name: getattr(numbers, field.name) for field in dataclasses.fields(EntryNumbers)}
 
 
 def _archive(content: str, sums: list[ClusterSums], *, single: bool) -> bytes:

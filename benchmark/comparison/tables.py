@@ -86,14 +86,14 @@ def tables(comparison: RunComparison) -> list[Table]:
 def scopes(comparison: RunComparison) -> Iterator[tuple[str, Against]]:
     """Yield each run against the base: over all scenes where there are several, then scene by scene."""
     if len(comparison.scenes) > 1:
-        yield from ((ALL_SCENES, own) for own in comparison.overall)
+        yield from ((ALL_SCENES, against) for against in comparison.overall)
     for scene in comparison.scenes:
-        yield from ((scene.scene, own) for own in scene.against)
+        yield from ((scene.scene, against) for against in scene.against)
 
 
-def heading(comparison: RunComparison, scope: str, own: Against) -> str:
+def heading(comparison: RunComparison, scope: str, against: Against) -> str:
     """Return the heading of a run's differences."""
-    return f"{scope}: {own.other} less {comparison.base}"
+    return f"{scope}: {against.other} less {comparison.base}"
 
 
 def scope(row: Contrast) -> str:
@@ -110,7 +110,9 @@ def _differences(comparison: RunComparison) -> Table:
         Column("difference", "Difference", 4, signed=True), Column("p_holm", "p (Holm)", 4),
         Column("answers", "Answers for"), Column("change", "Change"),
     )  # fmt: skip
-    groups = tuple(Group(heading(comparison, scope, own), _rows(own, HEADLINES)) for scope, own in scopes(comparison))
+    groups = tuple(
+        Group(heading(comparison, scope, against), _rows(against, HEADLINES)) for scope, against in scopes(comparison)
+    )
     macro = " Over all scenes each scene with an interval counts once." if len(comparison.scenes) > 1 else ""
     caption = (
         "Alpha is of the observations that all runs made, and other measures are of the voxels that all saw twice or"
@@ -127,17 +129,17 @@ def _others(comparison: RunComparison) -> str:
     return comparison.runs[1].name if len(comparison.runs) == 2 else "Other"
 
 
-def _rows(own: Against, shown: Sequence[Quantity]) -> tuple[Row, ...]:
+def _rows(against: Against, shown: Sequence[Quantity]) -> tuple[Row, ...]:
     keys = {quantity.key: quantity for quantity in shown}
     return tuple(
         (_titled(keys[row.measure]), row.base, row.other, row.difference, row.p_holm, scope(row), _change(row))
-        for row in own.contrasts
+        for row in against.contrasts
         if row.measure in keys
     )
 
 
 def _change(row: Contrast) -> str:
-    """Return 'better' or 'worse'; of coverage, which no model is judged by, 'more' or 'fewer'."""
+    """Return 'better' or 'worse'; for coverage, which is neither, 'more' or 'fewer'."""
     return COUNTED.get(row.change, "") if row.measure == COVERAGE.key else row.change
 
 
@@ -150,11 +152,13 @@ def _titled(quantity: Quantity) -> str:
 
 
 def _by_class(comparison: RunComparison) -> Table:
-    there = {row.measure for _, own in scopes(comparison) for row in own.by_class}
-    shown = [quantity for quantity in IN_CLASSES if quantity.key in there]
+    measured = {row.measure for _, against in scopes(comparison) for row in against.by_class}
+    shown = [quantity for quantity in IN_CLASSES if quantity.key in measured]
     columns = (Column("class", "Class"), *(Column(q.key, q.title, 3, q.better, signed=True) for q in shown))
     worse = Column("worse", "Worse"), Column("better", "Better")
-    groups = tuple(Group(heading(comparison, scope, own), _class_rows(own, shown)) for scope, own in scopes(comparison))
+    groups = tuple(
+        Group(heading(comparison, scope, against), _class_rows(against, shown)) for scope, against in scopes(comparison)
+    )
     caption = (
         "The measures are alpha of the class against all others, PSA of its locations (by the ground truth, or else by"
         " all runs together), recall and IoU. Worse and better list the measures that differ when the p-values are"
@@ -163,11 +167,11 @@ def _by_class(comparison: RunComparison) -> Table:
     return Table("comparison_classes", "By class", caption, (columns[0], *worse, *columns[1:]), groups, "scope")
 
 
-def _class_rows(own: Against, shown: Sequence[Quantity]) -> tuple[Row, ...]:
+def _class_rows(against: Against, shown: Sequence[Quantity]) -> tuple[Row, ...]:
     words = by_key(BY_CLASS)
     rows = []
-    for name in dict.fromkeys(row.of for row in own.by_class):
-        mine = {row.measure: row for row in own.by_class if row.of == name}
+    for name in dict.fromkeys(row.of for row in against.by_class):
+        mine = {row.measure: row for row in against.by_class if row.of == name}
         cells = [mine[q.key].difference if q.key in mine else math.nan for q in shown]
         changed = {
             change: ", ".join(
@@ -189,9 +193,9 @@ def _areas(comparison: RunComparison) -> Table:
         Column("improved_alike", "Improved alike", 0), Column("frames", "Top contributing frames"),
     )  # fmt: skip
     groups = tuple(
-        Group(heading(comparison, scene.scene, own), tuple(_area_row(area) for area in own.areas))
+        Group(heading(comparison, scene.scene, against), tuple(_area_row(area) for area in against.areas))
         for scene in comparison.scenes
-        for own in scene.against
+        for against in scene.against
     )
     caption = (
         "An area is neighbouring voxels of one class that got worse: by agreement, they lost a fifth or more of the"
@@ -212,7 +216,7 @@ def _area_row(area: Area) -> Row:
 
 def top_frames(frames: Sequence[FrameShare]) -> str:
     """Return '13 (30%), 4 (26%) and 7 more'."""
-    listed = ", ".join(f"{own.name or own.frame} ({own.share:.0%})" for own in frames[:NAMED_FRAMES])
+    listed = ", ".join(f"{frame.name or frame.frame} ({frame.share:.0%})" for frame in frames[:NAMED_FRAMES])
     return listed + (f" and {len(frames) - NAMED_FRAMES} more" if len(frames) > NAMED_FRAMES else "")
 
 
@@ -220,11 +224,11 @@ def _frames(comparison: RunComparison) -> Table:
     columns = (Column("frame", "Frame"), Column("share_percent", "Share of what was lost (%)", 1))
     groups = tuple(
         Group(
-            heading(comparison, scene.scene, own),
-            tuple((each.name or str(each.frame), 100 * each.share) for each in own.top_frames),
+            heading(comparison, scene.scene, against),
+            tuple((each.name or str(each.frame), 100 * each.share) for each in against.top_frames),
         )
         for scene in comparison.scenes
-        for own in scene.against
+        for against in scene.against
     )
     caption = "The shares are of all areas together whose frames agree less."
     return Table("comparison_frames", "Top contributing frames", caption, columns, groups, "scope")
@@ -238,15 +242,15 @@ def everything(comparison: RunComparison) -> Table:
         Column("holds_for", "Holds for"), Column("p", "p", 6), Column("p_holm", "p (Holm)", 6),
         Column("change", "Change"), Column("undecided", "Undecided"),
     )  # fmt: skip
-    groups = tuple(Group(scope, tuple(_all_rows(own))) for scope, own in scopes(comparison))
+    groups = tuple(Group(scope, tuple(_all_rows(against))) for scope, against in scopes(comparison))
     return Table("comparison_all", "All comparisons", ANSWERS, columns, groups, "scope")
 
 
-def _all_rows(own: Against) -> Iterator[Row]:
-    for row in (*own.contrasts, *own.by_class):
+def _all_rows(against: Against) -> Iterator[Row]:
+    for row in (*against.contrasts, *against.by_class):
         change: Interval = row.difference
         yield (
-            own.other, row.of, row.measure, row.base, row.other, change.ends, change.scope, change.p_value,
+            against.other, row.of, row.measure, row.base, row.other, change.ends, change.scope, change.p_value,
             row.p_holm, row.change, change.undecided,
         )  # fmt: skip
 
@@ -271,7 +275,7 @@ def sentences(comparison: RunComparison) -> list[str]:
 
 def answers(comparison: RunComparison) -> list[str]:
     """Return the differences, run by run."""
-    return [sentence for own in comparison.overall for sentence in _of_run(comparison, own)]
+    return [sentence for against in comparison.overall for sentence in _of_run(comparison, against)]
 
 
 def notes(comparison: RunComparison) -> list[str]:
@@ -300,49 +304,48 @@ LEAST_LEFT_OUT = 0.005
 """Least share of pixels left without a label that is reported."""
 
 
-def _of_run(comparison: RunComparison, own: Against) -> Iterator[str]:
-    yield _stability(comparison, own)
-    if changes := _changes(own.contrasts, by_key([row for row in HEADLINES if row is not COVERAGE])):
-        yield f"{own.other}: {changes}."
-    yield from _coverage(comparison, own)
+def _of_run(comparison: RunComparison, against: Against) -> Iterator[str]:
+    yield _stability(comparison, against)
+    if changes := _changes(against.contrasts, by_key([row for row in HEADLINES if row is not COVERAGE])):
+        yield f"{against.other}: {changes}."
+    yield from _coverage(comparison, against)
     classes = {
-        name: [row for row in own.by_class if row.of == name] for name in dict.fromkeys(r.of for r in own.by_class)
+        name: [row for row in against.by_class if row.of == name]
+        for name in dict.fromkeys(r.of for r in against.by_class)
     }
     notes = {name: _changes(rows, by_key(BY_CLASS)) for name, rows in classes.items()}
     if listed := [f"{name} ({text})" for name, text in notes.items() if text]:
         left = len(listed) - MOST_CLASSES
         more = f" and {left} more {'class' if left == 1 else 'classes'}" if len(listed) > MOST_CLASSES else ""
-        yield f"{own.other} by class: {', '.join(listed[:MOST_CLASSES])}{more}."
+        yield f"{against.other} by class: {', '.join(listed[:MOST_CLASSES])}{more}."
     for scene in comparison.scenes:
-        mine = next(each for each in scene.against if each.other == own.other)
+        mine = next(each for each in scene.against if each.other == against.other)
         for what in ("agreement", "truth"):
             if areas := [area for area in mine.areas if area.what == what]:
-                yield f"{own.other} in {scene.scene}: {_of_areas(areas)}."
+                yield f"{against.other} in {scene.scene}: {_of_areas(areas)}."
 
 
-def _stability(comparison: RunComparison, own: Against) -> str:
+def _stability(comparison: RunComparison, against: Against) -> str:
     """Return the difference of alpha, on which verdicts rest."""
-    row = next((row for row in own.contrasts if row.measure == ALPHA.key), None)
+    row = next((row for row in against.contrasts if row.measure == ALPHA.key), None)
     if row is None:
-        return f"Alpha of {own.other} or {comparison.base} is not known: run it with more overlap between frames."
+        return f"Alpha of {against.other} or {comparison.base} is not known: run it with more overlap between frames."
     where = f" over {len(comparison.scenes)} scenes" if len(comparison.scenes) > 1 else ""
     numbers = f"{ALPHA.word} {row.other:.3f} against {row.base:.3f}{where}"
     if row.difference.value == row.difference.low == row.difference.high == 0:
-        return f"{own.other} is as stable as {comparison.base}: {numbers}, the same everywhere."
+        return f"{against.other} is as stable as {comparison.base}: {numbers}, the same everywhere."
     interval = f"{row.difference.value:+z.3f} ({row.difference.low:+z.3f} to {row.difference.high:+z.3f})"
     p = "" if math.isnan(row.p_holm) else f", p {row.p_holm:.2g} (Holm)"
     text = {"better": "is more stable than", "worse": "is less stable than"}
-    pair = own.other, comparison.base
+    other, base = pair = against.other, comparison.base
     if silent := [run.name for run in comparison.runs if run.uninformative and run.name in pair]:
         which = f"{' and '.join(silent)} {'is' if len(silent) == 1 else 'are'} nearly one class all over"
-        return f"{own.other} and {comparison.base} are not ranked, as {which}: {numbers}, {interval}{p}."
+        return f"{other} and {base} are not ranked, as {which}: {numbers}, {interval}{p}."
     if row.change:
-        return (
-            f"{own.other} {text[row.change]} {comparison.base}: {numbers}, {interval}{p}, for {row.difference.scope}."
-        )
+        return f"{other} {text[row.change]} {base}: {numbers}, {interval}{p}, for {row.difference.scope}."
     why = f"; undecided: {row.difference.undecided}" if row.difference.undecided else ""
     return (
-        f"Over all classes, no difference in stability between {own.other} and {comparison.base} is shown: {numbers},"
+        f"Over all classes, no difference in stability between {other} and {base} is shown: {numbers},"
         f" {interval}{p}, for {row.difference.scope}{why}."
     )
 
@@ -351,12 +354,12 @@ LEAST_COVERAGE = 0.005
 """Least change of coverage that is reported: it is a count, so that any difference is a fact, however small."""
 
 
-def _coverage(comparison: RunComparison, own: Against) -> Iterator[str]:
-    for row in own.contrasts:
+def _coverage(comparison: RunComparison, against: Against) -> Iterator[str]:
+    for row in against.contrasts:
         change = row.difference.value
         if row.measure == COVERAGE.key and abs(change) >= LEAST_COVERAGE:
             more = "more" if change > 0 else "fewer"
-            yield f"{own.other} covers {abs(change):.1%} {more} voxels than {comparison.base}."
+            yield f"{against.other} covers {abs(change):.1%} {more} voxels than {comparison.base}."
 
 
 def _changes(rows: Sequence[Contrast], known: Mapping[str, Quantity]) -> str:
@@ -421,7 +424,7 @@ def _fitting(table: Table, comparison: RunComparison) -> Table:
     """Return a table whose groups are scenes, where there is one other run, and whose title has names that are long."""
     if len(comparison.runs) == 2:
         pair = heading(comparison, "", comparison.overall[0])
-        groups = (dataclasses.replace(own, name=own.name.removesuffix(pair)) for own in table.groups)
+        groups = (dataclasses.replace(group, name=group.name.removesuffix(pair)) for group in table.groups)
         table = dataclasses.replace(table, groups=tuple(groups))
     heads = {column.key: column.header for column in table.columns if column.key in ("base", "other")}
     if max(map(len, heads.values()), default=0) <= LONGEST_NAME:

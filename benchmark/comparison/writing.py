@@ -45,7 +45,7 @@ MOST_NUMBERS = 9
 
 def charts(comparison: RunComparison) -> dict[str, list[dict[str, str]]]:
     """Return charts of the differences with their intervals, by the name of the table above them."""
-    colors = {own.name: k for k, own in enumerate(comparison.runs[1:])}
+    colors = {run.name: k for k, run in enumerate(comparison.runs[1:])}
     shown, panels, by_class = by_key(HEADLINES), Panels(), Panels()
     for scope, against in scopes(comparison):
         for row in against.contrasts:
@@ -62,48 +62,50 @@ def charts(comparison: RunComparison) -> dict[str, list[dict[str, str]]]:
     return {
         name: [
             {"title": title, "chart": dot_chart(rows, f"{title} {less}", (0.0,))}
-            for title, rows in own.items()
+            for title, rows in drawn.items()
             if any(estimate.value for row in rows.values() for _, _, estimate in row)  # not where nothing differs
         ]
-        for name, own in (("comparison", panels), ("comparison_classes", by_class))
-        if own
+        for name, drawn in (("comparison", panels), ("comparison_classes", by_class))
+        if drawn
     }
 
 
 def _changed(comparison: ComparisonData) -> Iterator[tuple[SceneComparison, Against, Changes]]:
     """Yield the scenes and runs with known changes in each voxel."""
     for scene in comparison.result.scenes:
-        for own in scene.against:
-            if (changes := comparison.changes.get((scene.scene, own.other))) is not None:
-                yield scene, own, changes
+        for against in scene.against:
+            if (changes := comparison.changes.get((scene.scene, against.other))) is not None:
+                yield scene, against, changes
 
 
 def maps(comparison: ComparisonData) -> Iterator[Figure]:
     """Yield a map of each scene and run with known changes."""
-    for scene, own, changes in _changed(comparison):
+    for scene, against, changes in _changed(comparison):
         if scene.scene in comparison.up:
             yield Figure(
-                slug("comparison_map", scene.scene, own.other),
-                f"Changes: {scene.scene}, {own.other} less {comparison.result.base}",
+                slug("comparison_map", scene.scene, against.other),
+                f"Changes: {scene.scene}, {against.other} less {comparison.result.base}",
                 "The map shows the largest change in each column of voxels that both saw twice or more: of agreement"
                 " between frames and, where there is ground truth, of correctness. Numbers name the areas that got"
                 " worse.",
-                f"Maps of {scene.scene} from above: orange where {own.other} is worse, blue where it is better.",
-                partial(_draw, changes, comparison.up[scene.scene], own),
-                unit=slug(scene.scene, own.other),
+                f"Maps of {scene.scene} from above: orange where {against.other} is worse, blue where it is better.",
+                partial(_draw, changes, comparison.up[scene.scene], against),
+                unit=slug(scene.scene, against.other),
             )
 
 
-def _draw(changes: Changes, up: tuple[float, float, float], own: Against) -> Canvas:
+def _draw(changes: Changes, up: tuple[float, float, float], against: Against) -> Canvas:
     shown = changes.shown
-    panels = [Panel("agreement", ("lost", "gained"), shown.change, *_numbers(own, "agreement"))]
+    panels = [Panel("agreement", ("lost", "gained"), shown.change, *_numbers(against, "agreement"))]
     if shown.right is not None:
-        panels.append(Panel("truth", ("wrong now", "right now"), shown.right.astype(float), *_numbers(own, "truth")))
+        panels.append(
+            Panel("truth", ("wrong now", "right now"), shown.right.astype(float), *_numbers(against, "truth"))
+        )
     return draw_changes(shown.table, up, panels)
 
 
-def _numbers(own: Against, what: str) -> tuple[list[int], list[tuple[float, float, float]]]:
-    shown = [area for area in own.areas if area.what == what][:MOST_NUMBERS]
+def _numbers(against: Against, what: str) -> tuple[list[int], list[tuple[float, float, float]]]:
+    shown = [area for area in against.areas if area.what == what][:MOST_NUMBERS]
     return [area.number for area in shown], [area.centre for area in shown]
 
 
@@ -194,7 +196,7 @@ def page(comparison: RunComparison, made: Sequence[Table], drawn: Sequence[Figur
         runs=comparison.runs,
         scenes=[scene.scene for scene in comparison.scenes],
         reading=[relations(text) for text in sentences(comparison)],
-        models=[(own.name, sample(k)) for k, own in enumerate(comparison.runs[1:])],
+        models=[(run.name, sample(k)) for k, run in enumerate(comparison.runs[1:])],
         topics=list(_topics(shown, drawn, charts(comparison), folder)),
     )
 
@@ -213,18 +215,18 @@ def _topics(
     made: Sequence[Table], drawn: Sequence[Figure], made_charts: Mapping[str, list[dict[str, str]]], folder: Path
 ) -> Iterator[dict[str, Any]]:
     for key, title, names in TOPICS:
-        own = [table for table in made if table.name in names]
+        named = [table for table in made if table.name in names]
         shown = [figure for figure in drawn if figure.name.partition("__")[0] in names]
-        if own or shown:
+        if named or shown:
             dots = [chart for name in names for chart in made_charts.get(name, ())]
-            yield {"id": key, "title": title, "charts": dots, "blocks": list(blocks(own, shown, folder))}
+            yield {"id": key, "title": title, "charts": dots, "blocks": list(blocks(named, shown, folder))}
 
 
 def _write_columns(comparison: ComparisonData, folder: Path) -> None:
     written = []
-    for _, own, changes in _changed(comparison):
-        if own.columns is not None:
-            written.append(folder / own.columns)
+    for _, against, changes in _changed(comparison):
+        if against.columns is not None:
+            written.append(folder / against.columns)
             table = changes.shown.table
             parquet.write(written[-1], changes.parts(), KIND, table.voxel_size, table.classes)
     if written:
@@ -232,19 +234,17 @@ def _write_columns(comparison: ComparisonData, folder: Path) -> None:
 
 
 def _recorded(comparison: ComparisonData) -> Iterator[tuple[tuple[str, str], tuple[Any, ...]]]:
-    for scene, own, changes in _changed(comparison):
-        areas = [(area.what, f"{area.number} {area.of}", area.centre) for area in own.areas]
-        title, shown = heading(comparison.result, scene.scene, own), changes.shown
-        yield (scene.scene, own.other), (title, shown.table, shown.change, shown.right, areas)
-
-
-def _has_files(folder: Path) -> bool:
-    return any(not file.name.startswith(TEMPORARY) for file in folder.iterdir())  # a killed comparison leaves those
+    for scene, against, changes in _changed(comparison):
+        areas = [(area.what, f"{area.number} {area.of}", area.centre) for area in against.areas]
+        title, shown = heading(comparison.result, scene.scene, against), changes.shown
+        yield (scene.scene, against.other), (title, shown.table, shown.change, shown.right, areas)
 
 
 def _require_own(folder: Path) -> None:
     """Raise ConfigError where the folder holds something else than a comparison, as a run."""
     if folder.is_file():
         raise ConfigError(f"{folder}: it is a file; name a folder")
-    if folder.is_dir() and _has_files(folder) and not (folder / CONTENT).exists():
+    if not folder.is_dir() or (folder / CONTENT).exists():
+        return
+    if any(not file.name.startswith(TEMPORARY) for file in folder.iterdir()):  # a killed comparison leaves those
         raise ConfigError(f"{folder}: it is not empty and holds no comparison; choose another folder")

@@ -126,20 +126,13 @@ def export(
         >>> file.path.name
         'map.ply'
     """
+    classify, join, thresholds = classify or onto, join or beside, thresholds or commit
     run, model = model_of(run, model)
     files = [Path(file) for file in ([to] if isinstance(to, str | Path) else to)]
-    for file in files:
-        require_output(file, (asprs, join or beside, thresholds or commit))
-        if task_format is not None:
-            annotation_formats.check(task_format, file)
-        elif file.suffix.lower() not in SUFFIXES:
-            raise ConfigError(f"{file}: format '{file.suffix}' is not known; {nearest(file.suffix, SUFFIXES)}")
-    for folder in {file.parent for file in files if file.parent.is_dir()}:
-        remove_abandoned(folder)  # of a killed export
+    _require_writable(files, (asprs, join, thresholds), task_format)
     result = load_result(run)
     record = result.record(scene=scene, model=model, backend=backend)
     settings = Settings(cell, None if asprs is None else Path(asprs))
-    classify, join, thresholds = classify or onto, join or beside, thresholds or commit
     accepted = None if thresholds is None else AcceptanceThresholds.load(thresholds)
 
     @functools.cache
@@ -163,36 +156,48 @@ def export(
         return [_written(chosen(usual.get(file.suffix.lower())), file, settings) for file in files]
 
 
+def _require_writable(files: Sequence[Path], inputs: Sequence[str | Path | None], task_format: str | None) -> None:
+    """Raise ConfigError for a file that is an input or whose format is not known; remove what a killed export left."""
+    for file in files:
+        require_output(file, inputs)
+        if task_format is not None:
+            annotation_formats.check(task_format, file)
+        elif file.suffix.lower() not in SUFFIXES:
+            raise ConfigError(f"{file}: format '{file.suffix}' is not known; {nearest(file.suffix, SUFFIXES)}")
+    for folder in {file.parent for file in files if file.parent.is_dir()}:
+        remove_abandoned(folder)
+
+
 def _written(chosen: Chosen, file: Path, settings: Settings) -> Exported:
-    voxels, some = WRITERS[file.suffix.lower()](chosen, file, settings), chosen.first
+    voxels, part = WRITERS[file.suffix.lower()](chosen, file, settings), chosen.first
     where = "coordinates of the scene, which has no georeference"
-    where = where if some.georeference is None else crs_name(some.georeference)
-    return Exported(file, f"{voxels:,} voxels, {where}", tuple(_notes(some, file, settings)))
+    where = where if part.georeference is None else crs_name(part.georeference)
+    return Exported(file, f"{voxels:,} voxels, {where}", tuple(_notes(part, file, settings)))
 
 
 def _tasks_written(file: TaskFile, kind: str, task: Task) -> Exported:
     notes, images = write_tasks(file, kind, task), len(file.by_image())
-    bits = sum(own.score for own in file.tasks)
+    bits = sum(each.score for each in file.tasks)
     return Exported(file.path, f"{len(file.tasks)} tasks in {images} images, {bits:,.0f} bits of entropy", notes)
 
 
 def _classified(chosen: Chosen, cloud: Path, file: Path, radius: float | None, settings: Settings) -> Exported:
-    some = chosen.first
-    tally = joining.classify(chosen, cloud, file, some.table.voxel_size if radius is None else radius, settings.asprs)
+    part = chosen.first
+    tally = joining.classify(chosen, cloud, file, part.table.voxel_size if radius is None else radius, settings.asprs)
     share = tally.classified / tally.points
     if chosen.whole and share < FEW_MET:
-        logger.warning("%s: %s", cloud, _few_met(tally, some))
+        logger.warning("%s: %s", cloud, _few_met(tally, part))
     content = f"{tally.points:,} points, {share:.1%} of them classified"
-    return Exported(file, content, tuple(_notes(some, file, settings)))
+    return Exported(file, content, tuple(_notes(part, file, settings)))
 
 
-def _few_met(tally: joining.Tally, some: Voxels) -> str:
+def _few_met(tally: joining.Tally, part: Voxels) -> str:
     """Return the possible reasons why few points of a cloud have a voxel."""
     text = f"only {tally.classified / tally.points:.1%} of its points lie in or next to a voxel"
     within = tally.classified / max(1, tally.over)
     if within >= FEW_MET:
         return f"{text}: the cloud is larger than the map; of the points over the map {within:.1%} do"
-    where = "has no georeference" if some.georeference is None else "may be shifted or turned"
+    where = "has no georeference" if part.georeference is None else "may be shifted or turned"
     return (
         f"{text} ({within:.1%} of those over the map): the map {where}, or the cloud is of another"
         " area or height; run semstab-bench check to see the position of the project, or set a larger --radius"

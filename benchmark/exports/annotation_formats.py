@@ -202,7 +202,7 @@ def check(kind: str, path: Path) -> None:
 
 def write_tasks(file: TaskFile, kind: str, task: Task) -> tuple[str, ...]:
     """Write tasks of frames, and their images; return notes on their use."""
-    for one in {own.image: own for own in file.tasks}.values():
+    for one in {task.image: task for task in file.tasks}.values():
         color = task.scene.color(one.frame)
         assert color is not None
         image = file.path.parent / file.image(one)

@@ -181,12 +181,12 @@ class _Finder:
         return low, high
 
     def __call__(self, points: Float64) -> Taken:
-        some, apart = self.chosen.first, np.full(len(points), np.inf)
-        label = np.zeros(len(points), some.classified.dtype)
+        part, apart = self.chosen.first, np.full(len(points), np.inf)
+        label = np.zeros(len(points), part.classified.dtype)
         columns = {
-            name: np.zeros(len(points), clouds.as_stored(own.values).dtype) for name, own in some.columns.items()
+            name: np.zeros(len(points), clouds.as_stored(column.values).dtype) for name, column in part.columns.items()
         }
-        placed = some.in_scene(points)
+        placed = part.in_scene(points)
         for tile, rows in self._near(placed):
             voxels = self.chosen[tile]
             if not len(voxels.table):
@@ -308,7 +308,7 @@ def _classify_ply(voxels: Voxels, cloud: Path, out: Path, find: Finder) -> None:
         own = {name: header.dtype[name].newbyteorder("<") for name in header.dtype.names or ()}
         kinds = {
             "class": voxels.classified.dtype,
-            **{k: clouds.as_stored(own.values).dtype for k, own in voxels.columns.items()},
+            **{k: clouds.as_stored(column.values).dtype for k, column in voxels.columns.items()},
         }
         dtype = np.dtype([*(own | kinds).items()])
         comments = dict.fromkeys((*header.comments, *clouds.legend(voxels)))

@@ -53,23 +53,23 @@ def write_raster(chosen: Chosen, path: Path, cell: int = 1) -> int:
         from rasterio.windows import Window as Pixels
     except ImportError as error:
         raise MissingDependencyError(f"{path}: .tif needs rasterio; {INSTALL}") from error
-    some, seen, voxels = chosen.first, {}, 0
+    part, seen, voxels = chosen.first, {}, 0
     for tile in chosen.tiles():
         seen[tile] = _window(chosen[tile], cell)
         voxels += len(chosen[tile].table)
     whole = _fitting(functools.reduce(Window.around, seen.values()))
-    edge, (west, north) = cell * some.table.voxel_size, _corner(some, whole, cell)
+    edge, (west, north) = cell * part.table.voxel_size, _corner(part, whole, cell)
     height, width = whole.shape
     shape: dict[str, Any] = {
         "driver": "GTiff", "width": width, "height": height, "transform": Affine(edge, 0, west, 0, -edge, north),
-        "crs": None if some.georeference is None else rasterio.crs.CRS.from_wkt(some.georeference.crs),
+        "crs": None if part.georeference is None else rasterio.crs.CRS.from_wkt(part.georeference.crs),
         "compress": "deflate", "tiled": True, "blockxsize": 256, "blockysize": 256, "bigtiff": "if_safer",
     }  # fmt: skip
-    legend = {str(k): name for k, name in enumerate(("unclassified", *some.classes))}
-    names = ("class", *some.columns, "stable", "height")
+    legend = {str(k): name for k, name in enumerate(("unclassified", *part.classes))}
+    names = ("class", *part.columns, "stable", "height")
     many: dict[str, Any] = {"count": len(names), "dtype": "float32", "nodata": np.nan, "predictor": 3}
     kind = np.uint8 if len(legend) <= 2**8 else np.uint16
-    palette = {0: (0, 0, 0, 0)} | {k: (*map(int, color), 255) for k, color in enumerate(some.colors, start=1)}
+    palette = {0: (0, 0, 0, 0)} | {k: (*map(int, color), 255) for k, color in enumerate(part.colors, start=1)}
     one: dict[str, Any] = {"count": 1, "dtype": kind, "nodata": 0}
     with (
         atomic_path(path) as temporary,
@@ -78,22 +78,22 @@ def write_raster(chosen: Chosen, path: Path, cell: int = 1) -> int:
         _raster(temporary_classes, **one, **shape) as classes,
     ):
         for window in whole.parts():
-            there = [chosen[tile] for tile, own in seen.items() if own.meets(window)]
-            bands = _bands(together(there), cell, window) if there else {}
+            parts = [chosen[tile] for tile, own in seen.items() if own.meets(window)]
+            bands = _bands(together(parts), cell, window) if parts else {}
             at = Pixels(window.low[1] - whole.low[1], whole.high[0] - window.high[0], *reversed(window.shape))
             nothing = np.full(window.shape, np.nan, np.float32)
             for number, name in enumerate(names, start=1):
                 file.write(bands[name].values if bands else nothing, number, at)
             label = bands["class"].values if bands else nothing
             classes.write(np.nan_to_num(label, nan=0).astype(kind), 1, at)
-        for number, (name, unit, about) in enumerate(_abouts(some), start=1):
+        for number, (name, unit, about) in enumerate(_abouts(part), start=1):
             file.raster.set_band_description(number, name)
             file.raster.set_band_unit(number, unit)
             file.raster.update_tags(number, about=about)
         file.raster.update_tags(1, **legend)
-        if some.benchmark:
-            file.raster.update_tags(benchmark=some.benchmark)
-            classes.raster.update_tags(benchmark=some.benchmark)
+        if part.benchmark:
+            file.raster.update_tags(benchmark=part.benchmark)
+            classes.raster.update_tags(benchmark=part.benchmark)
         classes.raster.write_colormap(1, palette)
         classes.raster.set_band_description(1, "class")
         classes.raster.update_tags(1, **legend)

@@ -235,18 +235,18 @@ def joined_columns(table: VoxelTable, file: Path) -> dict[str, Column]:
     with parquet.reading(file):
         names = [name for name in pq.read_schema(file).names if name not in INDEX]
         content = parquet.read(file, (*INDEX, *names))
-        own, theirs = voxel_keys(table.index, np.stack([content[name] for name in INDEX], axis=1))
+        keys, theirs = voxel_keys(table.index, np.stack([content[name] for name in INDEX], axis=1))
     if content["voxel_size"] != table.voxel_size:
         raise DataError(
             f"{file}: the file has voxels of {content['voxel_size']:g} m, the map of {table.voxel_size:g} m"
         )
-    at = np.minimum(np.searchsorted(own, theirs), len(own) - 1)
-    there = own[at] == theirs
+    at = np.minimum(np.searchsorted(keys, theirs), len(keys) - 1)
+    joined = keys[at] == theirs
     columns = {}
     for name in names:
         empty = np.nan if content[name].dtype.kind == "f" else 0
         values = np.full(len(table), empty, dtype=content[name].dtype)
-        values[at[there]] = content[name][there]
+        values[at[joined]] = content[name][joined]
         columns[name] = Column(values)
     return columns
 
@@ -289,8 +289,8 @@ def _column(name: str, table: VoxelTable, file: Path) -> Column:
         return Column(psa(table), "", "pairwise semantic agreement")
     in_file = parquet.names_in(file)
     if name not in in_file:
-        there = sorted({*known, "op", "category", "psa", *in_file} - {*INDEX, "label"})
-        raise ConfigError(f"{file}: the run has no column '{name}'; {nearest(name, there)}")
+        available = sorted({*known, "op", "category", "psa", *in_file} - {*INDEX, "label"})
+        raise ConfigError(f"{file}: the run has no column '{name}'; {nearest(name, available)}")
     return Column(VoxelTable.columns(file, [name])[name])
 
 

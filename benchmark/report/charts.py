@@ -111,7 +111,7 @@ def point_chart(points: Sequence[tuple[str, float, Estimate]], x_label: str, y_l
     """Return a chart of named points, (name, x, y with its interval) each; those that are not known are left out."""
     known = [each for each in points if math.isfinite(each[1]) and math.isfinite(each[2].value)]
     ys = [v for _, _, y in known for v in (y.value, y.low, y.high)]
-    x = Scale.over([own for _, own, _ in known], LEFT + 14, WIDTH - RIGHT - 14, margin=0.06)
+    x = Scale.over([value for _, value, _ in known], LEFT + 14, WIDTH - RIGHT - 14, margin=0.06)
     y = Scale.over(ys, POINTS_HEIGHT - BOTTOM - 6, TOP + 6, margin=0.04)
     x_ticks, y_ticks = ({tick: number(tick) for tick in axis.ticks(6)} for axis in (x, y))
     parts = [*_frame(x, y, x_ticks, y_ticks, x_label, y_label, height=POINTS_HEIGHT)]

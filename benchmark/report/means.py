@@ -53,7 +53,7 @@ class Pooled:
 
     @property
     def excess_drift(self) -> float:
-        """Return SBD less that of the same observations in random order, bits."""
+        """Return the SBD of the observations less their SBD in random order, bits."""
         return self.drift.value - self.drift_null
 
     @property
@@ -247,7 +247,7 @@ def complete_scenes(result: Result, sweep: str, model: str) -> tuple[str, ...]:
     for record in result.select(sweep, model=model):
         points.setdefault(record.unit.scene, set()).add(record.variation)
     wanted = set().union(*points.values())
-    return tuple(scene for scene, there in points.items() if there == wanted)
+    return tuple(scene for scene, of_scene in points.items() if of_scene == wanted)
 
 
 def by_model(records: Iterable[Record]) -> dict[str, list[Record]]:

@@ -15,7 +15,8 @@ from semstab.data.statistics import OutlyingFrames, short
 from semstab.datasets import GROUND_TRUTH
 from semstab.metrics import macro_mean
 from semstab.report.means import ENOUGH, by_model, pooled
-from semstab.report.tables.stability import comparable, one_in
+from semstab.report.tables.backends import one_in
+from semstab.report.tables.stability import comparable
 from semstab.statistics.frame_disagreement import LEAST_FRAMES, LEAST_PLACES
 from semstab.statistics.verdict import LIMITS
 
@@ -37,8 +38,8 @@ ONE_CLASS = 0.9
 
 def noted(result: Result) -> Iterator[str]:
     """Yield what `check` notes of the scenes: labels or images that are not registered to the depth, and the like."""
-    for scene, own in result.notes.items():
-        yield from (f"{scene}: {text}" if len(result.scenes) > 1 else text for text in own)
+    for scene, notes in result.notes.items():
+        yield from (f"{scene}: {text}" if len(result.scenes) > 1 else text for text in notes)
 
 
 def warnings(result: Result) -> Iterator[str]:
@@ -66,7 +67,8 @@ def warnings(result: Result) -> Iterator[str]:
                 f"{_name(run, result)}: top_k leaves out {cut.mean:.2%} of a pixel's scores on average,"
                 f" {cut.most:.2%} at most; no belief changes by more than that"
             )
-    once = sum(_seen_once(run) for run in runs) / max(1, sum(run.table.voxels for run in runs))
+    seen_once = sum(row.voxels for run in runs for row in run.table.strata if row.name == "OP=1")
+    once = seen_once / max(1, sum(run.table.voxels for run in runs))
     if once >= MOSTLY_ONCE:
         yield (
             f"{once:.0%} of the voxels were seen once and look consistent for that reason; larger voxels or more"
@@ -85,15 +87,17 @@ def warnings(result: Result) -> Iterator[str]:
 
 
 def _one_class_covers(runs: Sequence[UnitSummary]) -> Iterator[str]:
+    """Yield which classes cover most of a map, so that they determine most of its numbers."""
     covering: dict[str, list[tuple[str, float]]] = {}
-    for run in filter(_one_class, runs):
-        largest = max(run.table.classes, key=lambda row: row.voxels)
-        covering.setdefault(largest.name, []).append((run.unit.model, largest.share))
-    for name, own in covering.items():
-        all_of_them = len(own) == len(runs)
-        of = "" if all_of_them else f" of {', '.join(dict.fromkeys(model for model, _ in own))}"
-        more = " or more" if len({f"{share:.0%}" for _, share in own}) > 1 else ""
-        least = min(share for _, share in own)
+    for run in runs:
+        if max(row.share for row in run.table.classes) >= ONE_CLASS:
+            largest = max(run.table.classes, key=lambda row: row.voxels)
+            covering.setdefault(largest.name, []).append((run.unit.model, largest.share))
+    for name, shares in covering.items():
+        all_of_them = len(shares) == len(runs)
+        of = "" if all_of_them else f" of {', '.join(dict.fromkeys(model for model, _ in shares))}"
+        more = " or more" if len({f"{share:.0%}" for _, share in shares}) > 1 else ""
+        least = min(share for _, share in shares)
         covers = f"'{name}' covers {round(100 * least)}%{more} of the map{of}, and determines most of its numbers"
         if least >= NOTHING_ELSE:
             yield f"{covers}; what is left without it is too little to assess: take another model, or another scene"
@@ -174,7 +178,7 @@ def _suspicions(record: Record) -> Iterator[str]:
 
 
 def _traffic(record: Record) -> Iterator[str]:
-    """Yield that most disagreement is of what moves, where frames would agree much better without it."""
+    """Yield a warning where most disagreement is at classes that move, and frames agree much better without them."""
     cells = None if record.statistics is None else record.statistics.cells
     if cells is None or (moving := cells.moving) is None or moving.disagreement < MOSTLY_MOVING:
         return
@@ -183,10 +187,6 @@ def _traffic(record: Record) -> Iterator[str]:
         f" ({', '.join(moving.classes)}); without these locations alpha is {short(moving.alpha)}:"
         f" {_excluding(*moving.classes)}"
     )
-
-
-def _seen_once(run: UnitSummary) -> int:
-    return sum(row.voxels for row in run.table.strata if row.name == "OP=1")
 
 
 def _name(run: UnitSummary, result: Result) -> str:
@@ -210,11 +210,6 @@ def _size(scene: str, advice: VoxelAdvice, result: Result) -> str:
     if advice.chosen or advice.suggested <= advice.voxel_size:
         return ""
     return f"{where}{size} are so small that noise splits locations: --voxel-size {advice.suggested:g}"
-
-
-def _one_class(run: UnitSummary) -> bool:
-    """Return whether one class covers most of the map, so that it determines most of the numbers."""
-    return max(row.share for row in run.table.classes) >= ONE_CLASS
 
 
 def mixed(runs: Sequence[UnitSummary]) -> bool:

@@ -163,8 +163,8 @@ def _numbers(
 
 def _scenes(result: Result, folder: Path, above: Mapping[str, FromAbove]) -> Iterator[dict[str, Any]]:
     views = Views()
-    own = [record for record in result.select() if record.voxels_file is not None]
-    share = min(BYTES, ALL_BYTES // max(1, len(own)))
+    stored = [record for record in result.select() if record.voxels_file is not None]
+    share = min(BYTES, ALL_BYTES // max(1, len(stored)))
     for scene in result.scenes:
         records = result.select(scene=scene)
         overviews = {}
@@ -271,22 +271,22 @@ def _timeline(records: Sequence[Record], colors: Mapping[str, int]) -> Iterator[
 
 def _outlying(record: Record, *, alone: bool) -> Iterator[str]:
     """Yield a sentence on the frames that stand out."""
-    found = None if record.statistics is None else record.statistics.outlying_frames
-    if found is not None:
-        yield outlying_line(found, "" if alone else record.unit.model, most=len(found.frames))
+    outlying = None if record.statistics is None else record.statistics.outlying_frames
+    if outlying is not None:
+        yield outlying_line(outlying, "" if alone else record.unit.model, most=len(outlying.frames))
 
 
 def _lone(record: Record, overview: Overview | None) -> Iterator[dict[str, Any]]:
     """Yield frames that stand out as small images: the image, its labels, and the pixels where it stands alone."""
-    found = None if record.statistics is None else record.statistics.outlying_frames
-    if overview is None or overview.lone is None or found is None:
+    outlying = None if record.statistics is None else record.statistics.outlying_frames
+    if overview is None or overview.lone is None or outlying is None:
         return
-    lone, named = overview.lone, {each.frame: each for each in found.frames}
+    lone, named = overview.lone, {each.frame: each for each in outlying.frames}
     for k, frame in enumerate(lone.frames.tolist()):
-        own, color = named[frame], None if lone.color is None else lone.color[k]
-        shares = f"alone at {100 * own.share:.0f} % of its places, other frames there at {100 * own.null:.0f} %"
+        outlier, color = named[frame], None if lone.color is None else lone.color[k]
+        shares = f"alone at {100 * outlier.share:.0f} % of its places, other frames there at {100 * outlier.null:.0f} %"
         pictures = lone_pictures(color, lone.labels[k], lone.alone[k], overview.palette)
-        yield {"title": f"{record.unit.model}, {own.name}: {shares}", "pictures": pictures}
+        yield {"title": f"{record.unit.model}, {outlier.name}: {shares}", "pictures": pictures}
 
 
 DISAGREES = 0.02
@@ -299,11 +299,13 @@ def _classes(records: Sequence[Record], colors: Mapping[str, int]) -> str:
     shown: dict[str, bool] = {}
     for record in records:
         statistics, name = record.statistics, record.unit.model
-        for own in () if statistics is None or statistics.cells is None else statistics.cells.classes:
-            if not math.isnan(own.alpha.value):
-                rows.setdefault(own.name, []).append((colors[name], name, own.alpha))
-                shown[own.name] = shown.get(own.name, False) or own.counts_for_verdict or own.disagreement >= DISAGREES
-    rows = {name: own for name, own in rows.items() if shown[name]}
+        for of_class in () if statistics is None or statistics.cells is None else statistics.cells.classes:
+            if not math.isnan(of_class.alpha.value):
+                rows.setdefault(of_class.name, []).append((colors[name], name, of_class.alpha))
+                shown[of_class.name] = (
+                    shown.get(of_class.name, False) or of_class.counts_for_verdict or of_class.disagreement >= DISAGREES
+                )
+    rows = {name: alphas for name, alphas in rows.items() if shown[name]}
     if not rows:
         return ""
     ordered = dict(sorted(rows.items(), key=lambda item: min(e.value for _, _, e in item[1])))
@@ -323,10 +325,10 @@ def _distance(records: Sequence[Record], colors: Mapping[str, int]) -> Iterator[
             correlogram = record.statistics and record.statistics.correlogram
             bins = getattr(correlogram, axis) if correlogram else ()
             if bins:
-                name, alphas = record.unit.model, [own.alpha for own in bins]
+                name, alphas = record.unit.model, [each.alpha for each in bins]
                 ends = [(alpha.low, alpha.high) for alpha in alphas]
                 lines.append(
-                    Line(name, [own.mean for own in bins], [alpha.value for alpha in alphas], ends, colors[name])
+                    Line(name, [each.mean for each in bins], [alpha.value for alpha in alphas], ends, colors[name])
                 )
         if lines:
             yield {"title": title, "chart": line_chart(lines, unit, "alpha of single cells", zero=True)}
@@ -340,8 +342,8 @@ def _by_op(result: Result) -> Iterator[dict[str, str]]:
     together = {name: pooled(records) for name, records in by_model(result.select()).items()}
     for measure in (measure for measure in measures() if measure.chart):
         lines, names = [], list[str]()
-        for k, (model, own) in enumerate(together.items()):
-            strata = [*own.strata[:-1], *(own.well_seen or own.strata[-1:])]
+        for k, (model, means) in enumerate(together.items()):
+            strata = [*means.strata[:-1], *(means.well_seen or means.strata[-1:])]
             names = names or [
                 row.name.replace("<=OP<=", " to ").replace("OP=", "").replace("OP>", "> ") for row in strata
             ]

@@ -78,7 +78,7 @@ def ranking(result: Result) -> Ranking:
         return Ranking((), ())
     records = [record for record in result.select() if record.unit.model != GROUND_TRUTH]
     models = by_model(records)
-    unranked = tuple(name for name, own in models.items() if all(map(_is_uninformative, own)))
+    unranked = tuple(name for name, of_scenes in models.items() if all(map(_is_uninformative, of_scenes)))
     names = tuple(name for name in models if name not in unranked)
     scenes = (_files([record for record in records if record.unit.scene == scene]) for scene in result.scenes)
     return replace(_ranking(tuple(filter(None, scenes)), names), unranked=unranked if len(models) > 1 else ())
@@ -91,8 +91,10 @@ Files = tuple[tuple[str, Path, int], ...]
 def _files(records: list[Record]) -> Files:
     """Return the files of a scene; none where a model has none."""
     files = [(record.unit.model, record.observations_file) for record in records]
-    there = tuple((name, file, file.stat().st_mtime_ns) for name, file in files if file is not None and file.is_file())
-    return there if len(there) == len(files) > 1 else ()
+    present = tuple(
+        (name, file, file.stat().st_mtime_ns) for name, file in files if file is not None and file.is_file()
+    )
+    return present if len(present) == len(files) > 1 else ()
 
 
 @functools.lru_cache(maxsize=8)
@@ -101,7 +103,7 @@ def _ranking(scenes: tuple[Files, ...], names: tuple[str, ...]) -> Ranking:
     sums = [_common_sums(files) for files in scenes] if len(names) > 1 else []
     apart = tuple(name for name in names if sums and name not in sums[0])
     names = tuple(name for name in names if name not in apart)
-    known = [own for own in sums if {*names} <= own.keys()]
+    known = [each for each in sums if {*names} <= each.keys()]
     return replace(ranked(known, names), apart=apart)
 
 
@@ -111,7 +113,7 @@ def ranked(
     """Return the ranking of models by their sums in each scene; each place counts once, however often it was flown."""
     places = [str(k) for k in range(len(scenes))] if places is None else places
     pairs = list(itertools.combinations(names, 2)) if scenes else []
-    changes = [over_places([_difference(own[b], own[a]) for own in scenes], places) for a, b in pairs]
+    changes = [over_places([_difference(by_model[b], by_model[a]) for by_model in scenes], places) for a, b in pairs]
     p_values = holm([change.p_value for change in changes])
     differences = tuple(
         Difference(
@@ -126,13 +128,13 @@ def ranked(
         if each.shown:
             better[each.other if each.value > 0 else each.model] += 1
     order = sorted(alpha, key=lambda name: (better[name], -alpha[name]))
-    ranks = tuple((1 + n, tuple(own)) for n, own in itertools.groupby(order, key=better.__getitem__))
+    ranks = tuple((1 + n, tuple(tied)) for n, tied in itertools.groupby(order, key=better.__getitem__))
     return Ranking(ranks, differences)
 
 
 def over_places(values: Sequence[Interval], places: Sequence[str]) -> Interval:
     """Return the mean over places of the mean over the scenes of each place, with its interval."""
-    return mean_of([mean_of(own) for own in _by_place(values, places)])
+    return mean_of([mean_of(of_place) for of_place in _by_place(values, places)])
 
 
 def _by_place(values: Sequence[Value], places: Sequence[str]) -> list[list[Value]]:
@@ -140,14 +142,14 @@ def _by_place(values: Sequence[Value], places: Sequence[str]) -> list[list[Value
 
 
 def _mean_alpha(name: str, scenes: Sequence[Mapping[str, ClusterSums]], places: Sequence[str]) -> float:
-    alpha = [value(own[name], ALPHA.key) for own in scenes]
-    return macro_mean([macro_mean(own) for own in _by_place(alpha, places)])
+    alpha = [value(by_model[name], ALPHA.key) for by_model in scenes]
+    return macro_mean([macro_mean(of_place) for of_place in _by_place(alpha, places)])
 
 
-def _difference(own: ClusterSums, other: ClusterSums) -> Interval:
+def _difference(new: ClusterSums, other: ClusterSums) -> Interval:
     """Return alpha of a model less that of another on common observations, for another flight if frames allow that."""
-    scopes = {scope_of(sums) for sums in (own, other)}
-    return difference(own, other, ALPHA.key, scope=THESE_FRAMES if THESE_FRAMES in scopes else THIS_SCENE)
+    scopes = {scope_of(sums) for sums in (new, other)}
+    return difference(new, other, ALPHA.key, scope=THESE_FRAMES if THESE_FRAMES in scopes else THIS_SCENE)
 
 
 def answers(result: Result) -> Iterator[str]:
@@ -187,5 +189,5 @@ def _is_uninformative(record: Record) -> bool:
 def _common_sums(files: Files) -> Mapping[str, ClusterSums]:
     """Return the sums of the observations that all models of a scene with the same classes made."""
     loaded = {name: CellObservations.load(file) for name, file, _ in files}
-    names = sharing_classes({name: own.classes for name, own in loaded.items()})
+    names = sharing_classes({name: each.classes for name, each in loaded.items()})
     return compared_observations({name: loaded[name] for name in names}).sums if names else {}

@@ -53,12 +53,12 @@ class Run:
             cells = None if unit.statistics is None else unit.statistics.cells
             rows += [
                 {
-                    "scene": unit.unit.scene, "model": unit.unit.model, "backend": unit.unit.backend, "class": own.name,
-                    "locations": own.locations, "counts_for_verdict": own.counts_for_verdict,
-                    "alpha": own.alpha.value, "alpha_low": own.alpha.low, "alpha_high": own.alpha.high,
-                    "unstable": own.unstable, "disagreement": own.disagreement,
+                    "scene": unit.unit.scene, "model": unit.unit.model, "backend": unit.unit.backend, "class": row.name,
+                    "locations": row.locations, "counts_for_verdict": row.counts_for_verdict,
+                    "alpha": row.alpha.value, "alpha_low": row.alpha.low, "alpha_high": row.alpha.high,
+                    "unstable": row.unstable, "disagreement": row.disagreement,
                 }
-                for own in (() if cells is None else cells.classes)
+                for row in (() if cells is None else cells.classes)
             ]  # fmt: skip
         return voxels.to_pandas({name: np.array([row[name] for row in rows]) for name in (rows[0] if rows else ())})
 

@@ -1,4 +1,4 @@
-"""Say what was found in videos without depth and poses: the screen, the tables, the page."""
+"""Report videos without depth and poses: the screen, the tables, the page."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from semstab.metrics.image_space import mean_over_scenes
 from semstab.report.charts import Line, line_chart, sample
 from semstab.report.html import filled, lone_pictures, table_block
 from semstab.report.narrative import nearly_all, outlying_line
-from semstab.report.tables.stability import flicker_of_videos
+from semstab.report.tables.flicker import flicker_of_videos
 from semstab.report.tables.table import Column, Group, Table, relations
 from semstab.report.tables.video_measures import video_measure_tables
 from semstab.report.terminal import ProgressBar
@@ -95,10 +95,10 @@ def screen(result: VideoResult) -> Iterator[str]:
         yield f"  least flicker first: {order}"
     lines = [["", "flicker %", "pixel flicker %", "co-visible %", "VC8", "VC16"]]
     for name in names:
-        own = mean_over_scenes(record.image_space for record in result.of(name))
+        mean = mean_over_scenes(record.image_space for record in result.of(name))
         shown = (
-            own.compensated_flicker_percent, own.flicker_percent, 100 * own.compensated_share, own.self_vc8,
-            own.self_vc16,
+            mean.compensated_flicker_percent, mean.flicker_percent, 100 * mean.compensated_share, mean.self_vc8,
+            mean.self_vc16,
         )  # fmt: skip
         cells = [_text(value, 2 if k < 2 else 0 if k == 2 else 3) for k, value in enumerate(shown)]
         lines.append([name, *cells])
@@ -126,7 +126,7 @@ def tables(result: VideoResult) -> list[Table]:
         name: {record.scene: record.video_measures for record in result.of(name) if record.video_measures is not None}
         for name in result.models
     }
-    measures = {name: own for name, own in measures.items() if own}
+    measures = {name: values for name, values in measures.items() if values}
     return [*flicker_of_videos(methods), *video_measure_tables(measures), *_frames(result)]
 
 
@@ -211,14 +211,14 @@ def page(result: VideoResult) -> str:
 
 
 def _card(result: VideoResult, model: str) -> dict[str, Any]:
-    own = mean_over_scenes(record.image_space for record in result.of(model))
+    mean = mean_over_scenes(record.image_space for record in result.of(model))
     numbers = (
-        ("flicker", own.compensated_flicker_percent, "{:.2f} %", "of the pixels per frame, motion removed"),
-        ("pixel flicker", own.flicker_percent, "{:.2f} %", "of the pixels per frame, motion included"),
-        ("co-visible", 100 * own.compensated_share, "{:.0f} %", "of the pixels, in the frame before"),
-        ("VC8", own.self_vc8, "{:.3f}", "of the pixels keep their label for 8 frames"),
-        ("VC16", own.self_vc16, "{:.3f}", "for 16 frames"),
-        ("VC8, truth", own.vc8, "{:.3f}", "where the truth stays the same"),
+        ("flicker", mean.compensated_flicker_percent, "{:.2f} %", "of the pixels per frame, motion removed"),
+        ("pixel flicker", mean.flicker_percent, "{:.2f} %", "of the pixels per frame, motion included"),
+        ("co-visible", 100 * mean.compensated_share, "{:.0f} %", "of the pixels, in the frame before"),
+        ("VC8", mean.self_vc8, "{:.3f}", "of the pixels keep their label for 8 frames"),
+        ("VC16", mean.self_vc16, "{:.3f}", "for 16 frames"),
+        ("VC8, truth", mean.vc8, "{:.3f}", "where the truth stays the same"),
     )
     return {
         "model": model,
@@ -257,6 +257,6 @@ def _lone(record: VideoRecord) -> Iterator[dict[str, Any]]:
     """Yield frames that stand out as images: the image, its labels, and the pixels where it stands alone."""
     named = {each.frame: each for each in record.outlying.frames}
     for picture in record.pictures:
-        own = named[picture.frame]
-        title = f"{record.model}, {own.name}: alone at {100 * own.share:.0f} % of its pixels"
+        outlier = named[picture.frame]
+        title = f"{record.model}, {outlier.name}: alone at {100 * outlier.share:.0f} % of its pixels"
         yield {"title": title, "pictures": lone_pictures(picture.color, picture.labels, picture.alone, record.colors)}

@@ -211,15 +211,15 @@ class _Labels:
         left = {}
         for by, values in self._evidence.items() if len(self._right) else ():
             for at in np.unique(np.quantile(values, np.arange(STEPS) / STEPS, method="lower")).tolist():
-                some = values >= at
-                left[tried.setdefault(np.packbits(some).tobytes(), (by, at))] = int(some.sum())
+                accepted = values >= at
+                left[tried.setdefault(np.packbits(accepted).tobytes(), (by, at))] = int(accepted.sum())
         return list(tried.values()), left
 
     def _share(self, by: Evidence, at: float, error: float) -> tuple[float, float]:
         """Return the share of those with so much evidence that is right, and its lower end."""
-        some = self._evidence[by] >= at
-        of, cells = self._of[some], len(self._cell)
-        right, every = self._right[some].astype(np.float64), np.ones(len(of))
+        accepted = self._evidence[by] >= at
+        of, cells = self._of[accepted], len(self._cell)
+        right, every = self._right[accepted].astype(np.float64), np.ones(len(of))
         sums: Float64 = np.stack([np.bincount(of, each, cells) for each in (right, every)], axis=1).astype(np.float64)
         sums = sums[sums[:, 1] > 0]
         if np.count_nonzero(sums[:, 0] < sums[:, 1]) <= FEW_CUBES:

@@ -63,8 +63,8 @@ class Cubes:
 
         There are at most MOST_CELLS cubes, unless their edge is given, in metres.
         """
-        some = table.op >= 2 if where is None else where
-        return cls(*cubes_of((table.ix, table.iy, table.iz), table.voxel_size, edge, some))
+        counted = table.op >= 2 if where is None else where
+        return cls(*cubes_of((table.ix, table.iy, table.iz), table.voxel_size, edge, counted))
 
     @classmethod
     def of_log(cls, events: Events, edge: float | None = None) -> Cubes:
@@ -73,7 +73,7 @@ class Cubes:
         return cls(*cubes_of((events.ix, events.iy, events.iz), events.voxel_size, edge, again))
 
     def rows(self, rows: Any) -> Cubes:
-        """Return the same cubes, for some of the voxels."""
+        """Return the same cubes, in which only a part of the voxels counts."""
         return replace(self, at=self.at[rows])
 
     @property
@@ -88,16 +88,16 @@ class Cubes:
     def means(self, values: Mapping[str, npt.NDArray[Any]]) -> dict[str, Float64]:
         """Return (G, 2) by name: the sum and the count of the values (n,) that are defined in each cube."""
         both = by_group(self.at, [*values.values()], self.count)
-        return {name: np.stack(own, axis=1) for name, *own in zip(values, both[0].T, both[1].T, strict=True)}
+        return {name: np.stack(pair, axis=1) for name, *pair in zip(values, both[0].T, both[1].T, strict=True)}
 
     def sums_by_class(self, evidence: Evidence, *weights: Float64) -> list[Any]:
         """Return (G, K) for weights (m,) of the entries of the voxels' evidence: their sums by cube and class."""
         of = np.repeat(self.at, np.diff(evidence.starts)).astype(np.int64)
-        some = np.flatnonzero(of >= 0)
-        key, shape = of[some] * evidence.K + evidence.label[some], (self.count, evidence.K)
+        rows = np.flatnonzero(of >= 0)
+        key, shape = of[rows] * evidence.K + evidence.label[rows], (self.count, evidence.K)
         size = self.count * evidence.K
-        sums = (np.bincount(key, weights=own[some], minlength=size).astype(np.float64) for own in weights)
-        return [own.reshape(shape) for own in sums]
+        sums = (np.bincount(key, weights=weight[rows], minlength=size).astype(np.float64) for weight in weights)
+        return [total.reshape(shape) for total in sums]
 
     def estimate(
         self,
@@ -130,7 +130,7 @@ class Mean:
 
 @dataclass(frozen=True, eq=False)
 class CubeSums:
-    """Sums by name over the voxels of cubes; those of a map follow from those of its parts.
+    """Sums by name over the voxels of each cube; sums of the parts of a map add up to the sums of the map.
 
     Attributes:
         cell: (G, 3) int32 the cubes, of an edge in metres, a power of 2.
@@ -146,9 +146,6 @@ class CubeSums:
         total: Float64 = self.sums[name].sum(axis=0)
         return total
 
-    def __or__(self, further: Mapping[str, Float64]) -> CubeSums:
-        return CubeSums(self.cell, self.edge, {**self.sums, **further})
-
     def estimate(
         self, name: str, statistic: Statistic, bounds: tuple[float, float] = (0.0, 1.0), scale: Scale | None = None
     ) -> Interval:
@@ -157,8 +154,8 @@ class CubeSums:
 
     def specs(self, means: Mapping[str, Mean]) -> Iterator[EstimateSpec]:
         """Yield the specs of several means for `confidence_intervals`."""
-        for own in means.values():
-            yield spec_of_cubes(self._index, self.sums[own.sums], own.of, own.kind, own.bounds)
+        for mean in means.values():
+            yield spec_of_cubes(self._index, self.sums[mean.sums], mean.of, mean.kind, mean.bounds)
 
     @functools.cached_property
     def _index(self) -> ClusterIndex:
@@ -166,13 +163,13 @@ class CubeSums:
 
     @classmethod
     def merged(cls, parts: Sequence[CubeSums]) -> CubeSums:
-        """Return the sums of a map from those of its parts, by the cubes of the whole map."""
+        """Return the sums of a map from the sums of its parts, by the cubes of the whole map."""
         edge = max(part.edge for part in parts)
         cells = np.concatenate([part.cell // round(edge / part.edge) for part in parts])
         while len((cubes := distinct_rows(cells))[0]) > MOST_CELLS:
             cells, edge = cells // 2, 2 * edge
         distinct, of = cubes
-        sums = {name: np.zeros((len(distinct), own.shape[1])) for name, own in parts[0].sums.items()}
+        sums = {name: np.zeros((len(distinct), values.shape[1])) for name, values in parts[0].sums.items()}
         for name, total in sums.items():
             np.add.at(total, of, np.concatenate([part.sums[name] for part in parts]))
         return cls(distinct.astype(np.int32), edge, sums)
@@ -221,7 +218,7 @@ def cluster_sums_of(
 
 
 def with_cells(whole: ClusterSums, cells: CellObservations, edge: float | None = None) -> ClusterSums:
-    """Return the sums with those of sampled cells: fine cells, and coarse cells twice as wide, of scans the same ones.
+    """Return the sums with sums of sampled cells: fine cells, and coarse cells twice as wide, of scans the same ones.
 
     Args:
         whole: Sums of the map.
@@ -234,15 +231,15 @@ def with_cells(whole: ClusterSums, cells: CellObservations, edge: float | None =
         log = cells.observations(times * cells.coarsening)
         cubes = Cubes.of_log(log, edge)
         edge = cubes.edge
-        own = _sums_of_log(log, cubes)
-        parts.append(replace(own, classes=whole.classes))
+        part_sums = _sums_of_log(log, cubes)
+        parts.append(replace(part_sums, classes=whole.classes))
     step = max(part.step for part in parts)
     coarse, fine = (part.coarsened(part.edge, step) for part in parts)
     return replace(whole, fine=fine, coarse=coarse)
 
 
 def sums_of_cells(cells: CellObservations, edge: float | None = None) -> ClusterSums:
-    """Return sums of sampled cells alone, without those of a map.
+    """Return sums of sampled cells alone, without a map.
 
     Args:
         cells: Labels of sampled cells.
@@ -306,31 +303,31 @@ def _with_frameless_sums(
     """
     values = {measure.key: measure.of(table) for measure in summed()}
     measured = tuple(values)
-    own = layout(sums.K, truth=sums.truth, measured=measured)
+    slices = layout(sums.K, truth=sums.truth, measured=measured)
     columns = np.zeros((cubes.count, width(sums.K, truth=sums.truth, measured=measured)))
     for key, both in cubes.means(values).items():
         for name, column in zip(of_measure(key), both.T, strict=True):
-            columns[:, own[name].start] = column
+            columns[:, slices[name].start] = column
     if sbd_excess is not None:
         for name, values in zip(DRIFT, cubes.means({"": sbd_excess})[""].T, strict=True):
-            columns[:, own[name].start] = values
+            columns[:, slices[name].start] = values
     if true_label is not None:
         confidence, right = vss(table), dominant(table) == true_label
         bins = np.clip(np.ceil(confidence * BINS - 1e-9).astype(np.int64) - 1, 0, BINS - 1)
         group = np.where((cubes.at >= 0) & (true_label >= 0), cubes.at * BINS + bins, -1)
         gap, known = by_group(group, [right - confidence], cubes.count * BINS)
-        columns[:, own["gap"]] = gap.reshape(-1, BINS)
-        columns[:, own["calibrated"]] = known.reshape(-1, BINS).sum(axis=1, keepdims=True)
-    some = columns.any(axis=1)
+        columns[:, slices["gap"]] = gap.reshape(-1, BINS)
+        columns[:, slices["calibrated"]] = known.reshape(-1, BINS).sum(axis=1, keepdims=True)
+    filled = columns.any(axis=1)
     of_frames = np.zeros((len(sums.columns), columns.shape[1]))
     of_frames[:, : sums.columns.shape[1]] = sums.columns
     return replace(
         sums,
         classes=table.classes,
         measured=measured,
-        cell=np.concatenate([sums.cell, cubes.cell[some]]),
-        frame=np.concatenate([sums.frame, np.full(some.sum(), -1, np.int32)]),
-        columns=np.concatenate([of_frames, columns[some]]),
+        cell=np.concatenate([sums.cell, cubes.cell[filled]]),
+        frame=np.concatenate([sums.frame, np.full(filled.sum(), -1, np.int32)]),
+        columns=np.concatenate([of_frames, columns[filled]]),
     )
 
 
@@ -357,11 +354,11 @@ def _sums_of_table(table: VoxelTable, cubes: Cubes, true_label: Int64 | None, li
         likely = recurrent if likely is None else likely * recurrent
         plain, further = _sums_with_truth(table, cubes, true_label, likely)
         values, by_class = values | plain, by_class | further
-    sums, own = np.zeros((cubes.count, width(K, truth=truth))), layout(K, truth=truth)
+    sums, slices = np.zeros((cubes.count, width(K, truth=truth))), layout(K, truth=truth)
     for name, column in zip(values, by_group(cubes.at, [*values.values()], cubes.count)[0].T, strict=True):
-        sums[:, own[name].start] = column
+        sums[:, slices[name].start] = column
     for name, columns in by_class.items():
-        sums[:, own[name]] = columns
+        sums[:, slices[name]] = columns
     unknown = np.full(cubes.count, -1, dtype=np.int32)
     return ClusterSums(cubes.cell, unknown, sums, cubes.edge, 0, table.voxel_size, K, table.classes, truth)
 

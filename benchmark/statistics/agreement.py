@@ -68,7 +68,7 @@ def krippendorff_alpha(table: VoxelTable) -> float:
 
 
 def alpha_sums(table: VoxelTable) -> Float64:
-    """Return the sums (3 + K,) that give Krippendorff's alpha of a map; those of its parts add up."""
+    """Return the sums (3 + K,) that give Krippendorff's alpha of a map; sums of its parts add up."""
     return _sums(alpha_columns, table)
 
 

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+import numpy.typing as npt
 
 from semstab.core.types import Float64, Int32, Int64, Mask
 from semstab.data.evidence import Evidence
@@ -85,9 +86,9 @@ class Predictions:
         evidence = Evidence.of(evidence)
         spread, of = evidence.concentration, np.repeat(np.arange(len(evidence)), np.diff(evidence.starts))
         total = np.bincount(of, weights=evidence.weight, minlength=len(evidence))
-        hit, own = evidence.label == label[of], np.zeros(len(evidence))
-        own[of[hit]] = evidence.weight[hit]
-        error = spread.squares / total**2 - 2 * own / total + 1
+        hit, hits = evidence.label == label[of], np.zeros(len(evidence))
+        hits[of[hit]] = evidence.weight[hit]
+        error = spread.squares / total**2 - 2 * hits / total + 1
         return cls(label, spread.label.astype(np.int64), spread.largest, error, evidence.K)
 
     @property
@@ -114,14 +115,14 @@ def prediction_sums(predictions: Predictions, where: Mask) -> Float64:
 
 def _prediction_sums_by_group(predictions: Predictions, group: Int64, groups: int) -> Float64:
     """Return (G, ...) `prediction_sums` of each group; -1 is none."""
-    some, K = np.flatnonzero(group >= 0), predictions.K
+    rows, K = np.flatnonzero(group >= 0), predictions.K
     of, label, predicted, confidence = (
-        group[some],
-        predictions.label[some],
-        predictions.predicted[some],
-        predictions.confidence[some],
+        group[rows],
+        predictions.label[rows],
+        predictions.predicted[rows],
+        predictions.confidence[rows],
     )
-    right = predictions.right[some].astype(np.float64)
+    right = predictions.right[rows].astype(np.float64)
     bins = np.clip(np.ceil(confidence * BINS - 1e-9).astype(np.int64) - 1, 0, BINS - 1)
 
     def sums(width: int, within: Any, weights: Any = None) -> Float64:
@@ -129,7 +130,7 @@ def _prediction_sums_by_group(predictions: Predictions, group: Int64, groups: in
         return result.astype(np.float64).reshape(groups, width)
 
     return np.hstack([
-        sums(1, 0), sums(1, 0, right), sums(1, 0, predictions.error[some]),
+        sums(1, 0), sums(1, 0, right), sums(1, 0, predictions.error[rows]),
         sums(BINS, bins), sums(BINS, bins, confidence), sums(BINS, bins, right),
         sums(K, label, right), sums(K, label), sums(K, predicted),
     ])  # fmt: skip
@@ -141,10 +142,15 @@ def correctness_of(sums: Float64, name: str = "all") -> Correctness:
     if not n:
         return Correctness(name, 0, math.nan, math.nan, math.nan, math.nan)
     ece = sum(row.voxels * abs(row.accuracy - row.confidence) for row in reliability_of(sums) if row.voxels) / n
-    hit, true, predicted = sums[3 + 3 * BINS :].reshape(3, -1)
-    union = true + predicted - hit
-    miou = float((hit[union > 0] / union[union > 0]).mean())
+    miou = mean_iou(*sums[3 + 3 * BINS :].reshape(3, -1))
     return Correctness(name, int(n), float(right / n), miou, float(ece), float(error / n))
+
+
+def mean_iou(right: npt.NDArray[Any], true: npt.NDArray[Any], predicted: npt.NDArray[Any]) -> float:
+    """Return the mean over classes of intersection over union, from counts (K,); classes without any do not count."""
+    union = true + predicted - right
+    occurs = union > 0
+    return float((right[occurs] / union[occurs]).mean()) if occurs.any() else math.nan
 
 
 def reliability_of(sums: Float64) -> tuple[Reliability, ...]:
@@ -167,7 +173,9 @@ def by_stratum(predictions: Predictions, op: Int32, known: Mask, edges: Sequence
     """Return the correctness of all voxels whose true class is known (n,), then of each stratum of OP (n,)."""
     sums = _prediction_sums_by_group(predictions, np.where(known, groups_of(op, edges), -1), len(edges) + 1)
     names = ["all", *(name for name, _, _ in strata(edges))]
-    return tuple(correctness_of(own, name) for own, name in zip([sums.sum(axis=0), *sums], names, strict=True))
+    return tuple(
+        correctness_of(of_group, name) for of_group, name in zip([sums.sum(axis=0), *sums], names, strict=True)
+    )
 
 
 QUADRANTS = ("consistent_right", "consistent_wrong", "inconsistent_right", "inconsistent_wrong")
@@ -200,7 +208,7 @@ def consistent_wrong(table: VoxelTable, truth: Truth, *, consistent: float = CON
 
 
 def wrong_where_consistent(table: VoxelTable, truth: Truth, consistent: Float64) -> Mask:
-    """Return the same, by the probability (n,) that each is consistent."""
+    """Return (n,) the dangerous voxels, by the probability (n,) that each is consistent."""
     counted, likely, right = _masks(table, truth, consistent)
     return counted & (likely >= LIKELY) & ~right
 

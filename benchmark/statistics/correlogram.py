@@ -41,7 +41,7 @@ EDGES: dict[str, tuple[float, ...]] = {
 AXES = EDGES | {"standard": STANDARD}
 
 
-BINS = tuple((axis, *edges) for axis, own in AXES.items() for edges in itertools.pairwise(own))
+BINS = tuple((axis, *edges) for axis, limits in AXES.items() for edges in itertools.pairwise(limits))
 
 
 def correlogram(cells: CellObservations) -> Correlogram:
@@ -58,9 +58,9 @@ def correlogram(cells: CellObservations) -> Correlogram:
     while len(frames := np.unique(seen.frame // step)) > most:
         step *= 2
     group = np.searchsorted(frames, seen.frame // step)
-    there, cluster = np.unique(of[seen.voxel].astype(np.int64) * len(frames) + group, return_inverse=True)
-    cube, group = np.divmod(there, max(len(frames), 1))
-    sums = _BinSums(seen.evidence.only(labels), len(there))
+    keys, cluster = np.unique(of[seen.voxel].astype(np.int64) * len(frames) + group, return_inverse=True)
+    cube, group = np.divmod(keys, max(len(frames), 1))
+    sums = _BinSums(seen.evidence.only(labels), len(keys))
     pairs, distance = np.zeros((2, len(BINS) + 1))
     for first, second, apart in _pairs(cells, seen):
         bins = _bins(apart)
@@ -72,10 +72,10 @@ def correlogram(cells: CellObservations) -> Correlogram:
         some = np.flatnonzero(sums.total[k, :, 1])
         if len(np.unique(cube[some])) < LEAST_CUBES:
             continue
-        own = sums.total[k, some]
-        halves = own[:, :2]  # neither observation has half of its agreement with the other one for itself alone
+        totals = sums.total[k, some]
+        halves = totals[:, :2]  # neither observation has half of its agreement with the other one for itself alone
         where = cubes[cube[some]], frames[group[some]], edge, step
-        specs.append(spec_of_observations(*where, own, halves, alpha_of))
+        specs.append(spec_of_observations(*where, totals, halves, alpha_of))
         rows.append((k, float(distance[k] / pairs[k]), int(pairs[k])))
     of_axis: dict[str, tuple[LagBin, ...]] = dict.fromkeys(AXES, ())
     for (k, lag, count), alpha in zip(rows, confidence_intervals(specs), strict=True):

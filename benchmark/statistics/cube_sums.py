@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -12,12 +12,12 @@ import numpy.typing as npt
 
 from semstab.core.types import Float64
 from semstab.data.measures import sbd, vss
-from semstab.data.statistics import Flipping, Interval
+from semstab.data.statistics import Flipping
 from semstab.data.voxels import VoxelTable
 from semstab.statistics.accumulate import Cubes, CubeSums, Mean
 from semstab.statistics.agreement import decompose, disagreement, kappa_of, psa
 from semstab.statistics.drift import flips, trends
-from semstab.statistics.intervals import EstimateSpec
+from semstab.statistics.intervals import confidence_intervals
 from semstab.statistics.sample import MapSample
 
 Columns = dict[str, npt.NDArray[Any]]
@@ -114,12 +114,9 @@ class FlippingSums:
         share = CubeSums(cubes.cell, cubes.edge, cubes.means({"": inconsistent}))
         return cls(share, int(np.count_nonzero(table.op >= ENOUGH)), _together(table, inconsistent))
 
-    def specs(self) -> Iterator[EstimateSpec]:
-        """Yield the share of the locations that are not consistent, for `confidence_intervals`."""
-        return self.share.specs({"": Mean("")})
-
-    def flipping(self, share: Interval, classes: Sequence[str] = ()) -> Flipping:
-        """Return that share with its interval, and the two classes that most often occur together there."""
+    def flipping(self, classes: Sequence[str] = ()) -> Flipping:
+        """Return the share of the locations that are not consistent, and the two classes that most often meet there."""
+        (share,) = confidence_intervals(self.share.specs({"": Mean("")}))
         locations = self.share[""][1]
         seen = float(self.often / locations) if locations else float("nan")
         total = float(self.together.sum())

@@ -84,9 +84,9 @@ def expected_sbd(table: VoxelTable, events: Events | None = None, *, seed: int =
     if events is not None and len(rest):
         log = events.evidence.entries
         most = int((log[0][events.ends] - log[0][events.starts]).max())
-        own = np.zeros(len(table), np.uint64)
-        own[rest] = streams(table, rest, seed)
-        in_chunks(mean_drifts, rest, events.starts, T.astype(np.int64), log, events.K, most, own, null)
+        stream = np.zeros(len(table), np.uint64)
+        stream[rest] = streams(table, rest, seed)
+        in_chunks(mean_drifts, rest, events.starts, T.astype(np.int64), log, events.K, most, stream, null)
     return null
 
 

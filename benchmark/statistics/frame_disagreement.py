@@ -26,7 +26,7 @@ LEAST_VIEWS = 3
 """Views of a place from which on one of them can stand alone."""
 
 LEAST_PLACES = 50
-"""Places from which on a frame is judged."""
+"""The least number of places of a frame that is tested."""
 
 LEAST_FRAMES = 6
 """Judged frames from which on one of them can stand out."""
@@ -40,7 +40,7 @@ LEVEL = 0.025
 
 @dataclass(frozen=True, eq=False)
 class LoneDisagreement:
-    """How often each judged frame stands alone.
+    """How often each frame with enough places stands alone.
 
     Attributes:
         frame: (F,) indices of frames, the first of their view, ascending.
@@ -124,8 +124,8 @@ def largest_deviate(n: int, level: float) -> float:
     return float((n - 1) * t / np.sqrt((n - 2 + t * t) * n))
 
 
-def outlying_frames(found: LoneDisagreement, views: int, *, name: Callable[[int], str] = str) -> OutlyingFrames:
-    """Return the frames that stand alone more often than those of the same quality do.
+def outlying_frames(lone: LoneDisagreement, views: int, *, name: Callable[[int], str] = str) -> OutlyingFrames:
+    """Return the frames that stand alone more often than frames of the same quality do.
 
     The null is the spread of the frames themselves, which has in it how places, labels and frames vary: a frame is
     named where its excess is an outlier among the excesses, and at least LEAST_EXCESS above the mean of the frames
@@ -133,14 +133,14 @@ def outlying_frames(found: LoneDisagreement, views: int, *, name: Callable[[int]
     counts as sqrt(places / median) of its own.
 
     Args:
-        found: Of the frames of a map.
-        views: Distinct views of the map; those without enough places are counted, not judged.
+        lone: How often each frame of a map stands alone.
+        views: Distinct views of the map; views without enough places are counted, not tested.
         name: Returns the name of a frame's file by its index.
     """
-    judged = np.flatnonzero(found.places >= LEAST_PLACES)
+    judged = np.flatnonzero(lone.places >= LEAST_PLACES)
     if len(judged) < LEAST_FRAMES:
         return OutlyingFrames(judged=0, unjudged=views, usual=math.nan)
-    places, excess = found.places[judged], found.excess[judged]
+    places, excess = lone.places[judged], lone.excess[judged]
     above = outlying_rows(excess * np.sqrt(np.minimum(places / np.median(places), 1.0)))
     usual = float(np.delete(excess, above).mean())
     named = above[excess[above] >= usual + LEAST_EXCESS]
@@ -151,8 +151,8 @@ def outlying_frames(found: LoneDisagreement, views: int, *, name: Callable[[int]
         usual=usual,
         frames=tuple(
             FrameDisagreement(
-                int(found.frame[k]), name(int(found.frame[k])), int(found.places[k]), float(found.share[k]),
-                float(found.null[k]),
+                int(lone.frame[k]), name(int(lone.frame[k])), int(lone.places[k]), float(lone.share[k]),
+                float(lone.null[k]),
             )
             for k in rows
         ),

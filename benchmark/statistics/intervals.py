@@ -68,10 +68,10 @@ def confidence_intervals(specs: Iterable[EstimateSpec]) -> list[Interval]:
     """Return the numbers with their confidence intervals."""
     with one_thread():
         return [
-            Interval(own.value, math.nan, math.nan, undecided=NO_LOCATIONS, level=own.level)
-            if own.grid is None
-            else _answer(own, own.grid)
-            for own in specs
+            Interval(spec.value, math.nan, math.nan, undecided=NO_LOCATIONS, level=spec.level)
+            if spec.grid is None
+            else _answer(spec, spec.grid)
+            for spec in specs
         ]
 
 
@@ -80,7 +80,7 @@ def estimate(
 ) -> Interval:
     """Return a number of a map with its interval; see `FUNCTIONALS` for its key, k is a class.
 
-    The scope is that of `Interval`; where frames are unknown it is 'these frames'.
+    The scope is explained at `Interval`; where frames are unknown it is 'these frames'.
     """
     return confidence_intervals([spec_of(sums, key, k, scope, level)])[0]
 
@@ -90,8 +90,8 @@ def spec_of(
 ) -> EstimateSpec:
     """Return the spec of a number of a map, see `estimate`."""
     number = functional(key, k)
-    bounds, own = (number.low, number.high), value(sums, key, k)
-    clipped = own if math.isnan(own) else min(max(own, number.low), number.high)
+    bounds, point = (number.low, number.high), value(sums, key, k)
+    clipped = point if math.isnan(point) else min(max(point, number.low), number.high)
     return EstimateSpec(clipped, grid_of(sums, key, k), scope, number.scale, bounds, level)
 
 
@@ -120,9 +120,9 @@ def difference(
     one, other = grid_of(a, key, k), grid_of(b, key, k)
     if one is None or other is None:
         return Interval(result, math.nan, math.nan, undecided=NO_LOCATIONS)
-    own, theirs = (parts_of(sums, functional(key, k))[0][0] for sums in (a, b))
-    scope = scope if own.step else THESE_FRAMES
-    paired = (not own.step or same_flight(own, theirs)) if same_frames is None else same_frames
+    first, second = (parts_of(sums, functional(key, k))[0][0] for sums in (a, b))
+    scope = scope if first.step else THESE_FRAMES
+    paired = (not first.step or same_flight(first, second)) if same_frames is None else same_frames
     between = one.minus(other)
     with one_thread():
         spread = spread_of(between, scope) if paired else spread_of_flights(one, other, between, scope)
@@ -137,15 +137,15 @@ def difference(
 
 def identical(a: ClusterSums, b: ClusterSums, key: str, k: int | None = None) -> bool:
     """Return whether a number has identical sums in two maps, so that it has no difference anywhere."""
-    one, other = ([part for part, _ in parts_of(own, functional(key, k))] for own in aligned(a, b))
+    one, other = ([part for part, _ in parts_of(each, functional(key, k))] for each in aligned(a, b))
     if len(one) != len(other):
         return False
     for pair in zip(one, other, strict=True):
         columns = [columns_of(part, key, k) for part in pair]
-        rows = [own.any(axis=1) for own in columns]
+        rows = [values.any(axis=1) for values in columns]
         same = [
-            (own[where], part.cell[where], part.frame[where])
-            for own, where, part in zip(columns, rows, pair, strict=True)
+            (values[where], part.cell[where], part.frame[where])
+            for values, where, part in zip(columns, rows, pair, strict=True)
         ]
         if not all(np.array_equal(x, y, equal_nan=True) for x, y in zip(*same, strict=True)):
             return False
@@ -237,10 +237,10 @@ def grid_of(sums: ClusterSums, key: str, k: int | None = None) -> Influences | N
     number, total = functional(key, k), None
     for part, weight in parts_of(sums, number):
         halves = part.of(("twice_agreeing", "twice")) * (0.5 if key == "psa" else 1.0) if number.pairs else None
-        own = influences(part.index, columns_of(part, key, k), number.of, halves)
-        if own is None:
+        influence = influences(part.index, columns_of(part, key, k), number.of, halves)
+        if influence is None:
             return None
-        total = own.times(weight) if total is None else total.plus(own.times(weight))
+        total = influence.times(weight) if total is None else total.plus(influence.times(weight))
     return total
 
 
@@ -325,11 +325,11 @@ def unpaired(a: Interval, b: Interval) -> Interval:
 
 
 def mean_of(result: Sequence[Interval]) -> Interval:
-    """Return the mean of numbers with independent errors, as those of scenes, whose intervals have one level."""
+    """Return the mean of numbers with independent errors, such as scenes have, whose intervals have one level."""
     n = len(result)
-    value = sum(own.value for own in result) / n
-    low = value - math.hypot(*(own.value - own.low for own in result)) / n
-    high = value + math.hypot(*(own.high - own.value for own in result)) / n
+    value = sum(interval.value for interval in result) / n
+    low = value - math.hypot(*(interval.value - interval.low for interval in result)) / n
+    high = value + math.hypot(*(interval.high - interval.value for interval in result)) / n
     return result[0] if n == 1 else _combined(value, low, high, result, 1 / n)
 
 
@@ -337,21 +337,23 @@ def _combined(value: float, low: float, high: float, parts: Sequence[Interval], 
     """Return the p-value by the variances that the parts' intervals stand for, each with its degrees of freedom."""
     from scipy import special
 
-    variances = [(weight * standard_error(own)) ** 2 for own in parts]
-    spread = sum(v**2 / own.degrees for v, own in zip(variances, parts, strict=True) if v > 0 and own.degrees > 0)
+    variances = [(weight * standard_error(interval)) ** 2 for interval in parts]
+    spread = sum(
+        v**2 / interval.degrees for v, interval in zip(variances, parts, strict=True) if v > 0 and interval.degrees > 0
+    )
     total = sum(variances)
     degrees = max(total**2 / spread, 1.0) if spread > 0 else math.inf
     p = float(2 * special.stdtr(degrees, -abs(value) / math.sqrt(total))) if total > 0 else math.nan
-    scopes = {own.scope for own in parts}
+    scopes = {interval.scope for interval in parts}
     return Interval(
         value,
         low,
         high,
         scope=scopes.pop() if len(scopes) == 1 else THESE_FRAMES,
-        frames=min(own.frames for own in parts),
-        locations=sum(own.locations for own in parts),
+        frames=min(interval.frames for interval in parts),
+        locations=sum(interval.locations for interval in parts),
         degrees=degrees,
-        undecided="; ".join(dict.fromkeys(own.undecided for own in parts if own.undecided)),
+        undecided="; ".join(dict.fromkeys(interval.undecided for interval in parts if interval.undecided)),
         p_value=p,
         level=parts[0].level,
     )
@@ -371,13 +373,13 @@ def standard_error(interval: Interval) -> float:
 
 def mean_over_frames(frame: npt.NDArray[np.integer], values: Float64, level: float = CONFIDENCE) -> Interval:
     """Return the mean of values (F,), NaN where undefined, of frames (F,) by their index, for another flight."""
-    there = ~np.isnan(values)
-    if there.sum() < 2:
+    defined = ~np.isnan(values)
+    if defined.sum() < 2:
         return UNKNOWN
-    frame, values = np.asarray(frame)[there], values[there]
+    frame, values = np.asarray(frame)[defined], values[defined]
     groups = np.array_split(np.argsort(frame, kind="stable"), min(len(frame), MOST_GROUPS))
-    effect, size = np.array([values[own].mean() for own in groups]), np.array([len(own) for own in groups])
-    spread = spread_of_frames(effect, size / size.sum(), np.array([frame[own].mean() for own in groups]))
+    effect, size = np.array([values[rows].mean() for rows in groups]), np.array([len(rows) for rows in groups])
+    spread = spread_of_frames(effect, size / size.sum(), np.array([frame[rows].mean() for rows in groups]))
     result, half = float(values.mean()), spread.half(level)
     few = TOO_FEW.format(least=LEAST_FRAMES) if len(values) < LEAST_FRAMES else ""
     return Interval(

@@ -10,15 +10,12 @@ from dataclasses import dataclass
 import numpy as np
 
 from semstab.core.types import THIS_SCENE, Float64, Scope
-from semstab.data import labels
 from semstab.data.events import Events
 from semstab.data.information import by_group
-from semstab.data.measures import SBD, dominant
+from semstab.data.measures import SBD
 from semstab.data.results import TableSummary
 from semstab.data.statistics import (
-    CellAgreement,
     ClassAgreement,
-    ClassAlpha,
     CorrectnessStatistics,
     DriftStatistics,
     EntropyParts,
@@ -27,7 +24,6 @@ from semstab.data.statistics import (
     HeadlineStatistics,
     Interval,
     MapStatistics,
-    MovingClasses,
     Repeated,
     StratumStatistics,
     Trend,
@@ -35,9 +31,10 @@ from semstab.data.statistics import (
 from semstab.data.voxels import VoxelTable
 from semstab.metrics.agreement import shared_rows
 from semstab.metrics.summary import STRATA, groups_of
-from semstab.statistics.accumulate import Cubes, CubeSums, cluster_sums_of, sums_of_cells
+from semstab.statistics.accumulate import Cubes, CubeSums, cluster_sums_of
 from semstab.statistics.agreement import class_agreement_of, class_sums, consistency_posterior, shares_of
-from semstab.statistics.cluster_sums import MOST_CLASSES, ClusterSums, chance_of, value
+from semstab.statistics.cell_agreement import cell_agreement
+from semstab.statistics.cluster_sums import ClusterSums
 from semstab.statistics.correctness import (
     MIOU,
     Predictions,
@@ -66,14 +63,7 @@ from semstab.statistics.cube_sums import (
 from semstab.statistics.drift import expected_sbd
 from semstab.statistics.frame_disagreement import LoneDisagreement, lone_disagreement, outlying_frames
 from semstab.statistics.geometry import losses
-from semstab.statistics.intervals import (
-    confidence_intervals,
-    estimate,
-    headline_specs,
-    probability_above,
-    scope_of,
-    spec_of,
-)
+from semstab.statistics.intervals import confidence_intervals, estimate, headline_specs, scope_of
 from semstab.statistics.observations import CellObservations
 from semstab.statistics.ranges import range_agreement
 from semstab.statistics.sample import MapSample
@@ -108,8 +98,8 @@ class Analysis:
         """Return the numbers of each frame by its index, as the time series names them; see `LoneDisagreement`."""
         if self.lone is None:
             return {}
-        found = self.summary.outlying_frames
-        named = {each.frame for each in found.frames} if found else set()
+        outlying = self.summary.outlying_frames
+        named = {each.frame for each in outlying.frames} if outlying else set()
         rows = zip(self.lone.frame.tolist(), self.lone.share.tolist(), self.lone.null.tolist(), strict=True)
         return {
             frame: {"lone_percent": 100 * share, "lone_null_percent": 100 * null, "outlying": int(frame in named)}
@@ -182,8 +172,8 @@ def analyse(
 ) -> Analysis:
     """Return all statistics of one map; the same seed gives the same numbers.
 
-    Intervals are at CONFIDENCE, those of all other numbers for these frames; undefined numbers are NaN, and a section
-    that cannot be computed is None.
+    Intervals are at CONFIDENCE, and for these frames where `scope` does not apply; undefined numbers are NaN, and a
+    section that cannot be computed is None.
 
     Args:
         sample: The map, or a sample of it, with its log and the ground truth.
@@ -201,162 +191,61 @@ def analyse(
     table, events = sample.table.measured(), sample.events
     truth = None if sample.truth is None else join_truth(table, sample.truth)
     limit = sample.truth if limit is None else limit
+
     shares = shares_of(table)
     consistent = consistency_posterior(table, shares)
     null = expected_sbd(table, events, seed=seed)
-    columns = row_columns(table, null)
-    cubes = Cubes.of(table)
-    of_locations = location_sums(table, columns, cubes)
-    influence = cluster_sums_of(
-        table,
-        events,
-        None if truth is None else truth.label,
-        cells=cells,
-        sbd_excess=columns["sbd_excess"],
-        cubes=cubes,
-        consistent=consistent,
+    columns, cubes = row_columns(table, null), Cubes.of(table)
+    locations = location_sums(table, columns, cubes)
+    true_label = None if truth is None else truth.label
+    sums = cluster_sums_of(
+        table, events, true_label, cells=cells, sbd_excess=columns["sbd_excess"], cubes=cubes, consistent=consistent
     )
-    flipping = FlippingSums.of(table, consistent, cubes)
     drawn, log = log_sums(sample, cubes)
     if log is not None:
         drawn["sbd_null"] = null
-    if truth is not None:
-        drawn["true_label"] = truth.label
-    (inconsistent,) = confidence_intervals(flipping.specs())
-    of_flips = [] if log is None else confidence_intervals(log.sums.specs(OF_FLIPS))
-    means = dict(zip(MEANS, confidence_intervals(of_locations.specs(MEANS)), strict=True)) | {
-        name: estimate(influence, key, scope=scope_of(influence, scope, key)) for name, key in OF_CLUSTERS.items()
-    }
+    if true_label is not None:
+        drawn["true_label"] = true_label
+
     whole = sample.summary.summary(table.voxel_size, table.classes, edges)
-    headline, count = HeadlineStatistics(*confidence_intervals(headline_specs(influence, scope))), len(cubes.cell)
-    agreeing = None if cells is None else cell_agreement(cells, influence, table, scope, critical, limits)
     repeats = whole.means.voxels[SBD.key]
     repeated = Repeated(repeats, repeats / whole.voxels if whole.voxels else math.nan)
-    lone, outlying = None if cells is None else lone_disagreement(cells), None
-    if cells is not None and lone is not None:
+    headline = HeadlineStatistics(*confidence_intervals(headline_specs(sums, scope)))
+    means = _means(locations, sums, scope)
+    flips = FlippingSums.of(table, consistent, cubes).flipping(table.classes)
+    lone, outlying = None, None
+    if cells is not None:
+        lone = lone_disagreement(cells)
         outlying = outlying_frames(lone, len(cells.views), name=frame_name)
-    flips_of_map = flipping.flipping(inconsistent, table.classes)
+    agreement_of_cells = None if cells is None else cell_agreement(cells, sums, table, scope, critical, limits)
+    stability = verdict(
+        name or "model", headline=headline, cells=agreement_of_cells, flips=flips, voxels=repeats, share=repeated.share,
+        limits=limits,
+    )  # fmt: skip
     summary = MapStatistics(
-        schema=SCHEMA,
-        name=name,
-        seed=seed,
-        K=table.K,
-        voxel_size=table.voxel_size,
-        voxels=whole.voxels,
-        observations=whole.observations,
-        repeated=repeated,
-        cubes=count,
-        verdict=verdict(
-            name or "model",
-            headline=headline,
-            cells=agreeing,
-            flips=flips_of_map,
-            voxels=repeated.voxels,
-            share=repeated.share,
-            limits=limits,
-        ),
+        schema=SCHEMA, name=name, seed=seed, K=table.K, voxel_size=table.voxel_size,
+        voxels=whole.voxels, observations=whole.observations, repeated=repeated, cubes=len(cubes.cell),
+        verdict=stability,
         agreement=_agreement(means, class_agreement_of(class_sums(table, events), table.classes)),
-        flipping=flips_of_map,
+        flipping=flips,
         headline=headline,
-        cells=agreeing,
+        cells=agreement_of_cells,
         correlogram=None if cells is None else correlogram(cells),
-        drift=_drift(repeats, means, of_locations, log, of_flips),
+        drift=_drift(repeats, means, locations, log),
         uncertainty=EntropyParts(means["entropy"], means["entropy_within"], means["entropy_between"]),
         geometry=None if limit is None else losses(table, limit),
-        correctness=None if truth is None else _correctness(table, truth, consistent, influence, edges, headline),
+        correctness=None if truth is None else _correctness(table, truth, consistent, sums, edges, headline),
         strata=_strata(whole, table, columns, edges),
         outlying_frames=outlying,
         ranges=None if cells is None else range_agreement(cells, scope, limits),
-    )
-    return Analysis(summary, whole, influence, sample, shares, drawn, lone)
+    )  # fmt: skip
+    return Analysis(summary, whole, sums, sample, shares, drawn, lone)
 
 
-def cell_agreement(
-    cells: CellObservations,
-    sums: ClusterSums,
-    table: VoxelTable,
-    scope: Scope = THIS_SCENE,
-    critical: Sequence[str] = (),
-    limits: Limits = LIMITS,
-) -> CellAgreement:
-    """Return alpha of each class, with the observations that alpha rests on.
-
-    Args:
-        cells: Labels of sampled cells.
-        sums: Sums of the map with these cells.
-        table: The map, by which locations of a class are counted.
-        scope: Scope of the intervals, where there are enough views for it.
-        critical: Classes that the verdict depends on; where none is named, those with enough locations.
-        limits: Limits of the verdict.
-    """
-    fine = sums.fine
-    assert fine is not None
-    names, named = sums.classes or tuple(str(k) for k in range(table.K)), set(critical) & set(sums.classes)
-    locations = np.bincount(dominant(table)[table.op >= 2], minlength=table.K).tolist()
-    own, evidence = scope_of(sums, scope), fine["evidence"].sum(axis=0)
-    alphas = confidence_intervals(spec_of(sums, "alpha", k, own) for k in range(table.K) if table.K <= MOST_CLASSES)
-    n, largest = float(fine["observations"].sum()), int(evidence.argmax())
-    disagreement = _disagreement(evidence / n if n else evidence, np.array([alpha.value for alpha in alphas]))
-    moving = [k for k in labels.moving(names) if k < len(disagreement) and disagreement[k] >= LITTLE]
-    return CellAgreement(
-        cell_size=cells.coarsening * cells.cell_size,
-        cells=round(float(fine["voxels"].sum())),
-        cubes=fine.cells,
-        frames=cells.frames,
-        views=len(cells.views),
-        chance=chance_of(fine),
-        largest_class=names[largest],
-        largest_share=float(evidence[largest]) / n if n else math.nan,
-        labelled=cells.labelled_share(),
-        classes=tuple(
-            ClassAlpha(
-                name,
-                locations[k],
-                name in named if named else locations[k] >= limits.class_locations,
-                alpha,
-                1 - probability_above(alpha, limits.usable, "agreement"),
-                float(disagreement[k]),
-            )
-            for k, (name, alpha) in enumerate(zip(names, alphas, strict=False))
-        ),
-        moving=moving_classes(cells, sums, moving) if disagreement[moving].sum() >= MUCH else None,
-    )
-
-
-LITTLE, MUCH = 0.01, 0.1
-"""The shares of the disagreement from which on a class that moves, and all of them together, are looked into."""
-
-
-def moving_classes(cells: CellObservations, sums: ClusterSums, moving: Sequence[int]) -> MovingClasses | None:
-    """Return what locations of these classes have of the disagreement, and alpha without them; `sums` are of all.
-
-    None where so few cells leave no disagreement to share.
-    """
-
-    def disagreeing(own: ClusterSums, alpha: float) -> float:
-        fine = own.fine
-        assert fine is not None
-        return float(fine["observations"].sum()) * (1 - alpha) * (1 - chance_of(fine))
-
-    rest = sums_of_cells(cells.without(moving))
-    whole, alpha = (min(value(own, "alpha"), 1.0) for own in (sums, rest))  # extrapolated to cells without a size
-    if not (everywhere := disagreeing(sums, whole)) > 0:
-        return None
-    share = 1 - disagreeing(rest, alpha) / everywhere
-    return MovingClasses(tuple(sums.classes[k] for k in moving), min(max(share, 0.0), 1.0), alpha)
-
-
-def _disagreement(shares: Float64, alpha: Float64) -> Float64:
-    """Return the share (K,) of each class in all disagreement, from shares of the observations and alpha of each class.
-
-    A class against all others disagrees with the probability (1 - alpha) 2 p (1 - p).
-    """
-    own = np.nan_to_num((1 - alpha) * shares[: len(alpha)] * (1 - shares[: len(alpha)])).clip(min=0)
-    total = own.sum()
-    return own / total if total > 0 else np.full(len(own), np.nan)
-
-
-# --- Sections ---------------------------------------------------------------------------------------------------------
+def _means(locations: CubeSums, sums: ClusterSums, scope: Scope) -> dict[str, Interval]:
+    """Return the means over the voxels with OP >= 2 by name, those of `OF_CLUSTERS` in the scope where they can be."""
+    of_cubes = dict(zip(MEANS, confidence_intervals(locations.specs(MEANS)), strict=True))
+    return of_cubes | {name: estimate(sums, key, scope=scope_of(sums, scope, key)) for name, key in OF_CLUSTERS.items()}
 
 
 def _agreement(means: Mapping[str, Interval], classes: tuple[ClassAgreement, ...]) -> FrameAgreement:
@@ -364,16 +253,14 @@ def _agreement(means: Mapping[str, Interval], classes: tuple[ClassAgreement, ...
     return FrameAgreement(**{name: means[name] for name in names}, classes=classes)
 
 
-def _drift(
-    repeats: int, means: Mapping[str, Interval], locations: CubeSums, log: LogSums | None, of_flips: Sequence[Interval]
-) -> DriftStatistics:
+def _drift(repeats: int, means: Mapping[str, Interval], locations: CubeSums, log: LogSums | None) -> DriftStatistics:
     """Return SBD and its null; without a log only for one-hot evidence, and without flips and trend."""
     trend, rates, sampled = None, None, locations["psa"][1]
     if log is not None:
         since, share = confidence_intervals(log.sums.specs(OF_CHANGES))
         trend = Trend(share, log.telling)
-        rate, null, beyond = of_flips
-        rates = FlipRates(rate, null, beyond, since)
+        rate, null, excess = confidence_intervals(log.sums.specs(OF_FLIPS))
+        rates = FlipRates(rate, null, excess, since)
     return DriftStatistics(
         voxels=round(locations["null"][1] / sampled * repeats) if sampled else 0,
         sbd=means["sbd"],
@@ -418,7 +305,7 @@ def _strata(
         means = sums / count
     return tuple(
         StratumStatistics(
-            stratum.name, stratum.voxels, stratum.means, **dict(zip(BY_STRATUM, own.tolist(), strict=True))
+            stratum.name, stratum.voxels, stratum.means, **dict(zip(BY_STRATUM, of_stratum.tolist(), strict=True))
         )
-        for stratum, own in zip(whole.strata, means, strict=True)
+        for stratum, of_stratum in zip(whole.strata, means, strict=True)
     )

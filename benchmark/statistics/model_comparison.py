@@ -328,12 +328,12 @@ def common_voxels(regions: Regions) -> Region:
         first, truth = next(iter(tables.values())), region.truth
         true = None if truth is None else truth.rows(shared_rows(truth, first)[0])
         parts.append(Region(tables, logs or None, true))
-    tables = {name: VoxelTable.joined([own.tables[name] for own in parts]) for name in parts[0].tables}
-    events = [own.events for own in parts if own.events is not None]
-    truths = [own.truth for own in parts if own.truth is not None]
+    tables = {name: VoxelTable.joined([each.tables[name] for each in parts]) for name in parts[0].tables}
+    events = [each.events for each in parts if each.events is not None]
+    truths = [each.truth for each in parts if each.truth is not None]
     return Region(
         tables,
-        {name: Events.joined([own[name] for own in events]) for name in tables} if events else None,
+        {name: Events.joined([each[name] for each in events]) for name in tables} if events else None,
         VoxelTable.joined(truths) if truths else None,
         share,
     )

@@ -304,7 +304,7 @@ def _numbered(models: Sequence[CellObservations]) -> tuple[list[Int64], Int64]:
 
 
 def _filled(sample: CellObservations, locations: CellObservations, ignored: Float64) -> CellObservations:
-    """Return a model's entries, and those of a further class that has the pixels `ignored` of each of the locations."""
+    """Return a model's entries, with a further class for the pixels `ignored` of each of the locations."""
     label = np.full(len(locations), sample.K, np.uint16)
     further = dataclasses.replace(locations, label=label, weight=ignored).only(ignored > 0)
     return dataclasses.replace(CellObservations.joined([sample, further]), K=sample.K + 1, classes=())

@@ -21,7 +21,7 @@ LEAST_ENTRIES, LEAST_SHARE = 2000, 0.02
 """The least entries of a stratum, and their share in all; a smaller one is joined with the next."""
 
 LEAST_SEEN_TWICE = 200
-"""The least cells that two views saw from a range; of fewer its alpha is not said."""
+"""The least number of cells that two views saw from a range, for its alpha to be reported."""
 
 
 def range_agreement(
@@ -41,14 +41,14 @@ def range_agreement(
         return None
     strata = []
     for low, high in itertools.pairwise(edges):
-        own = cells.only((distance >= low) & (distance < high))
-        sums = sums_of_cells(own)
+        within = cells.only((distance >= low) & (distance < high))
+        sums = sums_of_cells(within)
         fine = sums.fine
         assert fine is not None
         seen_twice = round(float(fine["voxels"].sum()))
         enough = seen_twice >= LEAST_SEEN_TWICE
         alpha = estimate(sums, "alpha", scope=scope_of(sums, scope)) if enough else UNKNOWN
-        strata.append(RangeStratum(low, high, len(own) / len(cells), seen_twice, alpha))
+        strata.append(RangeStratum(low, high, len(within) / len(cells), seen_twice, alpha))
     return RangeAgreement(tuple(strata), limits.usable, *_reliable(strata, limits.usable))
 
 
@@ -57,10 +57,10 @@ def _edges(distance: Float64) -> list[float]:
     least = max(LEAST_ENTRIES, LEAST_SHARE * len(distance))
     chosen, below = [0.0], 0
     for edge in EDGES.tolist():
-        here = int(np.count_nonzero(distance < edge))
-        if here - below >= least and len(distance) - here >= least:
+        nearer = int(np.count_nonzero(distance < edge))
+        if nearer - below >= least and len(distance) - nearer >= least:
             chosen.append(edge)
-            below = here
+            below = nearer
     beyond = EDGES[distance.max() < EDGES]
     return [*chosen, float(beyond[0]) if len(beyond) else math.inf]
 

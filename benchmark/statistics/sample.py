@@ -69,7 +69,7 @@ class MapSample:
 
     @classmethod
     def merged(cls, parts: Sequence[MapSample], *, most: int = MOST_VOXELS) -> MapSample:
-        """Return the sample of a map from those of its disjoint parts: the lowest hashes of all of them."""
+        """Return the sample of a map from the samples of its disjoint parts: the voxels with the lowest hashes."""
         table = VoxelTable.joined([part.table for part in parts])
         logs = [part.events for part in parts if part.events is not None]
         truths = [part.truth for part in parts if part.truth is not None]

@@ -28,7 +28,7 @@ SIDE = 640
 """Most pixels on a side: every n-th pixel of each axis of a larger frame is taken, or every n-th point of a scan."""
 
 FEW = 4
-"""The median depth is that of every FEW-th pixel of each axis."""
+"""The median depth is taken of every FEW-th pixel of each axis."""
 
 REACH = SPAN // 2
 """Blocks from the first camera within which there is a sample."""
@@ -90,14 +90,14 @@ class Sampler:
         self._frames += 1
         self._sparse = self._sparse or frame.is_scan
         frame = frame.within(SIDE)
-        there = frame.valid if frame.unlabelled is None else frame.valid | frame.unlabelled
-        if not there.any():
+        with_depth = frame.valid if frame.unlabelled is None else frame.valid | frame.unlabelled
+        if not with_depth.any():
             return
         labels = np.where(frame.valid, frame.predicted, self.K).astype(np.uint16)
-        some = frame.depth[::FEW, ::FEW][there[::FEW, ::FEW]]  # a median of a few pixels is as good
-        view = self._view_of(frame, labels, float(np.median(some if len(some) else frame.depth[there])))
+        few = frame.depth[::FEW, ::FEW][with_depth[::FEW, ::FEW]]  # a median of a few pixels is as good
+        view = self._view_of(frame, labels, float(np.median(few if len(few) else frame.depth[with_depth])))
         if view is not None:
-            self._take(view, *self._drawn(frame, there, labels))
+            self._take(view, *self._drawn(frame, with_depth, labels))
 
     def _view_of(self, frame: Frame, labels: UInt16, depth: float) -> int | None:
         """Return the view of a frame, which may be a new one; None where the frame repeats another."""
@@ -117,7 +117,7 @@ class Sampler:
             self._clear()
         return self._anchor.view
 
-    def _drawn(self, frame: Frame, there: Any, labels: UInt16) -> tuple[Int64, UInt16, Float64, UInt32]:
+    def _drawn(self, frame: Frame, with_depth: Any, labels: UInt16) -> tuple[Int64, UInt16, Float64, UInt32]:
         """Return cells, labels, pixels and hashes of the frame's entries."""
         from semstab.statistics.loops.observations import draw, grouped
 
@@ -126,7 +126,7 @@ class Sampler:
         points = np.zeros((0, 0, 3), np.float32) if frame.points is None else frame.points
         cell, drawn, label = np.empty(H * W, np.int64), np.empty(H * W, np.uint32), np.empty(H * W, np.uint16)
         n = draw(
-            fixed(frame.depth), fixed(points), fixed(there), labels, ray_x, ray_y, fixed(frame.T_wc),
+            fixed(frame.depth), fixed(points), fixed(with_depth), labels, ray_x, ray_y, fixed(frame.T_wc),
             CELLS * self._cell_size, self._share, self._origin, REACH, cell, drawn, label,
         )  # fmt: skip
         near = slice(n) if cell[:n].min(initial=0) >= 0 else np.flatnonzero(cell[:n] >= 0)
@@ -146,8 +146,8 @@ class Sampler:
         some = np.flatnonzero(drawn < self._share)
         end = self._entries + len(some)
         taken: tuple[npt.NDArray[Any], ...] = cell, np.full(len(drawn), view), label, weight, drawn
-        for column, own in zip(self._columns, taken, strict=True):
-            column[self._entries : end] = own[some]
+        for column, values in zip(self._columns, taken, strict=True):
+            column[self._entries : end] = values[some]
         self._entries = end
 
     def sample(self, classes: tuple[str, ...] = ()) -> CellObservations:

@@ -134,8 +134,8 @@ def variances(
     logs, result = [], []
     for reach, prior in ranges.items():
         alike = np.exp(-distance / reach) if reach > 0 else np.eye(n)
-        own, vectors = np.linalg.eigh(whiten @ alike @ whiten.T)
-        total = 1 + np.outer(sizes, np.maximum(own, 0.0))
+        eigenvalues, vectors = np.linalg.eigh(whiten @ alike @ whiten.T)
+        total = 1 + np.outer(sizes, np.maximum(eigenvalues, 0.0))
         logs.append(math.log(prior) - 0.5 * (np.log(total) + (vectors.T @ seen) ** 2 / total).sum(axis=1))
         result.append(sizes * (weight @ alike @ weight))
     log = np.concatenate(logs)
@@ -208,20 +208,22 @@ def influences(
     total = columns.sum(axis=0)
     gradient = gradient_of(of, total)
     everything = np.abs(index.by_cube(columns[:, 1]))
-    some = everything > TINY * everything.sum()
-    if some.sum() < 2 or everything.sum() < TINY or not np.isfinite(gradient).all():
+    occupied = everything > TINY * everything.sum()
+    if occupied.sum() < 2 or everything.sum() < TINY or not np.isfinite(gradient).all():
         return None  # with 150 classes hardly any voxel may count as consistent: 1e-112 of all of them
-    own: Float64 = columns @ gradient
-    shared = own if halves is None else own + gradient[0] * (halves[:, 0] - total[0] / total[1] * halves[:, 1])
+    influence: Float64 = columns @ gradient
+    shared = (
+        influence if halves is None else influence + gradient[0] * (halves[:, 0] - total[0] / total[1] * halves[:, 1])
+    )
     by_frame, size = index.by_both(shared), index.by_both(np.abs(columns[:, 1]))
     seen = size.sum(axis=0) > 0
     return Influences(
-        index.cubes[some],
+        index.cubes[occupied],
         index.frames[seen],
-        index.by_cube(own)[some],
-        by_frame[np.ix_(some, seen)],
-        size[np.ix_(some, seen)],
-        everything[some],
+        index.by_cube(influence)[occupied],
+        by_frame[np.ix_(occupied, seen)],
+        size[np.ix_(occupied, seen)],
+        everything[occupied],
         index.edge,
         index.per_group,
         one_off=abs(float(gradient[0] * total[1])),
@@ -249,8 +251,8 @@ class Effects:
     @classmethod
     def of(cls, grid: Influences) -> Effects:
         """Fit the model to influences."""
-        some = grid.size.sum(axis=1) > 0
-        cell, size = grid.cell[some], grid.size[some]
+        occupied = grid.size.sum(axis=1) > 0
+        cell, size = grid.cell[occupied], grid.size[occupied]
         by_location, by_frame = size.sum(axis=1), size.sum(axis=0)
         if grid.per_group == 0 or len(by_frame) < 2 or len(by_location) < 2:
             return cls(grid, 0.0, 0.0, None, None)
@@ -295,7 +297,7 @@ class Effects:
             weight,
             np.diag(self.unit / weight),
             apart,
-            {own * extent: prior for own, prior in REACHES.items()},
+            {length * extent: prior for length, prior in REACHES.items()},
         )
 
 
@@ -410,8 +412,8 @@ def slope(statistic: Statistic, totals: Float64, direction: Float64) -> Float64:
 def gradient_of(statistic: Statistic, total: Float64) -> Float64:
     """Return the gradient (C,) of a statistic at sums (C,), 0 where there is nothing to sum."""
     gradient = np.zeros_like(total)
-    some = np.flatnonzero(total)
-    for at in np.array_split(some, len(some) * len(total) // AT_ONCE + 1):
+    nonzero = np.flatnonzero(total)
+    for at in np.array_split(nonzero, len(nonzero) * len(total) // AT_ONCE + 1):
         scale = np.maximum(np.abs(total[at]), TINY)
         along = np.zeros((len(at), len(total)))
         along[np.arange(len(at)), at] = scale

@@ -18,7 +18,8 @@ from posed_config import configure
 import semstab
 from semstab.comparison.runs import open_run, save_summary
 from semstab.core.files import FolderLock, atomic_path, only_writer
-from semstab.exports.relabel import Belief, relabel
+from semstab.exports.fused_labels import Belief
+from semstab.exports.relabel import relabel
 
 
 @pytest.fixture(scope="module")

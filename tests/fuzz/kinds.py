@@ -25,7 +25,8 @@ from rich.console import Console
 
 import semstab
 from semstab.comparison.differences import contrasts
-from semstab.comparison.gate import gate_config, parse
+from semstab.comparison.gate import gate_config
+from semstab.comparison.gate_rules import parse
 from semstab.comparison.pairing import pair
 from semstab.comparison.runs import open_run, open_runs, save_summary, shared_scenes
 from semstab.convert import convert

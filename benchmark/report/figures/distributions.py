@@ -208,8 +208,8 @@ def _draw_column(rows: Panels, histograms: Histograms, shade: str) -> None:
     present = voxels > 0
     x, few = op_position()[present], voxels[present] < ENOUGH
     for axes, measure in zip(rows[:-1], measures(), strict=True):
-        own = histograms[measure.key]
-        curves = (own.mean(), own.quantile(0.25), own.quantile(0.75))
+        histogram = histograms[measure.key]
+        curves = (histogram.mean(), histogram.quantile(0.25), histogram.quantile(0.75))
         mean, *ends = (lacking(measure, curve[present]) for curve in curves)
         axes.fill_between(x, *ends, color=shade, alpha=0.2, linewidth=0.8)
         axes.plot(x, mean, color=shade, marker="o", markersize=3)

@@ -111,10 +111,10 @@ class Overview:
             data = read_bytes(path)
             with zipfile.ZipFile(io.BytesIO(data)) as archive:
                 arrays = {name: decode_array(path, data, name[:-4]) for name in archive.namelist()}
-            own = {name.removesuffix(".npy"): value for name, value in arrays.items()}
-            lone: list[Any] = [own.get(f"lone_{name}") for name in ("frames", "labels", "alone", "color")]
+            content = {name.removesuffix(".npy"): value for name, value in arrays.items()}
+            lone: list[Any] = [content.get(f"lone_{name}") for name in ("frames", "labels", "alone", "color")]
             return cls(
-                int(own["frame"]), own["labels"], own.get("color"), own["palette"],
+                int(content["frame"]), content["labels"], content.get("color"), content["palette"],
                 None if lone[0] is None else LoneFrames(*lone),
             )  # fmt: skip
         except (ValueError, TypeError, KeyError, RuntimeError, zipfile.BadZipFile) as error:

@@ -9,23 +9,13 @@ from pathlib import Path
 from semstab.core.files import keep_only, write_json, write_text
 from semstab.data.records import Result
 from semstab.report.filter_study import of_interest
+from semstab.report.tables.backends import agreement, compared, fusion
 from semstab.report.tables.correctness import ceiling, comparison, correctness, correlogram
 from semstab.report.tables.filters import filter_tables
+from semstab.report.tables.flicker import flicker
 from semstab.report.tables.paper import paper
-from semstab.report.tables.stability import (
-    agreement,
-    classes,
-    compared,
-    cross_model,
-    flicker,
-    fusion,
-    overview,
-    persistence,
-    reduced,
-    scenes,
-    sensitivity,
-    voxel_sizes,
-)
+from semstab.report.tables.sensitivity import reduced, sensitivity, voxel_sizes
+from semstab.report.tables.stability import classes, cross_model, overview, persistence, scenes
 from semstab.report.tables.statistics import (
     class_agreement,
     drift,

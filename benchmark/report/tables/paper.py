@@ -1,4 +1,4 @@
-"""Make the tables that hold a study against the paper: its findings, and its numbers beside those of the study."""
+"""Make the tables that compare a study with the paper: findings and numbers of both."""
 
 from __future__ import annotations
 
@@ -57,12 +57,12 @@ FLICKER = {"SAM + heuristic": 29.47, "Raw SAM proposals": 21.64, CLOSED: 25.39, 
 
 
 def paper(result: Result) -> list[Table]:
-    """Return what the paper finds and whether it holds here, and its numbers beside those of the study."""
+    """Return the findings of the paper with whether they hold in the study, and the numbers of both."""
     models = {STANDS_FOR[name]: name for name in result.models if name in STANDS_FOR}
     if result.name not in STUDIES or OPEN not in models:
         return []
     named = " and ".join(
-        f"{own} stands for {theirs}" for theirs, own in models.items() if own.lower() != theirs.lower()
+        f"{ours} stands for {theirs}" for theirs, ours in models.items() if ours.lower() != theirs.lower()
     )
     said = f" Here {named}; absolute numbers are not comparable, the findings are." if named else ""
     return [_findings(result, models, said), _numbers(result, models, said)]
@@ -85,7 +85,9 @@ class Finding:
 
     def row(self) -> Row:
         """Return its row of the table."""
-        theirs, ours = (" → ".join(f"{value:.{self.digits}f}" for value in own) for own in (self.theirs, self.ours))
+        theirs, ours = (
+            " → ".join(f"{value:.{self.digits}f}" for value in values) for values in (self.theirs, self.ours)
+        )
         held = "--" if self.holds is None else "yes" if self.holds else "no"
         return self.text, theirs, "--" if self.holds is None else ours, held
 
@@ -136,7 +138,7 @@ def _persistence(result: Result, model: str) -> Iterator[Finding]:
 
 def _order(result: Result, models: Mapping[str, str]) -> Iterator[Finding]:
     records = result.select(SHARED) or result.select()
-    own = {theirs: pooled([r for r in records if r.unit.model == name]) for theirs, name in models.items()}
+    means = {theirs: pooled([r for r in records if r.unit.model == name]) for theirs, name in models.items()}
     compared: Sequence[tuple[str, int, int, Callable[[Pooled], float]]] = (
         ("VSS of all voxels", 0, 1, over_all(VSS)),
         ("VSS of voxels with OP>=3", 1, 1, over_recurrent(VSS)),
@@ -145,7 +147,7 @@ def _order(result: Result, models: Mapping[str, str]) -> Iterator[Finding]:
     )
     for text, row, column, take in compared:
         theirs = [SHARED_TAXONOMY[name][row][column] for name in (OPEN, CLOSED)]
-        ours = [take(own[name]) for name in (OPEN, CLOSED) if name in own]
+        ours = [take(means[name]) for name in (OPEN, CLOSED) if name in means]
         yield _finding(f"{text}: {OPEN} → {CLOSED}", theirs, ours, 2 if column == 0 else 4)
 
 
@@ -165,12 +167,12 @@ def _association(result: Result, model: str) -> Iterator[Finding]:
     yield _changes_little("and little VSS of those with OP>=3", (0.8544, 0.8446), recurrent, held, 4)
 
 
-def _ends(own: Sequence[Level]) -> Sequence[Level]:
-    return (own[0], own[-1]) if len(own) > 1 else ()
+def _ends(of_sweep: Sequence[Level]) -> Sequence[Level]:
+    return (of_sweep[0], of_sweep[-1]) if len(of_sweep) > 1 else ()
 
 
-def _each(own: Sequence[Level], take: Callable[[Pooled], float]) -> list[float]:
-    return [level.mean(take) for level in own]
+def _each(of_sweep: Sequence[Level], take: Callable[[Pooled], float]) -> list[float]:
+    return [level.mean(take) for level in of_sweep]
 
 
 def _share(each: Pooled) -> float:
@@ -190,10 +192,10 @@ def _numbers(result: Result, models: Mapping[str, str], said: str) -> Table:
         *(Column(f"paper_{c.key}", c.header, c.digits, over="Paper") for c in measured),
         *(Column(f"here_{c.key}", c.header, c.digits, over="Here") for c in measured),
     )
-    own = result.select(model=models[OPEN])
-    together = pooled(own)
+    of_model = result.select(model=models[OPEN])
+    together = pooled(of_model)
     strata, classes = {row.name: row for row in together.strata}, {row.name: row for row in together.classes}
-    everywhere: Row = ("all voxels", *ALL, *_macro(own))
+    everywhere: Row = ("all voxels", *ALL, *_macro(of_model))
     groups = [
         Group("All scenes, means over scenes", (everywhere,)),
         Group("By observation persistence", tuple(_beside(STRATA, strata))),

@@ -114,7 +114,7 @@ def ranges(result: Result) -> list[Table]:
     groups = []
     for name, rows in assessed_records(result).items():
         several = len(rows) > 1
-        own = [
+        of_model = [
             (
                 f"{record.unit.scene}: {_from_to(row)}" if several else _from_to(row),
                 100 * row.share,
@@ -125,7 +125,7 @@ def ranges(result: Result) -> list[Table]:
             if stats.ranges is not None
             for row in stats.ranges.strata
         ]
-        groups += [Group(name, tuple(own))] if own else []
+        groups += [Group(name, tuple(of_model))] if of_model else []
     if not groups:
         return []
     columns = (
@@ -181,7 +181,9 @@ def frames(result: Result) -> list[Table]:
     groups = []
     for model, rows in assessed_records(result).items():
         known = [(record, stats.outlying_frames) for record, stats in rows]
-        lines = tuple(row for record, found in known if found is not None for row in _frame_rows(record, found))
+        lines = tuple(
+            row for record, outlying in known if outlying is not None for row in _frame_rows(record, outlying)
+        )
         groups += [Group(model, lines)] if lines else []
     if not groups:
         return []
@@ -204,11 +206,11 @@ def frames(result: Result) -> list[Table]:
     return [Table("frames", "Frames that stand out", caption, columns, tuple(groups))]
 
 
-def _frame_rows(record: Record, found: OutlyingFrames) -> Iterator[Row]:
-    counts = found.judged, found.unjudged
-    for each in found.frames:
+def _frame_rows(record: Record, outlying: OutlyingFrames) -> Iterator[Row]:
+    counts = outlying.judged, outlying.unjudged
+    for each in outlying.frames:
         yield record.unit.scene, each.name, each.places, 100 * each.share, 100 * each.null, *counts
-    if not found.frames:
+    if not outlying.frames:
         yield record.unit.scene, "none", math.nan, math.nan, math.nan, *counts
 
 
@@ -289,7 +291,7 @@ def by_scene(
     groups = tuple(
         Group(
             model,
-            tuple(row(scene, own) for scene, own in rows.items()),
+            tuple(row(scene, of_scene) for scene, of_scene in rows.items()),
             row("Mean", _means(list(rows.values()))) if len(rows) > 1 else None,
         )
         for model, rows in cells.items()
@@ -347,7 +349,7 @@ def grouped(rows: Iterable[T], name: Callable[[T], str]) -> dict[str, list[T]]:
 def _class_rows(assessed: Sequence[MapStatistics]) -> tuple[Row, ...]:
     by_name = grouped((row for stats in assessed for row in stats.agreement.classes), lambda row: row.name)
     cells = (stats.cells for stats in assessed if stats.cells is not None)
-    alphas: dict[str, list[ClassAlpha]] = grouped((row for own in cells for row in own.classes), lambda row: row.name)
+    alphas: dict[str, list[ClassAlpha]] = grouped((row for each in cells for row in each.classes), lambda row: row.name)
     return tuple(
         (
             name,

@@ -147,11 +147,11 @@ def to_csv(table: Table) -> str:
     text = io.StringIO()
     writer = csv.writer(text, lineterminator="\n")
     parts = [_csv_parts([row[k] for _, row in table.rows()]) for k in range(len(table.columns))]
-    keys = [[f"{column.key}{part}" for part in own] for column, own in zip(table.columns, parts, strict=True)]
+    keys = [[f"{column.key}{part}" for part in names] for column, names in zip(table.columns, parts, strict=True)]
     last = [csv_text(table.benchmark)] if table.benchmark else []
     writer.writerow([*_leading(table, table.by), *itertools.chain(*keys), *(["benchmark"] if last else [])])
     for group, row in table.rows():
-        cells = (_csv_cells(column, cell, own) for column, cell, own in zip(table.columns, row, parts, strict=True))
+        cells = (_csv_cells(column, cell, names) for column, cell, names in zip(table.columns, row, parts, strict=True))
         writer.writerow([*_leading(table, group), *itertools.chain(*cells), *last])
     return text.getvalue()
 
@@ -184,7 +184,7 @@ def to_latex(table: Table) -> str:
         [
             rf"\begin{{{environment}}}[t]",
             r"\centering",
-            rf"\caption{{{_latex(_sentence(table.title))} {_latex(table.caption)}}}",
+            rf"\caption{{{_latex(table.title.removesuffix('.') + '.')} {_latex(table.caption)}}}",
             rf"\label{{tab:{table.name}}}",
             size,
             r"\setlength{\tabcolsep}{4pt}",
@@ -288,10 +288,6 @@ def _csv_cells(column: Column, cell: Cell, parts: Sequence[str]) -> list[str]:
     else:
         values = [cell.mean, cell.sd] if isinstance(cell, Spread) else [cell, math.nan, math.nan]
     return ["" if math.isnan(value) else column.number(value).replace(",", "") for value in values[: len(parts)]]
-
-
-def _sentence(text: str) -> str:
-    return text if text.endswith(".") else f"{text}."
 
 
 def _pipes(cells: list[str]) -> str:

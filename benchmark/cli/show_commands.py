@@ -1,0 +1,186 @@
+"""Define the commands that show: show and view a finished run, list the parts of semstab."""
+
+from __future__ import annotations
+
+import os
+import shlex
+import sys
+import textwrap
+from enum import StrEnum
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from semstab.cli.options import own_defaults, print_lines, say
+from semstab.errors import ConfigError, DataError
+
+
+class FigureFormat(StrEnum):
+    """The file format of figures."""
+
+    png = "png"
+    svg = "svg"
+
+
+FORMER_TABLES = {"glance": "overview", "remedies": "filters"}
+"""The names of tables in 0.3, with the current names; the old ones work for one version."""
+
+
+def show(
+    run: Annotated[Path, typer.Argument(metavar="RUN", help="Folder of a finished run, or of several.")],
+    what: Annotated[list[str] | None, typer.Argument(
+        metavar="[RUN|TABLE]...", help="Further runs, for one table of all; or tables, by the beginning of their names."
+    )] = None,
+    out: Annotated[Path | None, typer.Option(help="Write the table of several runs and a figure here.")] = None,
+    figures: Annotated[FigureFormat | None, typer.Option(help="Draw the figures for a paper into RUN/figures.")] = None,
+) -> None:  # fmt: skip
+    """Print the answer of a finished run, or its tables, without computing; of several runs one table of all."""
+    from rich.console import Console
+
+    from semstab.data.records import is_run
+    from semstab.engine.folder import load_result
+    from semstab.report.tables import tables
+    from semstab.report.tables.table import to_terminal
+    from semstab.report.terminal import failure_lines, print_answer
+
+    further = [Path(word) for word in what or () if Path(word).is_dir()]
+    if further or (run.is_dir() and not is_run(run)):
+        _show_several(run, further, [word for word in what or () if Path(word) not in further], out, figures)
+        return
+    if out is not None:
+        raise ConfigError("--out is for the table of several runs; the tables of one are in its folder")
+    result = load_result(run)
+    for line in failure_lines(result):
+        say(f"failed: {line}")
+    if not result.select():
+        raise DataError(f"{run}: no unit finished; {run / 'failures.log'} has more where it exists; run it again")
+    by_name = {table.name: table for table in tables(result)}
+    if figures is not None:
+        from semstab.report.figures import write_figures
+
+        print_lines(map(str, write_figures(result, run, svg=figures is FigureFormat.svg)))
+    elif not what:
+        print_answer(result, Console(), out=run)
+        listed = f"tables  {', '.join(by_name)}"
+        print_lines(textwrap.wrap(listed, 80, initial_indent="  ", subsequent_indent=" " * 10))
+    for name in what or ():
+        matching = [table for key, table in by_name.items() if key.startswith(FORMER_TABLES.get(name, name))]
+        if not matching:
+            raise ConfigError(f"{run}: no table '{name}'; the tables are {', '.join(by_name)}")
+        print_lines(f"{to_terminal(table)}\n" for table in matching)
+
+
+def _show_several(
+    run: Path, further: list[Path], names: list[str], out: Path | None, figures: FigureFormat | None
+) -> None:
+    """Print one table of several runs, and write it with its figure where that is wanted."""
+    from semstab.report.figures.runs import runs_figure
+    from semstab.report.tables import save_tables
+    from semstab.report.tables.runs import found_runs, runs_table
+    from semstab.report.tables.table import to_terminal
+
+    if names:
+        raise ConfigError(f"'{names[0]}' is neither a table of several runs nor a folder; name one run for its tables")
+    results = found_runs([run, *further])
+    table = runs_table(results)
+    print_lines([to_terminal(table)])
+    if out is not None:
+        written = save_tables([table], out)
+        print_lines(map(str, [*written, *runs_figure(results).save(out, svg=figures is FigureFormat.svg)]))
+
+
+def view(run: Annotated[Path, typer.Argument(metavar="RUN", help="Run folder, or an .rrd file.")]) -> None:
+    """Open a run's recording in the rerun viewer; it is made again if units have no pictures in it."""
+    import subprocess
+
+    from semstab.recording import lacks_pictures, record_finished, viewer_command
+
+    if not run.exists():
+        raise ConfigError(f"{run}: there is no such run or file; give the folder of --out, or one of runs/")
+    recording, finished = run / "recording.rrd" if run.is_dir() else run, (run / "summary.json").is_file()
+    if not finished and not recording.is_file():
+        raise ConfigError(f"{run}: there is no finished run here; give the folder of --out, or one of runs/")
+    if finished and lacks_pictures(run, recording):
+        say(f"making {recording}")
+        record_finished(run, recording)
+    display = sys.platform != "linux" or bool(os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY"))
+    stderr = None if display else subprocess.DEVNULL  # where it says in several lines that there is none
+    code = subprocess.run([*viewer_command(), str(recording)], check=False, stderr=stderr).returncode
+    if code and not display:
+        raise ConfigError(
+            f"{recording}: there is no display for the viewer; copy the file to a machine with one, or show it in a"
+            f" browser: rerun --serve-web {shlex.quote(str(recording))}"
+        )
+    raise typer.Exit(code)
+
+
+KINDS = {
+    "backends": "backend", "datasets": "dataset", "models": "model", "filters": "filter", "taxonomies": "taxonomy",
+    "studies": "study", "benchmarks": "benchmark",
+}  # fmt: skip
+"""The kinds of things that `list` lists, in the plural."""
+
+
+def _kind(text: str | None) -> str | None:
+    """Return a kind by its name in the singular or the plural; raises ConfigError if there is none."""
+    if text is None or text in KINDS.values():
+        return text
+    if text not in KINDS:
+        from semstab.config import nearest
+
+        raise ConfigError(f"list {text}: there is no such kind; {nearest(text, [*KINDS])}")
+    return KINDS[text]
+
+
+def list_(
+    kind: Annotated[
+        str | None, typer.Argument(metavar="KIND", help="Only backends, datasets, models, filters, taxonomies, ...")
+    ] = None,
+    check: Annotated[bool, typer.Option("--check", help="Also load each one, which takes seconds.")] = False,
+) -> None:
+    """List backends, datasets, models, filters, taxonomies, studies and benchmarks, with 'ready' or what is missing.
+
+    Below stand the settings of your own: ~/.config/semstab/config.yaml.
+    """
+    import yaml
+    from rich.console import Console
+    from rich.markup import escape
+    from rich.table import Table
+
+    from semstab import backends, datasets, models
+    from semstab.config import read_yaml
+    from semstab.data.labels import LabelSpace, shipped_taxonomies
+    from semstab.errors import MissingDependencyError
+    from semstab.predict import filters
+    from semstab.settings import load_study, shipped_benchmarks, shipped_studies
+
+    table = Table(show_edge=False)
+    for name in ("kind", "name", "", "description"):
+        table.add_column(name)
+    wanted = _kind(kind)
+    for registry in (backends.REGISTRY, datasets.REGISTRY, models.REGISTRY, filters.REGISTRY):
+        for name, entry in sorted(registry.entries().items()) if wanted in (None, registry.kind) else ():
+            missing = registry.missing(name)
+            if check and not missing:
+                try:
+                    registry.load(name)
+                except MissingDependencyError as error:
+                    missing = str(error)
+            ready = f"[yellow]{escape(missing)}" if missing else "[green]ready"
+            table.add_row(registry.kind, name, ready, escape(entry.summary))
+    for name in shipped_taxonomies() if wanted in (None, "taxonomy") else ():
+        space = LabelSpace.load(name)
+        table.add_row("taxonomy", name, "[green]ready", f"K = {len(space)}: {', '.join(space.classes)}")
+    for name in shipped_studies() if wanted in (None, "study") else ():
+        table.add_row("study", name, "[green]ready", load_study(name).description)
+    for name, file in shipped_benchmarks().items() if wanted in (None, "benchmark") else ():
+        table.add_row("benchmark", name, "[green]ready", read_yaml(file)["description"])
+    console = Console()
+    console.print(table)
+    if (own := own_defaults()) is None:
+        console.print("no settings of your own: ~/.config/semstab/config.yaml, or SEMSTAB_CONFIG", markup=False)
+    else:
+        console.print(f"settings of your own, where no --config is given: {own}", markup=False)
+        content = yaml.safe_dump(read_yaml(own), sort_keys=False, allow_unicode=True)
+        print_lines(f"  {line}" for line in content.splitlines())

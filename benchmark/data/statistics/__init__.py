@@ -1,0 +1,66 @@
+"""The statistics of a map; JSON has the names of the fields.
+
+Undefined numbers are NaN; a section that could not be computed is None.
+"""
+
+from semstab.data.statistics.agreement import (
+    CellAgreement,
+    ClassAgreement,
+    ClassAlpha,
+    Correlogram,
+    FrameAgreement,
+    LagBin,
+    MovingClasses,
+    RangeAgreement,
+    RangeStratum,
+)
+from semstab.data.statistics.correctness import Correctness, CorrectnessStatistics, Losses, Quadrants, Reliability
+from semstab.data.statistics.drift import DriftStatistics, Flipping, FlipRates, FrameDisagreement, OutlyingFrames, Trend
+from semstab.data.statistics.intervals import CONFIDENCE, UNDEFINED, UNKNOWN, Estimate, Interval, short
+from semstab.data.statistics.map_statistics import (
+    ORDER_KNOWN,
+    EntropyParts,
+    HeadlineStatistics,
+    Level,
+    MapStatistics,
+    Repeated,
+    StabilityVerdict,
+    StratumStatistics,
+)
+
+__all__ = [
+    "CONFIDENCE",
+    "ORDER_KNOWN",
+    "UNDEFINED",
+    "UNKNOWN",
+    "CellAgreement",
+    "ClassAgreement",
+    "ClassAlpha",
+    "Correctness",
+    "CorrectnessStatistics",
+    "Correlogram",
+    "DriftStatistics",
+    "EntropyParts",
+    "Estimate",
+    "FlipRates",
+    "Flipping",
+    "FrameAgreement",
+    "FrameDisagreement",
+    "HeadlineStatistics",
+    "Interval",
+    "LagBin",
+    "Level",
+    "Losses",
+    "MapStatistics",
+    "MovingClasses",
+    "OutlyingFrames",
+    "Quadrants",
+    "RangeAgreement",
+    "RangeStratum",
+    "Reliability",
+    "Repeated",
+    "StabilityVerdict",
+    "StratumStatistics",
+    "Trend",
+    "short",
+]

@@ -1,0 +1,225 @@
+"""Agreement of frames on voxels, of views on sampled cells, by range and by distance between observations."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+from semstab.data.statistics.intervals import Interval
+
+
+@dataclass(frozen=True)
+class ClassAgreement:
+    """Agreement on one class against all others, over the voxels with OP >= 2; NaN where undefined.
+
+    observations is the evidence for the class in these voxels, in frames.
+    """
+
+    name: str
+    observations: float
+    kappa: float
+    voxel_alpha: float
+
+
+@dataclass(frozen=True)
+class FrameAgreement:
+    """Agreement of frames at the voxels with OP >= 2, whose size it depends on.
+
+    Attributes:
+        psa: Probability that two frames agree.
+        kappa: Fleiss' kappa.
+        voxel_alpha: Krippendorff's alpha.
+        vss: The paper's VSS.
+        within: Part of 1 - PSA that is there within a frame.
+        between: Part of 1 - PSA that is there between frames.
+        classes: The same of each class.
+    """
+
+    psa: Interval
+    kappa: Interval
+    voxel_alpha: Interval
+    vss: Interval
+    within: Interval
+    between: Interval
+    classes: tuple[ClassAgreement, ...]
+
+
+@dataclass(frozen=True)
+class ClassAlpha:
+    """Alpha of one class against all others.
+
+    Attributes:
+        name: The class.
+        locations: Voxels with OP >= 2 of which it is the dominant class.
+        counts_for_verdict: Whether the verdict depends on it.
+        alpha: Alpha with its interval.
+        unstable: Probability that alpha is below the level 'usable'; NaN where that is not known.
+        disagreement: Its share of the disagreement between views: of two labels that differ, each class has one half.
+    """
+
+    name: str
+    locations: float
+    counts_for_verdict: bool
+    alpha: Interval
+    unstable: float
+    disagreement: float
+
+
+@dataclass(frozen=True)
+class MovingClasses:
+    """Disagreement where the map has classes that move, as vehicles and persons do.
+
+    Attributes:
+        classes: Their names.
+        disagreement: Share of all disagreement that is at locations with one of these as dominant class.
+        alpha: Of all other locations.
+    """
+
+    classes: tuple[str, ...]
+    disagreement: float
+    alpha: float
+
+
+@dataclass(frozen=True)
+class RangeStratum:
+    """Observations from some range.
+
+    Attributes:
+        low, high: Ends of the range in metres; the high one is not part of it.
+        share: Share of all sampled observations.
+        cells: Cells that two views saw from there.
+        alpha: Alpha of these observations.
+    """
+
+    low: float
+    high: float
+    share: float
+    cells: int
+    alpha: Interval
+
+
+@dataclass(frozen=True)
+class RangeAgreement:
+    """Agreement by the distance from which spots were seen.
+
+    Attributes:
+        strata: By range, the nearest first.
+        usable: The level above which labels can be used.
+        reliable: Metres up to which alpha stays above it, 0 where it never does.
+        low, high: The least and the largest that this may be, by the intervals of the strata.
+    """
+
+    strata: tuple[RangeStratum, ...]
+    usable: float
+    reliable: float
+    low: float
+    high: float
+
+    @property
+    def farthest(self) -> float:
+        """Return the end of the last stratum in which two views saw a spot, metres."""
+        return max((row.high for row in self.strata if not math.isnan(row.alpha.value)), default=0.0)
+
+    @property
+    def is_told(self) -> bool:
+        """Return whether the number is printed: labels are reliable near by and may not be farther out, or at no range.
+
+        Where neither is known, the verdict alone is printed.
+        """
+        return self.low < self.farthest and (self.reliable > 0 or self.high == 0)
+
+    @property
+    def text(self) -> str:
+        """Return the one number for people: 'reliable up to 30 m (20 to 50 m)'."""
+        return " ".join(filter(None, ("reliable", *self.parts)))
+
+    @property
+    def parts(self) -> tuple[str, str]:
+        """Return the number, and its interval or the reason: ('up to 30 m', '(20 to 50 m)')."""
+        if self.reliable:
+            ends = "" if self.low == self.high else f"{self.low:g} to {self.high:g} m"
+            far = "the farthest seen" if self.reliable == self.farthest else ""
+            note = ", ".join(filter(None, (ends, far)))
+            return f"up to {self.reliable:g} m", note and f"({note})"
+        first = next((row for row in self.strata if not math.isnan(row.alpha.value)), self.strata[0])
+        text = f"(alpha {first.alpha.text()} from {first.low:g} to {first.high:g} m)"
+        return "at no range", text
+
+
+@dataclass(frozen=True)
+class CellAgreement:
+    """The observations that alpha rests on: labels of sampled cells, about as wide as a pixel's footprint.
+
+    Attributes:
+        cell_size: Edge of a fine cell in metres.
+        cells: Fine cells that two views saw or more.
+        cubes: Cubes of space that hold them.
+        frames: Frames that were fused.
+        views: Distinct views among them: a camera that stands still has one.
+        chance: Probability that two observations from anywhere on the map agree.
+        largest_class: The class with most observations, and `largest_share` its share of them.
+        labelled: Share of the locations with depth that have a label in at least half of their observations.
+        classes: Alpha of each class.
+        moving: The classes that move, where much of the disagreement is theirs; else None.
+    """
+
+    cell_size: float
+    cells: int
+    cubes: int
+    frames: int
+    views: int
+    chance: float
+    largest_class: str
+    largest_share: float
+    labelled: float
+    classes: tuple[ClassAlpha, ...]
+    moving: MovingClasses | None = None
+
+    @property
+    def effective_classes(self) -> float:
+        """1 / chance: as many classes of equal size have this chance (Hill 1973, Ecology 54, of order 2)."""
+        return 1 / self.chance if self.chance > 0 else math.nan
+
+    def agreeing(self, alpha: float) -> float:
+        """Return the share of the spots at which two views see the same class, as an alpha of these cells has it."""
+        return 1 - (1 - alpha) * (1 - self.chance)
+
+    @property
+    def critical_classes(self) -> tuple[ClassAlpha, ...]:
+        """The classes that count for the verdict, those most probably unstable first."""
+        known = [row for row in self.classes if row.counts_for_verdict and not math.isnan(row.unstable)]
+        return tuple(sorted(known, key=lambda row: (-row.unstable, row.alpha.value)))
+
+
+@dataclass(frozen=True)
+class LagBin:
+    """Pairs of observations of a cell that are `low` to `high` apart, `mean` in the mean.
+
+    Attributes:
+        alpha: Of these pairs, beyond their own chance.
+    """
+
+    low: float
+    high: float
+    mean: float
+    pairs: int
+    alpha: Interval
+
+
+@dataclass(frozen=True)
+class Correlogram:
+    """Agreement beyond chance by how far apart two observations are; bins with few pairs are left out.
+
+    Attributes:
+        time: Frames.
+        angle: Degrees between the directions of view.
+        range: Ratio of the distances to the location, the larger one above.
+        baseline: Metres between the cameras.
+        standard: The pairs with 5 to 15 degrees between them, for models and flights to be compared at.
+    """
+
+    time: tuple[LagBin, ...]
+    angle: tuple[LagBin, ...]
+    range: tuple[LagBin, ...]
+    baseline: tuple[LagBin, ...]
+    standard: LagBin

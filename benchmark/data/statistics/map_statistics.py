@@ -1,0 +1,149 @@
+"""All statistics of one map: the verdict, the numbers that it rests on, and every section."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, field
+from typing import Literal
+
+from semstab.core.json_form import INLINE
+from semstab.data.measures import MeasureMeans
+from semstab.data.statistics.agreement import CellAgreement, Correlogram, FrameAgreement, RangeAgreement
+from semstab.data.statistics.correctness import CorrectnessStatistics, Losses
+from semstab.data.statistics.drift import DriftStatistics, Flipping, OutlyingFrames
+from semstab.data.statistics.intervals import Interval, short
+
+Level = Literal[
+    "stable", "usable", "unstable", "undecided", "uninformative", "misleading", "no verdict",
+]  # fmt: skip
+
+
+@dataclass(frozen=True)
+class StabilityVerdict:
+    """A model on a scene.
+
+    Attributes:
+        level: See ADVICE.
+        probability: Probability that the level is right, for the same scene flown again; NaN where no threshold
+            decides.
+        line: The reasons.
+    """
+
+    level: Level
+    probability: float
+    line: str
+
+    @property
+    def stated(self) -> str:
+        """The probability in print: '(p .71)', '(p > .99)', no share of a map; '' where no level has enough."""
+        p = self.probability
+        return "" if math.isnan(p) or self.level == "undecided" else "(p > .99)" if p >= 0.995 else f"(p {short(p)})"
+
+    def __str__(self) -> str:
+        """Return 'stable (p .98)'."""
+        return f"{self.level} {self.stated}".rstrip()
+
+
+@dataclass(frozen=True)
+class Repeated:
+    """The voxels with OP >= 2: how many they are, and of all voxels."""
+
+    voxels: int
+    share: float
+
+
+@dataclass(frozen=True)
+class HeadlineStatistics:
+    """The numbers that a verdict rests on, with intervals for the same scene flown again.
+
+    If frames are not known, or too few to tell, the intervals are for these frames, as their `scope` says. alpha is
+    of sampled cells, NaN without them; psa and vss are of voxels, at OP >= 2 and OP >= 3; the last two are undefined
+    without ground truth.
+    """
+
+    alpha: Interval
+    psa: Interval
+    vss: Interval
+    accuracy: Interval
+    wrong_of_consistent: Interval
+
+
+@dataclass(frozen=True)
+class EntropyParts:
+    """Mean entropy of the belief, and its parts within each frame and between them."""
+
+    entropy: Interval
+    within: Interval
+    between: Interval
+
+
+@dataclass(frozen=True)
+class StratumStatistics:
+    """Means over a stratum of OP."""
+
+    name: str
+    voxels: int
+    means: MeasureMeans = field(metadata=INLINE)
+    psa: float
+    sbd_null: float
+    sbd_excess: float
+    entropy_within: float
+    entropy_between: float
+
+
+ORDER_KNOWN = 0.25
+"""Share of the locations seen twice from which on SBD less that in random order is reported."""
+
+
+@dataclass(frozen=True)
+class MapStatistics:
+    """All statistics of one map."""
+
+    schema: int
+    name: str
+    seed: int
+    K: int
+    voxel_size: float
+    voxels: int
+    observations: int
+    repeated: Repeated
+    cubes: int
+    verdict: StabilityVerdict
+    agreement: FrameAgreement
+    flipping: Flipping | None
+    headline: HeadlineStatistics
+    cells: CellAgreement | None
+    correlogram: Correlogram | None
+    drift: DriftStatistics
+    uncertainty: EntropyParts
+    geometry: Losses | None
+    correctness: CorrectnessStatistics | None
+    strata: tuple[StratumStatistics, ...]
+    outlying_frames: OutlyingFrames | None = None
+    ranges: RangeAgreement | None = None
+
+    def __repr__(self) -> str:
+        return f"<MapStatistics '{self.name}': {self.stated}>"
+
+    @property
+    def stated(self) -> str:
+        """The verdict and the number that it rests on: 'stable (p .98), alpha .93 (.92 to .95)'."""
+        return f"{self.verdict}, alpha {self.headline.alpha.text()}"
+
+    @property
+    def agreeing(self) -> float:
+        """The share of the spots at which two views see the same class; NaN without sampled cells."""
+        return math.nan if self.cells is None else self.cells.agreeing(self.headline.alpha.value)
+
+    @property
+    def order_known(self) -> bool:
+        """Return whether a random order of the observations was drawn for a quarter of the locations.
+
+        For soft scores without a log that is so for a few of them only, which are no random sample.
+        """
+        return self.drift.voxels >= ORDER_KNOWN * self.repeated.voxels
+
+    @property
+    def sections(self) -> int:
+        """Return how many of the sections that need more than the map could be computed."""
+        return sum(section is not None for section in (self.geometry, self.correctness))

@@ -1,0 +1,159 @@
+"""Make the tables of the same data with other settings: sweeps, other voxel sizes, soft scores reduced to labels."""
+
+from __future__ import annotations
+
+import math
+
+from semstab.data.measures import VSS, measures
+from semstab.data.records import Record, Result
+from semstab.report.means import (
+    ENOUGH,
+    Level,
+    Sweep,
+    by_model,
+    complete_scenes,
+    levels,
+    over_all,
+    over_recurrent,
+    swept,
+)
+from semstab.report.tables.stability import SBD_OVER, of_measures
+from semstab.report.tables.table import Column, Group, Row, Table
+from semstab.statistics.agreement import ALPHA, PSA, VOXEL_ALPHA
+
+# The sensitivity sweeps: means of all voxels and of the recurrent ones side by side, with their share.
+
+
+def sensitivity(result: Result) -> list[Table]:
+    """Return one table for each sweep (paper, Sensitivity to World-Space Association), and one with agreement."""
+    pairs = [(_table(result, sweep), _agreement_table(result, sweep)) for sweep in swept(result)]
+    return [table for pair in pairs for table in pair if table is not None]
+
+
+def _table(result: Result, sweep: Sweep) -> Table:
+    columns = (
+        Column("value", sweep.header),
+        Column("repeats", "Repeats", 0),
+        Column("voxels", "Voxels", 0),
+        Column("mean_op", "Mean OP", 2),
+        Column("recurrent_percent", "OP>=3 (%)", 2),
+        *of_measures(compared=True, over="All voxels"),
+        *of_measures(compared=True, prefix="recurrent_", over="OP>=3"),
+        Column("note", "Note"),
+    )
+    models = [name for name in result.models if complete_scenes(result, sweep.name, name)]
+    groups = tuple(
+        Group(name, tuple(_sweep_row(sweep, level) for level in levels(result, sweep.name, name))) for name in models
+    )
+    scenes = dict.fromkeys(scene for name in models for scene in complete_scenes(result, sweep.name, name))
+    caption = (
+        f"The means are pooled: they run over the voxels of all scenes together ({', '.join(scenes)}); ± is the"
+        f" standard deviation over the repeats, each with a seed of its own. {SBD_OVER} The note 'few' marks fewer than"
+        f" {ENOUGH:,} recurrent voxels."
+    )
+    return Table(f"sensitivity_{sweep.name}", f"Sensitivity to {sweep.title}", caption, columns, groups)
+
+
+def _sweep_row(sweep: Sweep, level: Level) -> Row:
+    spread = level.spread if len(level.repeats) > 1 else level.mean
+    return (
+        sweep.text(level.value),
+        len(level.repeats),
+        level.mean(lambda p: p.voxels),
+        level.mean(lambda p: p.mean_op),
+        spread(lambda p: 100 * p.recurrent.share),
+        *(spread(over_all(measure)) for measure in measures()),
+        *(spread(over_recurrent(measure)) for measure in measures()),
+        "" if level.mean(lambda p: p.recurrent.voxels) >= ENOUGH else "few",
+    )
+
+
+def _agreement_table(result: Result, sweep: Sweep) -> Table | None:
+    """Return the table of agreement; None where the units have no statistics."""
+    columns = (
+        Column("value", sweep.header),
+        Column("mean_op", "Mean OP", 2),
+        Column("vss", "VSS, all voxels", VSS.digits[1], VSS.better),
+        *(Column.of(quantity, compared=True) for quantity in (PSA, ALPHA)),
+        Column("sbd_excess", "SBD excess", 4, signed=True),
+    )
+    by_model = {name: levels(result, sweep.name, name) for name in result.models}
+    known = {name: rows for name, rows in by_model.items() if any(level.assessed for level in rows)}
+    if not known:
+        return None
+    groups = tuple(Group(name, tuple(_agreement_row(sweep, level) for level in rows)) for name, rows in known.items())
+    caption = (
+        "VSS is pooled over the voxels of all scenes. The other numbers are of the voxels seen twice or more, and are"
+        " macro means of the scenes. PSA is the share of pairs of frames that agree about a voxel. Alpha is the"
+        " agreement of two views at the same spot beyond chance. SBD excess is SBD less that of the same observations"
+        " in random order (bits), over the voxels where that is known. These three do not depend on how often a voxel"
+        " was seen, but the set of voxels seen twice changes along the sweep. ± is the standard deviation over the"
+        " repeats."
+    )
+    title = f"Agreement against {sweep.title}"
+    return Table(f"sensitivity_agreement_{sweep.name}", title, caption, columns, groups)
+
+
+def _agreement_row(sweep: Sweep, level: Level) -> Row:
+    spread = level.spread if len(level.repeats) > 1 else level.mean
+    return (
+        sweep.text(level.value),
+        level.mean(lambda p: p.mean_op),
+        spread(over_all(VSS)),
+        spread(lambda p: p.psa.value),
+        spread(lambda p: p.alpha.value),
+        spread(lambda p: p.excess_drift),
+    )
+
+
+# The same map with other settings: soft scores reduced to labels, other voxel sizes.
+
+
+def reduced(result: Result) -> list[Table]:
+    """Return numbers that compare hard labels with soft scores, which are reduced to each pixel's likeliest class."""
+    records = result.select()
+    if len({record.summary.reduced is None for record in records}) < 2:
+        return []
+    columns = (
+        Column("scene", "Scene"),
+        Column("vss", VSS.title, VSS.digits[0], VSS.better),
+        Column("recurrent_vss", f"{VSS.title}, OP>=3", VSS.digits[0], VSS.better),
+        Column.of(VOXEL_ALPHA),
+    )
+    groups = tuple(
+        Group(name, tuple(_reduced_row(record) for record in rows)) for name, rows in by_model(records).items()
+    )
+    caption = (
+        "VSS, entropy and voxel alpha do not compare hard labels with soft scores, because scores spread their"
+        " evidence; alpha is of the likeliest classes. Here scores are reduced to each pixel's likeliest class; labels"
+        " are unchanged."
+    )
+    return [Table("reduced", "Labels and reduced scores", caption, columns, groups)]
+
+
+def _reduced_row(record: Record) -> Row:
+    reduced, table, statistics = record.summary.reduced, record.summary.table, record.summary.statistics
+    if reduced is not None:
+        return record.unit.scene, reduced.vss, reduced.recurrent_vss, reduced.voxel_alpha
+    alpha = math.nan if statistics is None else statistics.agreement.voxel_alpha.value
+    return record.unit.scene, table[VSS], table.recurrent[VSS], alpha
+
+
+def voxel_sizes(result: Result) -> list[Table]:
+    """Return alpha at half, once and twice the voxel size, from some frames."""
+    groups = tuple(
+        Group(name, rows)
+        for name, records in by_model(result.select()).items()
+        if (
+            rows := tuple(
+                (r.unit.scene, s.voxel_size, s.frames, s.voxel_alpha) for r in records for s in r.summary.sizes
+            )
+        )
+    )
+    columns = (Column("scene", "Scene"), Column("voxel_size", "Voxel (m)", 4), Column("frames", "Frames", 0))
+    caption = "The table shows Krippendorff's alpha of the same frames in voxels of other sizes."
+    return (
+        [Table("voxel_sizes", "Other voxel sizes", caption, (*columns, Column.of(VOXEL_ALPHA)), groups)]
+        if groups
+        else []
+    )

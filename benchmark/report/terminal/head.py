@@ -1,0 +1,52 @@
+"""The data that a run fused: frames, classes, size of voxels, geometry, and for which data intervals are."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+
+from semstab.core.types import THESE_FRAMES
+from semstab.data.records import Result
+from semstab.data.results import UnitSummary
+from semstab.report.narrative import noted
+from semstab.report.terminal.layout import wrapped
+from semstab.statistics.intervals import LEAST_FRAMES
+
+
+def head_lines(name: str, result: Result, runs: Sequence[UnitSummary], width: int) -> Iterator[str]:
+    """Yield the data that was fused: '40 frames, 7 classes, 0.2 m voxels', whether depth and poses agree, and notes."""
+    first = runs[0]
+    frames = sorted({run.frames for run in runs})
+    counts = f"{frames[0]} to {frames[-1]}" if len(frames) > 1 else f"{frames[0]}"
+    cells = [run.statistics.cells for run in runs if run.statistics is not None]
+    views = min((each.views for each in cells if each is not None and each.views < each.frames), default=None)
+    seen = "" if views is None else f" of {views} distinct views"
+    chosen = " (chosen)" if any(advice.chosen for advice in result.advice.values()) else ""
+    classes = " and ".join(map(str, sorted({run.table.K for run in runs})))
+    what = f"{counts} frames{seen}, {classes} classes, {_metres(first.table.voxel_size)} voxels{chosen}"
+    beside = "    ".join(filter(None, (_geometry(result), _scope(runs))))
+    line = f"{name}    {what}    {beside}".rstrip()
+    yield line if len(line) <= width else f"{name}    {what}\n  {beside}".rstrip()
+    for text in noted(result):
+        yield from wrapped(f"note: {text}")
+    yield ""
+
+
+def _geometry(result: Result) -> str:
+    scenes = result.manifest.get("geometry")
+    states = [state for state in scenes.values() if isinstance(state, Mapping)] if isinstance(scenes, Mapping) else []
+    if not states:
+        return ""
+    sound = all(state.get("state") == "sound" for state in states)
+    return "geometry ok" if sound else "geometry unclear: semstab-bench check"
+
+
+def _scope(runs: Sequence[UnitSummary]) -> str:
+    """Return a note where intervals and verdicts are for the frames of a run alone, as they are too few for more."""
+    alphas = [run.statistics.headline.alpha for run in runs if run.statistics is not None]
+    few = [alpha for alpha in alphas if alpha.scope == THESE_FRAMES and alpha.frames]
+    of = "" if len(few) == len(alphas) else f" in {len(few)} of {len(alphas)} rows"
+    return f"intervals for these frames alone{of}: fewer than {LEAST_FRAMES} views" if few else ""
+
+
+def _metres(size: float) -> str:
+    return f"{1000 * size:g} mm" if size < 0.01 else f"{size:g} m"

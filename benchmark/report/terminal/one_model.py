@@ -1,0 +1,93 @@
+"""The verdict on one model on one scene: level, alpha, accuracy, shares of the map, flicker, the paper's means."""
+
+from __future__ import annotations
+
+import math
+import textwrap
+from collections.abc import Iterator
+
+from semstab.data.measures import measures
+from semstab.data.records import Record, Result
+from semstab.data.results import UnitSummary
+from semstab.data.statistics import Estimate, short
+from semstab.metrics import CATEGORIES
+from semstab.report.means import ENOUGH
+from semstab.report.narrative import nearly_all
+from semstab.report.terminal.disagreement import class_lines, outlying_lines
+from semstab.report.terminal.head import head_lines
+from semstab.report.terminal.layout import LEVELS, WIDTH, percent, percents, wrapped
+from semstab.statistics.verdict import DANGEROUS, DECIDED, LIMITS, level_probabilities
+
+
+def one_model(result: Result, record: Record, width: int) -> Iterator[str]:
+    """Yield the verdict, the shares of the map, flicker, the classes that disagree most, and the paper's means."""
+    run, statistics = record.summary, record.summary.statistics
+    yield from head_lines(f"{run.unit.scene} / {run.unit.model}", result, [run], width)
+    if statistics is not None:
+        yield from _verdict(run)
+    recurrent, shares = run.table.recurrent, run.table.categories
+    if shares:
+        low, drifting, uncertain, stable = percents([shares[name] for name in CATEGORIES])
+        yield f"  map  {stable} stable  {uncertain} uncertain  {drifting} drifting  {low} seen less than 3 times"
+    yield from _flicker(record)
+    yield ""
+    yield from class_lines([record], width)
+    yield from outlying_lines([record])
+    if recurrent.voxels >= ENOUGH:
+        means = (f"{m.word} {short(recurrent[m], digits=m.digits[0])} {m.unit}".rstrip() for m in measures())
+        yield f"  paper (OP>=3)  {'  '.join(means)}"
+    else:
+        yield f"  paper (OP>=3)  -, {recurrent.voxels:,} voxels are too few (at least {ENOUGH:,})"
+    yield ""
+
+
+def _verdict(run: UnitSummary) -> Iterator[str]:
+    """Yield the level, the number that it rests on, and the meaning of that number."""
+    statistics = run.statistics
+    assert statistics is not None
+    level, alpha = statistics.verdict.level.upper(), statistics.headline.alpha
+    if statistics.verdict.level == "no verdict":
+        yield from wrapped(statistics.verdict.line)
+        return
+    yield f"  {level} {statistics.verdict.stated}".rstrip() + f"    alpha {short(alpha.value)}{_interval(alpha)}"
+    wrong = statistics.headline.wrong_of_consistent
+    told = f"{percent(wrong.value)}{_interval(wrong, 100)} of the consistent locations are wrong"
+    if statistics.verdict.level == "misleading":
+        yield from textwrap.wrap(
+            f"{told}, more than {percent(DANGEROUS)}: do not take agreement for truth",
+            WIDTH,
+            initial_indent="  ",
+            subsequent_indent="  ",
+        )
+    elif statistics.verdict.level == "uninformative" and statistics.cells is not None:
+        share, name = nearly_all(statistics.cells.largest_share), statistics.cells.largest_class
+        yield f"  {share} of the observations are {name}: agreement does not assess such a map"
+    else:
+        yield LEVELS
+    silent = 0.0 if statistics.cells is None else 1 - statistics.cells.labelled
+    if statistics.verdict.level == "usable" and alpha.value >= LIMITS.stable and silent > 1 - LIMITS.labelled:
+        yield f"  {percent(silent)} of the locations have no label in most frames: such a map is usable at most"
+    if statistics.verdict.level == "undecided":
+        levels = ", ".join(f"{name} {short(p)}" for name, p in level_probabilities(alpha).items())
+        yield f"  no level has p {short(DECIDED)} ({levels}): more frames decide it"
+    yield f"  two views see the same class at {percent(statistics.agreeing)} of the spots"
+    if not math.isnan(wrong.value) and statistics.verdict.level != "misleading":
+        yield f"  {told}"
+    if statistics.ranges is not None and statistics.ranges.is_told:
+        yield f"  {statistics.ranges.text}"
+    yield ""
+
+
+def _flicker(record: Record) -> Iterator[str]:
+    compensated = record.image_space.compensated_flicker_percent
+    if not math.isnan(compensated):
+        what, _, often = record.image_space.changing.partition(" ")
+        yield f"  flicker  {compensated:.1f} % of the {what} change class {often} (motion removed)"
+
+
+def _interval(estimate: Estimate, scale: float = 1.0) -> str:
+    if math.isnan(estimate.low) or math.isnan(estimate.high):
+        return ""
+    if scale == 1.0:
+        return f" ({estimate.of} {short(estimate.low)} to {short(estimate.high)})"
+    return f" ({scale * estimate.low:z.0f} to {scale * estimate.high:z.0f} %)"

@@ -1,0 +1,98 @@
+"""The columns of cluster sums: which sums there are, and where each one stands."""
+
+from __future__ import annotations
+
+import functools
+from collections.abc import Mapping
+from types import MappingProxyType
+from typing import NamedTuple
+
+import numpy as np
+
+MOST_CLASSES = 64
+"""Sums by class are stored up to so many classes."""
+
+BINS = 15
+"""Bins of the reliability diagram; bin b has voxels whose largest belief lies in (b / BINS, (b + 1) / BINS]."""
+
+PLAIN = (
+    "voxels", "psa", "observations", "agreeing", "own", "twice", "twice_agreeing", "recurrent", "vss", "entropy",
+)  # fmt: skip
+BY_CLASS_ALONE = ("class_apart", "class_own")
+DRIFT = ("sbd_excess", "sbd_known")
+WITH_TRUTH = ("known", "right", "observed", "observed_right", "consistent", "consistent_wrong")
+BY_TRUE_CLASS = ("class_known", "class_right", "class_predicted")
+WITHOUT_FRAMES = (*DRIFT, "calibrated", "gap")
+"""Sums that belong to no frame: they stand in rows whose frame is -1, as do sums of the register of measures."""
+
+
+def of_measure(key: str) -> tuple[str, str]:
+    """Return the names of the sums of a measure of the register: its total, and over how many voxels."""
+    return f"{key}_sum", f"{key}_count"
+
+
+@functools.lru_cache(maxsize=16)
+def layout(K: int, *, truth: bool, measured: tuple[str, ...] = ()) -> Mapping[str, slice]:
+    """Return the columns of the sums by name: K columns for sums by class, one for each bin for `gap`, else one.
+
+    Columns of the measures with the keys `measured` come last.
+    """
+    by_class = K <= MOST_CLASSES
+    widths = [(name, 1) for name in PLAIN] + [("evidence", K)]
+    widths += [(name, K) for name in BY_CLASS_ALONE] if by_class else []
+    widths += [(name, 1) for name in DRIFT]
+    if truth:
+        widths += [(name, 1) for name in WITH_TRUTH]
+        widths += [(name, K) for name in BY_TRUE_CLASS] if by_class else []
+        widths += [("calibrated", 1), ("gap", BINS)]
+    widths += [(name, 1) for key in measured for name in of_measure(key)]
+    ends = np.cumsum([width for _, width in widths])
+    slices = {name: slice(int(end) - width, int(end)) for (name, width), end in zip(widths, ends, strict=True)}
+    return MappingProxyType(slices)
+
+
+class FirstColumns(NamedTuple):
+    """The first column of each sum over observations, for compiled loops; -1 where the sums have none of that name."""
+
+    voxels: int
+    psa: int
+    observations: int
+    agreeing: int
+    own: int
+    twice: int
+    twice_agreeing: int
+    recurrent: int
+    vss: int
+    entropy: int
+    evidence: int
+    class_apart: int
+    class_own: int
+    known: int
+    right: int
+    observed: int
+    observed_right: int
+    consistent: int
+    consistent_wrong: int
+    class_known: int
+    class_right: int
+    class_predicted: int
+
+    @classmethod
+    def of(cls, K: int, *, truth: bool) -> FirstColumns:
+        """Return the first columns of a layout with K classes."""
+        columns = layout(K, truth=truth)
+        return cls(*(columns[name].start if name in columns else -1 for name in cls._fields))
+
+
+def width(K: int, *, truth: bool, measured: tuple[str, ...] = ()) -> int:
+    """Return how many columns there are."""
+    return max(int(part.stop) for part in layout(K, truth=truth, measured=measured).values())
+
+
+def column_names(K: int, *, truth: bool, measured: tuple[str, ...] = ()) -> list[str]:
+    """Return the name of each column in a file: NAME, or NAME_k for class or bin k."""
+    return [
+        f"{name}_{k}" if where.stop - where.start > 1 else name
+        for name, where in layout(K, truth=truth, measured=measured).items()
+        for k in range(where.stop - where.start)
+    ]

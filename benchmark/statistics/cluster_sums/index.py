@@ -1,0 +1,100 @@
+"""Clusters of observations: cubes of space, and groups of frames."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+from semstab.core.types import Float64, Int32, Int64, Mask
+
+MOST_CELLS, MOST_GROUPS = 256, 64
+"""Largest number of cubes of space, and of groups of frames."""
+
+MOST_SUMS = 2**24
+"""Most numbers in the sums: with thousands of classes there are fewer groups of frames."""
+
+
+def most_groups(K: int) -> int:
+    """Return the largest number of groups of frames with K classes."""
+    return max(1, min(MOST_GROUPS, MOST_SUMS // (MOST_CELLS * K)))
+
+
+@dataclass(frozen=True, eq=False)
+class ClusterIndex:
+    """The cube of space and the group of frames of rows (m,), some of which belong to no frame.
+
+    Attributes:
+        cubes: (G, 3) sorted, of an edge in metres; row (m,) the cube of each row.
+        frames: (F,) the groups of frames, sorted, of so many each on average (per_group, 0 where they are unknown).
+        known: (r,) the rows that belong to a group, column (r,) that group.
+    """
+
+    cubes: Int64
+    row: Int64
+    frames: Int64
+    known: Int64
+    column: Int64
+    edge: float
+    per_group: float
+
+    @classmethod
+    def of(
+        cls, cell: npt.NDArray[np.integer], frame: npt.NDArray[np.integer] | None, edge: float, per_group: float = 0
+    ) -> ClusterIndex:
+        """Index rows by cube (m, 3) and group of frames (m,), -1 where unknown; without frames all are of one."""
+        cubes, row = distinct_rows(cell)
+        if frame is None:
+            return cls(cubes, row, np.array([-1]), np.arange(len(row)), np.zeros(len(row), np.int64), edge, 0)
+        known = np.flatnonzero((frame >= 0) | (per_group == 0))
+        frames, column = np.unique(frame[known].astype(np.int64), return_inverse=True)
+        return cls(cubes, row, frames, known, column, edge, per_group)
+
+    def by_cube(self, values: Float64) -> Float64:
+        """Return the sums (G,) of values (m,)."""
+        return np.bincount(self.row, weights=values, minlength=len(self.cubes)).astype(np.float64, copy=False)
+
+    def by_both(self, values: Float64) -> Float64:
+        """Return the sums (G, F) of values (m,)."""
+        shape = len(self.cubes), len(self.frames)
+        cell = self.row[self.known] * shape[1] + self.column
+        sums: Float64 = np.bincount(cell, weights=values[self.known], minlength=shape[0] * shape[1]).astype(np.float64)
+        return sums.reshape(shape)
+
+
+def distinct_rows(rows: npt.NDArray[np.integer]) -> tuple[Int64, Int64]:
+    """Return each row of whole numbers (n, C) once, ascending, and which of them each is: np.unique by one number."""
+    low = rows.min(axis=0, initial=0).astype(np.int64)
+    size = [int(n) for n in rows.max(axis=0, initial=0) - low + 1]
+    if math.prod(size) >= 2**63:
+        distinct, of = np.unique(rows, axis=0, return_inverse=True)
+        return distinct.astype(np.int64), of.ravel()
+    key = np.zeros(len(rows), np.int64)
+    for column, least, many in zip(rows.T, low, size, strict=True):
+        key = key * many + (column - least)
+    _, first, of = np.unique(key, return_index=True, return_inverse=True)
+    return rows[first].astype(np.int64), of
+
+
+def cubes_of(
+    index: tuple[Int32, Int32, Int32], voxel_size: float, edge: float | None = None, counted: Mask | None = None
+) -> tuple[Int32, Int32, float]:
+    """Return the cubes (G, 3) that hold voxels of index columns (n,), the cube (n,) of each voxel, and their edge.
+
+    A cube is floor(voxel centre / edge). Only the voxels `counted` (n,) count, the others are in -1. The edge, unless
+    it is given, is the smallest power of 2 metres, no smaller than a voxel, that leaves at most MOST_CELLS cubes.
+    """
+    rows = np.arange(len(index[0])) if counted is None else np.flatnonzero(counted)
+    doubled = edge is None
+    edge = 2.0 ** math.ceil(math.log2(voxel_size) - 1e-9) if edge is None else edge
+    scale = voxel_size / edge
+    cell = np.stack([np.floor((axis[rows] + 0.5) * scale) for axis in index], axis=1).astype(np.int64)
+    cubes, number = distinct_rows(cell)
+    while doubled and len(cubes) > MOST_CELLS:
+        cubes, joined = distinct_rows(cubes // 2)
+        number, edge = joined[number], 2 * edge
+    of = np.full(len(index[0]), -1, np.int32)
+    of[rows] = number
+    return cubes.astype(np.int32), of, edge

@@ -1,0 +1,265 @@
+"""Sums by frame and cube of space, their file, and how they are coarsened to fit others."""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+import json
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from semstab.core import arrays as arrow
+from semstab.core.files import atomic_path, parse_json
+from semstab.core.json_form import from_json
+from semstab.core.types import Float64, Int32, Int64
+from semstab.data import earlier, parquet
+from semstab.data.measures import measures
+from semstab.errors import DataError
+from semstab.statistics.cluster_sums.columns import column_names, layout, of_measure, width
+from semstab.statistics.cluster_sums.index import ClusterIndex, distinct_rows
+
+SCHEMA = 5
+WITHOUT_CELLS = 2, 3
+"""Versions of files whose samples had no cells: only the sums of their maps are read."""
+
+
+@dataclass(frozen=True, eq=False)
+class ClusterSums:
+    """Sums over the observations in voxels with OP >= 2, a row for each cube of space and group of frames.
+
+    Attributes:
+        cell: (m, 3) int32 cube: floor(voxel centre / edge), so that the cubes of all maps of a scene are the
+            same.
+        frame: (m,) int32 group: frame index // step; -1 where the frames are unknown, without a log, and
+            for sums that belong to none (`WITHOUT_FRAMES`).
+        columns: (m, C) float64, see `layout`. A location counts 1 / T for each of its T frames in `voxels`, 1 in
+            `observations`; its pairwise agreement is shared out among them in `psa` and `agreeing`.
+        edge: Metres, a power of 2; that of cells is their own, so that alpha and its interval are the same whatever the
+            voxels of the map.
+        step: Frames of a group, a power of 2; 0 where they are unknown.
+        fused: Number of frames that they come from.
+        truth: True if sums of ground truth are included.
+        measured: Keys of the measures of the register that have sums over the voxels.
+        fine, coarse: The same of sampled cells, which are units instead of voxels and views instead of frames, and of
+            cells twice as wide, where there are `CellObservations`.
+    """
+
+    cell: Int32
+    frame: Int32
+    columns: Float64
+    edge: float
+    step: int
+    voxel_size: float
+    K: int
+    classes: tuple[str, ...] = ()
+    truth: bool = False
+    fused: int = 0
+    measured: tuple[str, ...] = ()
+    fine: ClusterSums | None = None
+    coarse: ClusterSums | None = None
+
+    def __getitem__(self, name: str) -> Float64:
+        """Return sums (m, 1), or (m, K) by class, of that name."""
+        return self.columns[:, self.layout[name]]
+
+    @property
+    def layout(self) -> Mapping[str, slice]:
+        """The columns for each name."""
+        return layout(self.K, truth=self.truth, measured=self.measured)
+
+    def of(self, names: tuple[str, ...]) -> Float64:
+        """Return sums (m, C) of several names side by side."""
+        return np.concatenate([self[name] for name in names], axis=1)
+
+    @functools.cached_property
+    def index(self) -> ClusterIndex:
+        """The cube and the group of frames of each row."""
+        groups = len(np.unique(self.frame[self.frame >= 0]))
+        per_group = self.fused / groups if self.fused and groups and self.step else self.step
+        return ClusterIndex.of(self.cell, self.frame, self.edge, per_group)
+
+    @property
+    def frames(self) -> int:
+        """Return how many groups of frames there are; 0 where they are unknown."""
+        return len(self.index.frames) if self.step else 0
+
+    @property
+    def frame_count(self) -> int:
+        """Return how many frames they come from, about; 0 where they are unknown."""
+        return round(self.frames * self.index.per_group)
+
+    @property
+    def cells(self) -> int:
+        """Return how many cubes hold a voxel that was seen twice."""
+        return len(self.index.cubes)
+
+    def coarsened(self, edge: float, step: int) -> ClusterSums:
+        """Return the sums of larger cubes, or groups of frames; step 0 forgets the frames of the map, not of its cells.
+
+        Cubes of the cells are then at least as large as cubes of the map.
+        """
+        cells = (part and part.coarsened(max(edge, part.edge), part.step) for part in (self.fine, self.coarse))
+        fine, coarse = cells
+        return dataclasses.replace(self._map_coarsened(edge, step), fine=fine, coarse=coarse)
+
+    def _map_coarsened(self, edge: float, step: int) -> ClusterSums:
+        """Return the sums of the map in larger cubes or groups of frames, with the sums of cells unchanged."""
+        cell = _joined(self.cell, edge / self.edge)
+        known = step and self.step
+        frame = _joined(self.frame, step // self.step) if known else np.full(len(cell), -1)
+        key = np.concatenate([cell, frame[:, None]], axis=1)
+        rows, of = distinct_rows(key)
+        columns = np.zeros((len(rows), self.columns.shape[1]))
+        np.add.at(columns, of, self.columns)
+        return dataclasses.replace(
+            self,
+            cell=rows[:, :3].astype(np.int32),
+            frame=rows[:, 3].astype(np.int32),
+            columns=columns,
+            edge=edge,
+            step=step if known else 0,
+        )
+
+    def without_truth(self) -> ClusterSums:
+        """Return the sums without the columns of ground truth."""
+        names = layout(self.K, truth=False, measured=self.measured)
+        return dataclasses.replace(self, columns=self.of(tuple(names)), truth=False)
+
+    def save(self, path: str | Path, *, single: bool = False) -> None:
+        """Write Parquet, atomically; in single precision, which takes half the bytes and keeps seven digits."""
+        import pyarrow as pa
+        import pyarrow.parquet as pq
+
+        parts = [part for part in (self, self.fine, self.coarse) if part is not None]
+        about = {name: getattr(self, name) for name in ("K", "classes", "truth")}
+        about |= {name: [getattr(part, name) for part in parts] for name in ("edge", "step", "voxel_size", "fused")}
+        lengths = [len(part.frame) for part in parts]
+        cell, frame = np.concatenate([part.cell for part in parts]), np.concatenate([part.frame for part in parts])
+        columns = np.zeros((sum(lengths), self.columns.shape[1]))
+        for part, rows in zip(parts, np.split(np.arange(len(columns)), np.cumsum(lengths)[:-1]), strict=True):
+            columns[rows, : part.columns.shape[1]] = part.columns
+        names = column_names(self.K, truth=self.truth, measured=self.measured)
+        stored = columns.astype(np.float32) if single else columns
+        arrays = [np.repeat(np.arange(len(parts)), lengths), *cell.T, frame, *stored.T]
+        content = pa.table({name: arrow.column(array) for name, array in zip([*KEYS, *names], arrays, strict=True)})
+        text = json.dumps({"schema": SCHEMA, "kind": "ClusterSums", **about})
+        with atomic_path(path) as temporary:
+            packed: dict[str, Any] = {"use_dictionary": False, "use_byte_stream_split": names} if single else {}
+            content = content.replace_schema_metadata({"semstab": text})
+            pq.write_table(content, temporary, compression="zstd", compression_level=19 if single else None, **packed)
+
+    @classmethod
+    def load(cls, path: str | Path) -> ClusterSums:
+        """Read a file that `save` wrote; sums that it lacks are NaN, and columns of other names are left out.
+
+        Raises:
+            DataError: If the file is missing, damaged or of another kind.
+        """
+        with parquet.reading(path, "a file of cluster sums"):
+            with parquet.opened(path) as file:
+                content = file.read()
+            about = parse_json((content.schema.metadata or {})[b"semstab"])
+            kind, version = about.pop("kind"), about.pop("schema")
+            old = (kind, version) in (("InfluenceSums", each) for each in WITHOUT_CELLS)
+            if not old and (kind, version) != ("ClusterSums", SCHEMA):
+                raise DataError("it is of another kind or version")
+            if old:
+                about |= {name: [about.get(name, 0)] for name in ("edge", "step", "voxel_size", "fused")}
+            meta = from_json(SumsMeta, about, path)
+            part, *keys = (_key(arrow.values_of(content.column(name)), name) for name in KEYS)
+            names = [earlier.SUMS.get(name, name) for name in content.column_names] if old else content.column_names
+            if len(names) < meta.K:
+                raise DataError(f"{len(names) - len(KEYS)} columns of sums for {meta.K} classes")
+            stored = dict(zip(names, content.columns, strict=True))
+            measured = tuple(each.key for each in measures() if stored.keys() >= {*of_measure(each.key)})
+            columns = np.full((len(content), width(meta.K, truth=meta.truth, measured=measured)), np.nan)
+            for k, name in enumerate(column_names(meta.K, truth=meta.truth, measured=measured)):
+                if name in stored:
+                    columns[:, k] = arrow.values_of(stored[name])
+            if np.any(np.abs(columns) > LARGEST**2):
+                raise DataError("a sum is larger than any map can have")
+            if not all(0 <= frames <= LARGEST for frames in (*meta.step, *meta.fused)):
+                raise DataError("a number of frames is one that no map can have")
+            parts: list[ClusterSums] = []
+            for number, (edge, step, voxel_size, fused) in enumerate(
+                zip(meta.edge, meta.step, meta.voxel_size, meta.fused, strict=True)
+            ):
+                rows, truth, measures_of = part == number, meta.truth and not number, () if number else measured
+                sums = columns[rows, : width(meta.K, truth=truth, measured=measures_of)]
+                cell, frame = np.stack([key[rows] for key in keys[:3]], axis=1), keys[3][rows]
+                where = cell.astype(np.int32), frame.astype(np.int32), sums, edge, step
+                parts.append(cls(*where, voxel_size, meta.K, meta.classes, truth, fused, measures_of))
+        whole, *cells = parts
+        return dataclasses.replace(whole, fine=cells[0], coarse=cells[1]) if cells else whole
+
+
+KEYS = ("part", "ix", "iy", "iz", "frame")
+"""The columns of the file before the sums; part 0 is the map, 1 the fine cells, 2 the coarse ones."""
+
+
+LARGEST = 2.0**30
+"""Largest edge in metres and group of frames; its square is the largest sum. Larger numbers are damage."""
+
+
+@dataclass(frozen=True)
+class SumsMeta:
+    """Metadata of a file of sums: edge, step, voxel_size and fused of each part; see `ClusterSums`."""
+
+    K: int
+    classes: tuple[str, ...]
+    truth: bool
+    edge: tuple[float, ...]
+    step: tuple[int, ...]
+    voxel_size: tuple[float, ...]
+    fused: tuple[int, ...]
+
+    def __post_init__(self) -> None:
+        parts = {len(each) for each in (self.edge, self.step, self.voxel_size, self.fused)}
+        if not (parts <= {1} or parts <= {3}):
+            raise DataError("sums of other parts than a map, fine and coarse cells")
+        sizes = all(0 < size < math.inf for size in self.voxel_size)
+        if not (sizes and self.K > 0 and len(self.classes) in (0, self.K)):
+            raise DataError(f"{self.K} classes, {len(self.classes)} names, voxels of {self.voxel_size[0]:g} m")
+        for edge in self.edge:
+            if not (0 < edge <= LARGEST and math.frexp(edge)[0] == 0.5):
+                raise DataError(f"the edge of cubes is {edge:g} m, which is not a power of 2 in range")
+        for step in self.step:
+            if not 0 <= step <= LARGEST or step & (step - 1):
+                raise DataError(f"groups have {step} frames, which is not a power of 2 in range")
+
+
+def _joined(index: Int32, times: float) -> Int64:
+    """Return the larger cubes, or groups of frames, that join so many of these; -1 of frames stays."""
+    wide: Int64 = index.astype(np.int64) // round(min(times, 2.0**40))
+    return wide
+
+
+def _key(values: npt.NDArray[Any], name: str) -> npt.NDArray[Any]:
+    """Return a column of whole numbers that fit; raises DataError where they do not."""
+    if values.dtype.kind not in "iu" or not np.array_equal(values, values.astype(np.int32)):
+        raise DataError(f"a number of column '{name}' is out of range")
+    return values
+
+
+def aligned(*parts: ClusterSums) -> tuple[ClusterSums, ...]:
+    """Return the sums, of maps and of their cells, at the finest cubes and groups of frames that all of them have.
+
+    Raises:
+        DataError: If they have different columns.
+    """
+    if len({(part.K, part.classes, part.truth) for part in parts}) > 1:
+        raise DataError("the sums do not fit together: their maps differ in classes, or only some have ground truth")
+    edge, steps = max(part.edge for part in parts), [part.step for part in parts]
+    step = max(steps) if all(steps) else 0
+    same = [part if (part.edge, part.step) == (edge, step) else part._map_coarsened(edge, step) for part in parts]
+    fine, coarse = [part.fine for part in same if part.fine], [part.coarse for part in same if part.coarse]
+    if len(fine) < len(same) or len(coarse) < len(same):
+        return tuple(same)
+    cells = zip(same, aligned(*fine), aligned(*coarse), strict=True)
+    return tuple(dataclasses.replace(part, fine=one, coarse=two) for part, one, two in cells)
