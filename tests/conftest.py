@@ -7,6 +7,8 @@ import time
 
 import pytest
 
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # read by numpy; the workers share the processors
+
 from semstab.core.process import configure_process
 from semstab.report.figures import style
 

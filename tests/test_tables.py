@@ -26,8 +26,8 @@ from semstab.data.measures import SBD, VSS
 from semstab.data.records import ImageSpace, RegionFlicker, Result
 from semstab.metrics import entropy, op, sbd, vss
 from semstab.report.means import ENOUGH, Spread, complete_scenes, describe, levels, pooled, swept
-from semstab.report.tables import tables, write_tables
-from semstab.report.tables.table import Column, Group, Table, to_csv, to_json, to_latex, to_markdown, to_terminal
+from semstab.report.tables import Column, Group, Table, tables, to_csv, to_json, to_latex, to_markdown, write_tables
+from semstab.report.tables.table import to_terminal
 from semstab.statistics import Estimate
 from semstab.testing import checks
 
