@@ -5,12 +5,17 @@ import signal
 import tempfile
 import time
 
+import hypothesis
 import pytest
+
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # read by numpy; the workers share the processors
 
 from semstab.core.process import configure_process
 from semstab.report.figures import style
 
 pytest.register_assert_rewrite("semstab.testing")
+hypothesis.settings.register_profile("without deadlines", deadline=None)  # a busy machine is no failure
+hypothesis.settings.load_profile("without deadlines")
 signal.signal(signal.SIGINT, signal.default_int_handler)  # a shell lets what it starts in the background ignore Ctrl-C
 signal.signal(signal.SIGHUP, signal.SIG_DFL)  # and nohup the end of the terminal
 os.environ["SEMSTAB_CACHE"] = tempfile.mkdtemp(prefix="semstab-cache-")

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import itertools
-
 import dataset_writers
 import numpy as np
 import pytest
@@ -55,13 +53,11 @@ def test_a_sound_scene_is_called_sound_with_its_error(noise):
     ("room", "lines"),
     [
         (Room(told_pose=stored("world_to_camera")), ["pose_convention: world_to_camera"]),
-        (Room(told_pose=stored(axes="opengl")), ["camera_axes: opengl"]),
         (Room(told_pose=stored(axes="ned")), ["camera_axes: ned"]),
         (
             Room(told_pose=stored("world_to_camera", "opengl")),
             ["pose_convention: world_to_camera", "camera_axes: opengl"],
         ),
-        (Room(told_depth=lambda z: z * RAY_LENGTH), ["depth_kind: ray"]),
         (Room(told_depth=lambda z: z * RAY_LENGTH, noise=0.01), ["depth_kind: ray"]),
         (
             Room(told_depth=lambda z: z * RAY_LENGTH, told_pose=stored(axes="opengl")),
@@ -77,7 +73,7 @@ def test_a_mistake_is_named_with_the_line_that_mends_it(room, lines):
     assert all(line in verdict.text for line in lines)
 
 
-@pytest.mark.parametrize("scale", [1e-4, 1e-3, 0.1, 5.0, 10.0, 1000.0, 6553.5, 1e4])
+@pytest.mark.parametrize("scale", [1e-4, 5.0, 6553.5])
 def test_a_wrong_depth_scale_is_measured(tmp_path, scale):
     """What is stored are `scale` units a metre; scene.yaml says 1."""
     folder = write(tmp_path / "room", Room(told_depth=lambda z: z * scale))
@@ -90,7 +86,7 @@ def test_a_wrong_depth_scale_is_measured(tmp_path, scale):
     assert quick_check(opened(folder, depth_scale=scale), ALL).state == "sound"
 
 
-@pytest.mark.parametrize("size", [(2, 2), (0.5, 0.5), (3, 3), (2, 1)])
+@pytest.mark.parametrize("size", [(0.5, 0.5), (2, 1)])
 def test_intrinsics_of_another_image_size_are_found(size):
     other = (round(WIDTH * size[0]), round(HEIGHT * size[1]))
     verdict = checked(Room(camera=CAMERA.resized((WIDTH, HEIGHT), other)))
@@ -101,10 +97,13 @@ def test_intrinsics_of_another_image_size_are_found(size):
 
 
 def test_what_mends_it_mends_it(tmp_path):
-    """The advice for every combination of pose, axes and kind of depth, written down, makes the scene sound."""
-    for k, (pose, axes, kind) in enumerate(
-        itertools.product(("camera_to_world", "world_to_camera"), AXES, ("planar", "ray"))
-    ):
+    """The advice, written down, makes the scene sound; which advice it is, is tested in memory."""
+    combinations = [
+        ("camera_to_world", "opencv", "planar"),
+        ("world_to_camera", "opengl", "ray"),
+        ("camera_to_world", "ned", "ray"),
+    ]
+    for k, (pose, axes, kind) in enumerate(combinations):
         room = Room(walk(6), told_pose=stored(pose, axes), told_depth=lambda z, k=kind: z * RAY_LENGTH ** (k == "ray"))
         folder = write(tmp_path / f"room{k}", room)
         verdict = quick_check(opened(folder), range(6))
@@ -114,7 +113,7 @@ def test_what_mends_it_mends_it(tmp_path):
         assert quick_check(opened(folder), range(6)).state == "sound"
 
 
-@pytest.mark.parametrize("configured", [{"camera_axes": "opengl"}, {"camera_axes": "ned"}, {"depth_kind": "ray"}])
+@pytest.mark.parametrize("configured", [{"camera_axes": "opengl"}, {"depth_kind": "ray"}])
 def test_a_wrong_setting_of_a_right_scene_is_taken_back(tmp_path, configured):
     """Whatever is configured, alternatives are measured against what the files hold."""
     folder = write(tmp_path / "room", Room(walk(9)), **configured)
@@ -145,9 +144,9 @@ def test_large_coordinates_do_not_matter():
     assert quicker(verdict.mend) == ["pose_convention: world_to_camera"]
 
 
-@pytest.mark.parametrize("name", FORMATS)
-def test_a_wrong_option_of_any_dataset_is_taken_back(tmp_path, name):
-    """The formats differ in what their poses map and in axes; the advice is what each of them needs."""
+@pytest.mark.parametrize("name", ["hololens", "colmap, text", "polycam", "midair"])
+def test_a_wrong_option_of_a_dataset_is_taken_back(tmp_path, name):
+    """Formats differ in what their poses map and in axes: one of each kind; the advice is what it needs."""
     form, other = FORMATS[name], {"camera_to_world": "world_to_camera", "world_to_camera": "camera_to_world"}
     form.write(tmp_path / "data", source(form.scale))
     right = dataset_writers.opened(form, tmp_path / "data").options
@@ -230,7 +229,7 @@ def test_few_points_that_belong_to_nothing_leave_it_open():
     assert "no other convention explains it; are poses and depth this imprecise?" in verdict.text
 
 
-@pytest.mark.parametrize("scale", [2e4, 1e5, 5e-5, 1e-5])
+@pytest.mark.parametrize("scale", [2e4, 5e-5])
 def test_a_unit_beyond_four_decades_is_not_proposed(scale):
     """It could not be told from those outside of the factors that are tried."""
     assert not [line for line in checked(Room(told_depth=lambda z: z * scale)).mend if "depth_scale" in line]
@@ -242,7 +241,7 @@ def test_little_noise_in_the_unit_is_measurement():
     assert "depth as smooth as this has about 0.15%" in verdict.text
 
 
-@settings(max_examples=12, deadline=None, derandomize=True)
+@settings(max_examples=8, deadline=None, derandomize=True)
 @given(
     seed=st.integers(0, 10_000),
     pose=st.sampled_from(["camera_to_world", "world_to_camera"]),
@@ -276,7 +275,7 @@ def test_whatever_is_planted_is_found_or_said_to_be_unclear(seed, pose, axes, ki
         assert verdict.state == "unclear" or verdict.undetermined or "no other convention" in verdict.text
 
 
-@settings(max_examples=6, deadline=None, derandomize=True)
+@settings(max_examples=4, deadline=None, derandomize=True)
 @given(
     angles=st.tuples(*[st.floats(-3, 3)] * 3), offset=st.tuples(*[st.floats(-100, 100)] * 3), unit=st.floats(0.01, 100)
 )

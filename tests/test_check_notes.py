@@ -105,7 +105,7 @@ class Unregistered(Room):
         return dataclasses.replace(frame, labels=zoomed(np.array(frame.labels), *self.change))
 
 
-@pytest.mark.parametrize(("scale", "x"), [(525 / 585, 0), (585 / 525, 0), (1, 6), (1, -7)])
+@pytest.mark.parametrize(("scale", "x"), [(525 / 585, 0), (1, -7)])
 def test_labels_that_are_not_registered_are_pointed_out(tmp_path, scale, x):
     (note,) = notes(write(tmp_path / "room", Unregistered(scale, x)))
     assert note.startswith(

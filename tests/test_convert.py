@@ -28,7 +28,7 @@ from semstab.data.labels import LabelSpace
 from semstab.datasets import GROUND_TRUTH, open_dataset
 from semstab.errors import ConfigError, DataError
 from semstab.settings import load_config, resolve
-from semstab.testing.builders import assert_same_map
+from semstab.testing import assert_same_map
 
 CITY = {
     "width": 48,

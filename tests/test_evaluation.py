@@ -27,7 +27,7 @@ from semstab.engine.memory import map_bytes
 from semstab.errors import ConfigError, DataError
 from semstab.report import terminal
 from semstab.report.tables import tables
-from semstab.report.tables.table import to_json as table_content
+from semstab.report.tables import to_json as table_content
 from semstab.report.terminal import common_beginning, print_summary
 from semstab.statistics import CellObservations, MapSample, analyse, describe
 from semstab.statistics.correctness import ACCURACY

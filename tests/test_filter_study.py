@@ -12,7 +12,7 @@ from PIL import Image
 from typer.testing import CliRunner
 
 from semstab.cli import app
-from semstab.engine.folder import load_result
+from semstab.engine import load_result
 from semstab.report.filter_study import FilterResult, FilterStudy, advice, filter_studies
 
 NAN = float("nan")

@@ -29,8 +29,11 @@ STUDY = {"dataset": {"name": "posed_folder", "options": {"root": "flight"}}, "sw
 FAILS = {"gate new --rule 'alpha > 0.6' --out gate.md": 5}
 """Gates that so few frames leave undecided."""
 
-SLOW = ("conform './fuse'", "list --check", "benchmark city@1 --predict net.py:Net")
-"""All cases, all models loaded, five flights: other tests run these, or their like."""
+SLOW = (
+    "conform './fuse'", "list --check", "benchmark city@1 --predict net.py:Net",
+    "study mine.yaml --only voxel_size --jobs 2",
+)  # fmt: skip
+"""All cases, all models loaded, five flights, two processes: other tests run these, or their like."""
 
 RESULTS = Path(__file__).parents[1] / "results"
 BENCHMARK = {
@@ -50,7 +53,9 @@ def folder(tmp_path_factory):
     (folder / "net.py").write_text(NET)
     (folder / "mine.yaml").write_text(yaml.safe_dump(STUDY))
     (folder / "mine@1.yaml").write_text(yaml.safe_dump(BENCHMARK))
-    (folder / "results").symlink_to(RESULTS)
+    (folder / "results").mkdir()
+    for name in ("sim-steady", "sim-flicker"):
+        (folder / f"results/city@1__{name}.semstab").symlink_to(RESULTS / f"city@1__{name}.semstab")
     (folder / "fuse").write_text(f'#!/bin/sh\nexec {sys.executable} -m semstab.conformance.fuse numba "$@"\n')
     (folder / "fuse").chmod(0o755)
     for name in ("old", "new"):

@@ -32,9 +32,8 @@ from semstab.data import voxels
 from semstab.data.frames import Frame, Intrinsics
 from semstab.data.parquet import Tile
 from semstab.data.voxels import Extent, VoxelTable
-from semstab.engine import InProcess, LocalProcesses
+from semstab.engine import InProcess, LocalProcesses, Observer
 from semstab.engine.memory import Sizing
-from semstab.engine.observer import Observer
 from semstab.engine.tiles import tiles_met
 from semstab.errors import ConfigError, DataError, OutgrownError
 from semstab.exports import export, maps
@@ -42,8 +41,7 @@ from semstab.exports.fused_labels import Belief
 from semstab.exports.relabel import relabel
 from semstab.statistics import model_comparison
 from semstab.statistics.cluster_sums import ClusterSums
-from semstab.testing import random_frames
-from semstab.testing.builders import EXACT, SUMS, sight_line
+from semstab.testing import EXACT, SUMS, random_frames, sight_line
 
 K, SIZE = 4, 0.4
 

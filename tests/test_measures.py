@@ -31,8 +31,7 @@ from semstab.report.figures.distributions import draw_ecdf, draw_persistence, dr
 from semstab.report.figures.maps import draw_stability
 from semstab.report.figures.topdown import FromAbove
 from semstab.report.means import describe, levels
-from semstab.report.tables import tables
-from semstab.report.tables.table import to_csv
+from semstab.report.tables import tables, to_csv
 from semstab.report.terminal import columns, print_answer, print_summary, row_of
 from semstab.statistics.cluster_sums import BY_CLASS, FUNCTIONALS
 

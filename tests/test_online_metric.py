@@ -105,7 +105,7 @@ def test_pixels_without_a_label_are_left_out(flights):
         metric.update(np.full((54, 96), 9), frames[0].depth, frames[0].intrinsics, frames[0].T_wc)
 
 
-@settings(deadline=None, max_examples=15)
+@settings(deadline=None, max_examples=6)
 @given(owner=st.lists(st.integers(0, 2), min_size=10, max_size=10))
 def test_processes_add_up_to_one(flights, owner):
     """However the frames are shared out; SBD and flicker are means over the steps that each process saw."""

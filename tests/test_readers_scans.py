@@ -173,6 +173,7 @@ def test_there_is_no_such_scan_nor_model(form, folder):
     fails(ConfigError, "model 'nett' is not there; did you mean 'net'", scene.frame, 0, "nett")
 
 
+@pytest.mark.parametrize("form", [SCANS["semantickitti"], SCANS["nuscenes"]], ids=["semantickitti", "nuscenes"])
 def test_check_finds_that_the_scans_lie_on_each_other(form, folder):
     dense(form, folder)
     options = form.options | {"root": str(folder)}

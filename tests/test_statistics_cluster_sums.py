@@ -17,11 +17,10 @@ from semstab.data.earlier import SUMS
 from semstab.data.measures import Measure, dominant, entropy, margin, registered, sbd, vss
 from semstab.errors import DataError
 from semstab.metrics.agreement import rows_of
+from semstab.statistics import class_agreement, correctness, expected_sbd, krippendorff_alpha, psa
 from semstab.statistics.accumulate import cluster_sums_of, sums_of_cells
-from semstab.statistics.agreement import class_agreement, consistency_posterior, krippendorff_alpha, psa
+from semstab.statistics.agreement import consistency_posterior
 from semstab.statistics.cluster_sums import FUNCTIONALS, MOST_CLASSES, ClusterSums, aligned, value
-from semstab.statistics.correctness import correctness
-from semstab.statistics.drift import expected_sbd
 from semstab.statistics.intervals import (
     coverage,
     difference,

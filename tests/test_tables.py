@@ -26,8 +26,8 @@ from semstab.data.measures import SBD, VSS
 from semstab.data.records import ImageSpace, RegionFlicker, Result
 from semstab.metrics import entropy, op, sbd, vss
 from semstab.report.means import ENOUGH, Spread, complete_scenes, describe, levels, pooled, swept
-from semstab.report.tables import tables, write_tables
-from semstab.report.tables.table import Column, Group, Table, to_csv, to_json, to_latex, to_markdown, to_terminal
+from semstab.report.tables import Column, Group, Table, tables, to_csv, to_json, to_latex, to_markdown, write_tables
+from semstab.report.tables.table import to_terminal
 from semstab.statistics import Estimate
 from semstab.testing import checks
 
@@ -41,6 +41,11 @@ def walls(tmp_path_factory) -> Result:
     return wall_study(tmp_path_factory.getbasetemp())[0]
 
 
+@pytest.fixture(scope="module")
+def tables_of_walls(walls) -> list[Table]:
+    return tables(walls)
+
+
 def table_of(result: Result, name: str) -> Table:
     (found,) = (table for table in tables(result) if table.name == name)
     return found
@@ -51,13 +56,13 @@ def rows_of(result: Result, name: str) -> list[dict]:
 
 
 @pytest.mark.parametrize("suffix", WRITERS)
-def test_the_walls_tables_are_as_in_the_golden_file(walls, suffix):
-    written = "\n".join(WRITERS[suffix](table) for table in tables(walls))
+def test_the_walls_tables_are_as_in_the_golden_file(tables_of_walls, suffix):
+    written = "\n".join(WRITERS[suffix](table) for table in tables_of_walls)
     assert written == (GOLDEN / f"tables.{suffix}").read_text(encoding="utf-8")
 
 
-def test_a_study_of_everything_has_every_table(walls):
-    assert [table.name for table in tables(walls)] == [
+def test_a_study_of_everything_has_every_table(tables_of_walls):
+    assert [table.name for table in tables_of_walls] == [
         "overview", "verdicts", "flicker", "flicker_by_scene", "scenes", "persistence", "classes", "temporal_agreement",
         "correlogram", "class_agreement", "drift", "frames", "uncertainty", "cross_model", "sensitivity_voxel_size",
         "sensitivity_agreement_voxel_size", "sensitivity_depth_noise", "sensitivity_agreement_depth_noise",
@@ -251,8 +256,8 @@ def test_a_cell_in_print(column, cell, text):
     assert column.text(cell) == text
 
 
-def test_csv_holds_the_numbers_of_the_json_rounded(walls):
-    for table in tables(walls):
+def test_csv_holds_the_numbers_of_the_json_rounded(tables_of_walls):
+    for table in tables_of_walls:
         rows = list(csv.DictReader(io.StringIO(to_csv(table))))
         exact = to_json(table)["rows"]
         assert len(rows) == len(exact)
@@ -304,8 +309,8 @@ def test_latex_keeps_its_structure_whatever_the_names(name):
 
 
 @pytest.mark.skipif(shutil.which("pdflatex") is None, reason="there is no pdflatex")
-def test_latex_compiles_without_overfull_lines(walls, tmp_path):
-    floats = "\n".join(to_latex(table) for table in [*tables(walls), nasty_table()])
+def test_latex_compiles_without_overfull_lines(tables_of_walls, tmp_path):
+    floats = "\n".join(to_latex(table) for table in [*tables_of_walls, nasty_table()])
     page = r"\documentclass[10pt,twocolumn]{article}\usepackage[a4paper,margin=0.7in]{geometry}\usepackage[T1]{fontenc}"
     packages = r"\usepackage{lmodern,booktabs,graphicx}"
     (tmp_path / "t.tex").write_text(f"{page}{packages}\n\\begin{{document}}\n{floats}\n\\end{{document}}\n")

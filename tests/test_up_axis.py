@@ -64,7 +64,7 @@ def test_a_slope_is_taken_for_the_ground():
     assert degrees(up, (0, 0, 1)) == pytest.approx(10, abs=0.5)
 
 
-@pytest.mark.parametrize("seed", range(4))
+@pytest.mark.parametrize("seed", range(2))
 def test_the_answer_turns_with_the_world_and_moves_with_nothing(seed):
     rng = np.random.default_rng(seed)
     R = np.linalg.qr(rng.normal(size=(3, 3)))[0]

@@ -17,7 +17,7 @@ from PIL import Image
 from semstab import datasets
 from semstab.data.labels import LabelSpace
 from semstab.data.records import ClipMean, WarpedOverlap
-from semstab.engine.folder import load_result
+from semstab.engine import load_result
 from semstab.errors import DataError
 from semstab.metrics import (
     SelfConsistency,
@@ -29,8 +29,7 @@ from semstab.metrics import (
     occluded,
     warp_labels,
 )
-from semstab.report.tables import tables
-from semstab.report.tables.table import to_json
+from semstab.report.tables import tables, to_json
 
 CITY = {"frames": 200, "width": 160, "height": 90}
 FORMS = ("vspw", "etc", "ssp")

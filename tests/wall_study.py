@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import dataclasses
+import fcntl
 import functools
+import os
 from pathlib import Path
 
 import numpy as np
@@ -13,6 +15,7 @@ from posed_writer import write_posed
 from semstab.api import run_study
 from semstab.data.frames import Frame, Intrinsics
 from semstab.data.records import Result
+from semstab.engine import load_result
 from semstab.report.figures import write_figures
 
 WIDTH, HEIGHT, FOCAL, FRAMES = 96, 64, 64.0, 9
@@ -44,7 +47,20 @@ def write_wall(folder: Path, step: float) -> None:
 
 @functools.cache
 def wall_study(base: Path) -> tuple[Result, Path]:
-    """What the study found, and its folder, made once in `base`; times are set to 12.5 ms a frame."""
+    """What the study found, and its folder, made once for all processes of the session; 12.5 ms a frame."""
+    base = base.parent if "PYTEST_XDIST_WORKER" in os.environ else base
+    folder = base / "wall study"
+    with (base / "wall study.lock").open("w") as lock:
+        fcntl.flock(lock, fcntl.LOCK_EX)
+        result = load_result(folder) if (folder / "summary.json").exists() else made(base, folder)
+    records = tuple(
+        dataclasses.replace(record, summary=dataclasses.replace(record.summary, fuse_ms_per_frame=12.5))
+        for record in result.records
+    )
+    return dataclasses.replace(result, records=records), folder
+
+
+def made(base: Path, folder: Path) -> Result:
     for scene, step in STEPS.items():
         write_wall(base / "walls" / scene, step)
     config = configure(
@@ -59,14 +75,9 @@ def wall_study(base: Path) -> tuple[Result, Path]:
         backends=["numpy", {"name": "numba", "scenes": ["often"]}],
         check=None,
     )
-    folder = base / "wall study"
     result = run_study(config, folder, report=False)
     assert not result.failures
-    records = tuple(
-        dataclasses.replace(record, summary=dataclasses.replace(record.summary, fuse_ms_per_frame=12.5))
-        for record in result.records
-    )
-    return dataclasses.replace(result, records=records), folder
+    return result
 
 
 @functools.cache

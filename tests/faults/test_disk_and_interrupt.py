@@ -18,7 +18,7 @@ from posed_config import configure
 import semstab
 from semstab.core.files import write_text
 from semstab.errors import ConfigError
-from semstab.recording.observer import Recording
+from semstab.recording import Recording
 
 
 def test_a_recording_that_finds_no_room_costs_no_result(tmp_path, monkeypatch) -> None:

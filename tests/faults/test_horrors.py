@@ -17,9 +17,9 @@ from semstab.cli import app
 from semstab.datasets import open_dataset
 from semstab.engine import load_result
 from semstab.errors import LONGEST_LINE, ConfigError, DataError, sanitize
-from semstab.report.figures.style import Figure, canvas
-from semstab.report.tables import tables
-from semstab.report.tables.table import to_csv
+from semstab.report.figures import Figure
+from semstab.report.figures.style import canvas
+from semstab.report.tables import tables, to_csv
 
 LONG = "9" * 300_000
 

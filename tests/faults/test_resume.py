@@ -17,7 +17,7 @@ from semstab.cli import app
 from semstab.convert import convert
 from semstab.core.files import FolderLock
 from semstab.errors import ConfigError
-from semstab.recording.observer import Recording
+from semstab.recording import Recording
 from semstab.recording.target import is_whole
 
 

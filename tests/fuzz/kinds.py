@@ -60,9 +60,9 @@ from semstab.report.figures.maps import Overview
 from semstab.report.tables import tables
 from semstab.report.terminal import print_summary
 from semstab.settings import load_config, load_study
+from semstab.statistics import CellObservations
 from semstab.statistics.acceptance import AcceptanceThresholds
 from semstab.statistics.cluster_sums import ClusterSums
-from semstab.statistics.observations import CellObservations
 
 SHAPE = (12, 16)
 CAMERA = Intrinsics(12, 12, 7.5, 5.5)

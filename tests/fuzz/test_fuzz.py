@@ -29,8 +29,8 @@ from semstab.models.segearth_ov import read_prompts
 from semstab.report.figures.maps import Overview
 from semstab.report.saved_run import read_series
 from semstab.settings import load_config, resolve
+from semstab.statistics import CellObservations
 from semstab.statistics.cluster_sums import ClusterSums
-from semstab.statistics.observations import CellObservations
 
 EACH = 8
 """Inputs of a kind."""

@@ -14,8 +14,7 @@ from semstab.core.json_form import to_json
 from semstab.data.frames import Frame, Intrinsics
 from semstab.data.measures import measures
 from semstab.metrics import summarise
-from semstab.report.tables import tables
-from semstab.report.tables.table import to_csv, to_latex, to_markdown
+from semstab.report.tables import tables, to_csv, to_latex, to_markdown
 
 FILE = Path(__file__).parent / "small_map.json"
 K = 4
