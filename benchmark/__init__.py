@@ -11,6 +11,7 @@ if TYPE_CHECKING:
     from semstab.comparison.gate import GateConfig, gate
     from semstab.comparison.writing import compare
     from semstab.config import Config
+    from semstab.configure import load_config, load_study
     from semstab.data.events import Events
     from semstab.data.frames import Frame, Intrinsics
     from semstab.data.labels import LabelSpace
@@ -23,7 +24,6 @@ if TYPE_CHECKING:
     from semstab.exports.relabel import relabel
     from semstab.online import FusedResult, TemporalStability, fuse
     from semstab.report.saved_run import load
-    from semstab.settings import load_config, load_study
     from semstab.statistics.acceptance import AcceptanceThresholds
     from semstab.videos import run_videos
 
@@ -73,7 +73,7 @@ _HOMES = {
     "MissingDependencyError": "errors", "Result": "data.records", "SemstabError": "errors", "VoxelTable": "data.voxels",
     "FusedResult": "online", "TemporalStability": "online", "compare": "comparison.writing", "fuse": "online",
     "export": "exports", "gate": "comparison.gate", "load": "report.saved_run",
-    "load_config": "settings", "load_result": "engine.folder", "load_study": "settings", "relabel": "exports.relabel",
+    "load_config": "configure", "load_result": "engine.folder", "load_study": "configure", "relabel": "exports.relabel",
     "run": "api", "run_study": "api", "run_videos": "videos",
 }  # fmt: skip
 """The module of each public name; other public names are modules."""

@@ -9,12 +9,12 @@ from pathlib import Path
 from typing import Any
 
 from semstab.config import Config
+from semstab.configure import as_config
 from semstab.core.files import ScratchFolder
 from semstab.data.records import Result
 from semstab.engine import Executor, Observer, execute
 from semstab.errors import DataError
 from semstab.report import Reporting
-from semstab.settings import as_config
 
 
 def run(

@@ -9,6 +9,7 @@ import numpy as np
 
 from semstab.check import with_voxel_size
 from semstab.config import Config, merge
+from semstab.configure import dataset_defaults, load_config, load_study, predicted_config, resolve
 from semstab.core.arrays import evenly
 from semstab.data.measures import mean
 from semstab.datasets import Scene
@@ -18,7 +19,6 @@ from semstab.pixels.warp import density
 from semstab.predict.filters import parse, too_sparse
 from semstab.predict.predictor import NAME as STORED
 from semstab.predict.predictor import PredictorConfig, StoredSequence
-from semstab.settings import dataset_defaults, load_config, load_study, predicted_config, resolve
 from semstab.task import frame_indices, open_scenes
 
 STUDY = "filters"

@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from semstab.config import Config
+from semstab.configure import as_config, resolve
 from semstab.core.files import FolderLock, ScratchFolder, write_json, write_text
 from semstab.data.videos import VideoResult
 from semstab.engine.folder import SETTINGS, VIDEO_LAYOUT
@@ -19,7 +20,6 @@ from semstab.errors import ConfigError
 from semstab.predict.dataset import NAME as PREDICTED
 from semstab.report.tables import save_tables
 from semstab.report.videos import save_series, summary, tables, write_page
-from semstab.settings import as_config, resolve
 from semstab.task import open_scenes
 
 logger = logging.getLogger("semstab")

@@ -26,8 +26,8 @@ import numpy as np  # noqa: E402
 import semstab  # noqa: E402
 from semstab import backends  # noqa: E402
 from semstab.backends.shared.association import observe  # noqa: E402
+from semstab.configure import as_config, resolve  # noqa: E402
 from semstab.core.types import Float64  # noqa: E402
-from semstab.settings import as_config, resolve  # noqa: E402
 from semstab.task import open_scenes, read, tasks_of  # noqa: E402
 
 ALONE = "np.unique alone"

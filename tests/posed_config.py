@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import Any
 
 from semstab.config import Config
-from semstab.settings import load_config, resolve
+from semstab.configure import load_config, resolve
 
 
 def dataset_of(root: Path, **options: Any) -> dict[str, Any]:

@@ -24,10 +24,10 @@ from semstab.check.coverage import SIZES, plane_residuals
 from semstab.check.histogram import Tally
 from semstab.check.reprojection import View
 from semstab.cli import app
+from semstab.configure import load_config, resolve
 from semstab.data.frames import Frame
 from semstab.data.labels import LabelSpace
 from semstab.errors import ConfigError, DataError
-from semstab.settings import load_config, resolve
 
 DATA = Path(os.environ.get("SEMSTAB_DATA", Path(__file__).parents[1] / "../shared/data"))
 

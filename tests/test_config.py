@@ -6,8 +6,8 @@ import pytest
 
 import semstab
 from semstab.config import BackendConfig, Config, FrameSelection, merge, read_yaml
+from semstab.configure import load_config, resolve
 from semstab.errors import ConfigError
-from semstab.settings import load_config, resolve
 
 
 def test_defaults_are_the_papers() -> None:

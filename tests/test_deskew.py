@@ -11,9 +11,9 @@ from scipy.spatial.transform import Rotation
 from street import Street, write_street
 
 from semstab.check import check
+from semstab.configure import load_config
 from semstab.datasets import open_dataset
 from semstab.datasets.geometry.sweeps import SWEEPS, carried, deskewed, motion_in_sweep, share_of_sweep
-from semstab.settings import load_config
 
 
 def skewed(street, sweep):

@@ -10,6 +10,7 @@ from typer.testing import CliRunner
 
 from semstab.cli import app
 from semstab.config import Config
+from semstab.configure import load_study
 from semstab.core import registry
 from semstab.core.registry import Registry
 from semstab.datasets.files.options import Template
@@ -18,7 +19,6 @@ from semstab.models import REGISTRY, Model, options_model
 from semstab.models.checkpoint import ModelOptions
 from semstab.predict.dataset import PredictedOptions
 from semstab.predict.predictor import PredictorConfig
-from semstab.settings import load_study
 
 
 @pytest.fixture

@@ -12,13 +12,13 @@ from typer.testing import CliRunner
 
 from semstab.api import run
 from semstab.cli import app
+from semstab.configure import filtered_config, predicted_config, resolve
 from semstab.datasets import open_dataset
 from semstab.datasets.formats.images import read_labels
 from semstab.errors import ConfigError, DataError
 from semstab.predict.filters import REGISTRY, parse
 from semstab.predict.predictor import PredictorConfig, load_predictor, parse_predictor, stored_labels
 from semstab.predict.sequence import SequenceOptions, predict_sequence
-from semstab.settings import filtered_config, predicted_config, resolve
 
 MODEL = """
 import os

@@ -22,12 +22,12 @@ from posed_writer import write_posed
 
 import semstab
 from semstab.comparison.runs import open_run, save_summary
+from semstab.configure import shipped_benchmarks
 from semstab.datasets import city
 from semstab.errors import ConfigError, DataError
 from semstab.leaderboard.board import board_of, boards
 from semstab.leaderboard.definition import load_benchmark
 from semstab.leaderboard.submission import load_submission, submissions
-from semstab.settings import shipped_benchmarks
 from semstab.statistics.cluster_sums import value
 from semstab.statistics.intervals import estimate, scope_of
 

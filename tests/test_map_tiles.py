@@ -113,10 +113,10 @@ class Counting(InProcess):
         self.left, self.done, self.errors = stop_after, [], []
 
     def run(self, next_job, observers) -> Generator:
-        for outcome in super().run(next_job, observers):
-            self.done.append(outcome.tile)
-            self.errors += [outcome.error] if outcome.error is not None else []
-            yield outcome
+        for work in super().run(next_job, observers):
+            self.done.append(None if work.tile is None else work.tile.name)
+            self.errors += [work.error] if work.error is not None else []
+            yield work
             self.left -= 1
             if not self.left:
                 raise KeyboardInterrupt

@@ -18,11 +18,11 @@ from test_recording import read
 
 import semstab
 from semstab.config import BACKENDS
+from semstab.configure import load_config
 from semstab.engine import load_result
 from semstab.engine.units import make_plan
 from semstab.metrics import compare, compensated_flicker, image_space
 from semstab.recording import Recording, Target, lacks_pictures, record_finished
-from semstab.settings import load_config
 from semstab.task import read as read_frame
 
 TIMES = {"decode_ms", "wait_ms", "fuse_ms", "association_ms", "update_ms"}

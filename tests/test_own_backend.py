@@ -10,9 +10,9 @@ import tiny_scene
 from command_line import bench
 
 from semstab import backends
+from semstab.configure import load_config
 from semstab.engine import load_result
 from semstab.errors import ConfigError
-from semstab.settings import load_config
 
 ALIKE = """
 from dataclasses import replace

@@ -14,11 +14,11 @@ from posed_config import configure
 
 import semstab
 from semstab.config import Perturbation
+from semstab.configure import load_config
 from semstab.data.frames import Frame, Intrinsics
 from semstab.engine.units import make_plan
 from semstab.errors import ConfigError
 from semstab.pixels.preparation import perturb
-from semstab.settings import load_config
 from semstab.task import read
 
 H, W = 40, 50

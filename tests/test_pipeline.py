@@ -18,6 +18,7 @@ from rich.console import Console
 
 import semstab
 from semstab import metrics
+from semstab.configure import load_config
 from semstab.core.json_form import to_json
 from semstab.data.measures import ENTROPY, SBD, VSS
 from semstab.data.records import Result
@@ -26,7 +27,6 @@ from semstab.datasets.files import options
 from semstab.engine import Observer, load_result
 from semstab.errors import ConfigError, DataError
 from semstab.report.terminal import print_answer
-from semstab.settings import load_config
 
 
 @pytest.fixture

@@ -21,6 +21,7 @@ from posed_config import configure, dataset_of
 
 from semstab.api import run
 from semstab.config import Config, DatasetConfig, FrameSelection
+from semstab.configure import predicted_config
 from semstab.core.files import FolderLock
 from semstab.data.labels import LabelSpace
 from semstab.data.measures import ENTROPY
@@ -39,7 +40,6 @@ from semstab.predict.folder import names_a_folder
 from semstab.predict.predictor import PredictorConfig, load_predictor, parse_predictor, parse_predictors
 from semstab.predict.sequence import PredictionObserver, SequenceOptions, predict_sequence
 from semstab.report.terminal import screen
-from semstab.settings import predicted_config
 
 CLUSTERS = {"clusters": 4, "samples": 500, "fit_frames": 2}
 

@@ -13,6 +13,7 @@ from posed_config import dataset_of
 
 from semstab.api import run
 from semstab.config import Config, FrameSelection
+from semstab.configure import predicted_config, resolve
 from semstab.data.labels import LabelSpace
 from semstab.datasets import open_dataset
 from semstab.datasets.formats.images import read_labels
@@ -22,7 +23,6 @@ from semstab.models.names import InTaxonomy
 from semstab.predict.command import ImageFiles
 from semstab.predict.predictor import PredictorConfig
 from semstab.predict.sequence import SequenceOptions, predict_sequence
-from semstab.settings import predicted_config, resolve
 
 
 class Average(Model):

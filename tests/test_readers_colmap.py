@@ -13,13 +13,13 @@ import pytest
 from posed_scene import fails
 
 from semstab.config import read_yaml
+from semstab.configure import load_config, resolve
 from semstab.datasets import open_dataset
 from semstab.datasets.city.mesh import uavid8
 from semstab.datasets.colmap import read_model
 from semstab.datasets.files.depth import read_depth_map
 from semstab.datasets.uavid3d import Uavid3dOptions
 from semstab.errors import ConfigError, DataError
-from semstab.settings import load_config, resolve
 
 TEXT, BINARY = ds.FORMATS["colmap, text"], ds.FORMATS["colmap, binary"]
 

@@ -16,10 +16,10 @@ from scan_writers import SCANS
 
 from semstab.backends import create
 from semstab.check import check_scene
+from semstab.configure import load_config, resolve
 from semstab.data.frames import Frame
 from semstab.datasets import open_dataset, recognise
 from semstab.errors import ConfigError, DataError
-from semstab.settings import load_config, resolve
 
 
 @pytest.fixture(params=SCANS)

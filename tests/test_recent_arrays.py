@@ -10,9 +10,9 @@ import pytest
 import tiny_scene
 
 import semstab
+from semstab.configure import load_config
 from semstab.core.arrays import RecentArrays
 from semstab.datasets.files import scene
-from semstab.settings import load_config
 
 
 def test_an_array_is_made_again_once_others_took_its_room() -> None:

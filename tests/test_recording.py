@@ -394,7 +394,7 @@ def test_a_path_that_cannot_be_written_is_named(run, tmp_path) -> None:
 
 def test_without_a_recording_rerun_is_not_imported(run) -> None:
     program = (
-        "import sys, semstab; from semstab.settings import load_config;"
+        "import sys, semstab; from semstab.configure import load_config;"
         f"semstab.run(load_config({str(run / 'config.yaml')!r}));"
         "assert 'semstab.engine.execution' in sys.modules and 'rerun' not in sys.modules"
     )

@@ -23,6 +23,7 @@ from test_recording import config_of, grid, notes, read, series, verify
 
 import semstab
 from semstab import backends, metrics
+from semstab.configure import load_config
 from semstab.data.frames import Frame, Intrinsics
 from semstab.data.labels import LabelSpace
 from semstab.data.measures import SBD_MAX
@@ -32,7 +33,6 @@ from semstab.errors import DataError
 from semstab.recording import Recording, camera, color_modes, drift, lacks_pictures, layout, record_finished, voxel_maps
 from semstab.recording.drift import DriftLog, View
 from semstab.recording.timeline import Clock, entity
-from semstab.settings import load_config
 from semstab.task import read as read_frame
 
 CLASSES = LabelSpace("abc", ("a", "b", "c"))
@@ -447,7 +447,7 @@ def test_a_killed_run_leaves_a_recording_that_optimize_makes_whole(tmp_path) -> 
     program = f"""
 import os, signal, time, semstab
 from semstab.engine import Observer
-from semstab.settings import load_config
+from semstab.configure import load_config
 from semstab.recording import Recording
 class Killing(Observer):
     def unit_finished(self, *_):

@@ -11,10 +11,10 @@ from rich.console import Console
 
 import semstab
 from semstab.comparison.gate import gate, gate_config
+from semstab.configure import predicted_config, resolve
 from semstab.predict.predictor import parse_predictors
 from semstab.report.ranking import answers, ranking
 from semstab.report.terminal import print_summary
-from semstab.settings import predicted_config, resolve
 
 ERRORS = {"place": 0.05, "view": 0.05, "cell": 2.0, "flicker": 0.03}
 

@@ -12,11 +12,11 @@ from street import IDS, Street, write_street
 
 import semstab
 from semstab.check import check
+from semstab.configure import load_config
 from semstab.data.frames import Frame, Intrinsics
 from semstab.datasets import open_dataset
 from semstab.errors import DataError
 from semstab.metrics import compensated_flicker
-from semstab.settings import load_config
 from semstab.statistics import describe
 
 

@@ -17,6 +17,7 @@ import semstab
 from semstab.backends.numba_hash import NumbaHash
 from semstab.check import check
 from semstab.config import read_yaml
+from semstab.configure import load_config, predicted_config, resolve
 from semstab.data.frames import Frame, Intrinsics
 from semstab.errors import DataError
 from semstab.metrics import split_last, summarise
@@ -24,7 +25,6 @@ from semstab.predict.predictor import parse_predictor
 from semstab.report.narrative import notes
 from semstab.report.tables import tables
 from semstab.report.terminal import print_summary
-from semstab.settings import load_config, predicted_config, resolve
 
 
 def printed(result, **options) -> str:

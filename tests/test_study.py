@@ -18,6 +18,7 @@ from tiny_study import Counting, Interrupting, configure, summary
 import semstab
 from semstab.api import run_study
 from semstab.config import BACKENDS, Config
+from semstab.configure import resolve
 from semstab.core.json_form import to_json
 from semstab.data.records import Variation
 from semstab.data.results import UnitName
@@ -29,7 +30,6 @@ from semstab.engine.units import Unit, make_plan
 from semstab.engine.work import Start, Work, jobs_of
 from semstab.errors import ConfigError, DataError
 from semstab.metrics import SelfConsistency, VideoConsistency, compare, compensated_flicker, flicker_percent, summarise
-from semstab.settings import resolve
 from semstab.statistics import CellObservations, compare_models
 from semstab.task import read
 

@@ -7,9 +7,9 @@ import tiny_study
 import yaml
 
 from semstab.config import Config
+from semstab.configure import load_config, load_study, resolve, shipped_studies
 from semstab.engine.units import NOT_IN_KEYS, make_plan
 from semstab.errors import ConfigError
-from semstab.settings import load_config, load_study, resolve, shipped_studies
 
 
 def write(tmp_path, **content):

@@ -35,9 +35,9 @@ def check(
     from semstab.check import SCHEMA
     from semstab.check import check as check_scenes
     from semstab.check.display import print_check
+    from semstab.configure import load_config, resolve
     from semstab.core.files import write_json
     from semstab.engine.folder import require_output
-    from semstab.settings import load_config, resolve
 
     if json_file is not None:
         require_output(json_file, [config])
@@ -91,8 +91,8 @@ def predict(
     quiet: opt.Quiet = False,
 ) -> None:  # fmt: skip
     """Run a segmentation model over images; `run` and `study` read the label maps. A second start resumes."""
+    from semstab.configure import load_config, resolve
     from semstab.predict import command
-    from semstab.settings import load_config, resolve
 
     named = {
         "checkpoint": checkpoint, "revision": revision, "device": device, "dtype": dtype, "threads": threads,
@@ -146,8 +146,8 @@ def convert(
     """Write any dataset as posed folders. A second start resumes."""
     from rich.console import Console
 
+    from semstab.configure import load_config, resolve
     from semstab.convert import convert, frame_bar, print_converted
-    from semstab.settings import load_config, resolve
 
     named = {"scenes": source.scene, "models": source.model}
     content = chosen(named, settings, options, source.dataset, source.data, frames)

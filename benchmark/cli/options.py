@@ -39,8 +39,8 @@ def _listed(module: str, function: str = "REGISTRY.entries") -> Complete:
 
 def _opened(ctx: Any) -> Any:
     """Open the dataset that the options so far select."""
+    from semstab.configure import load_config, resolve
     from semstab.datasets import open_dataset
-    from semstab.settings import load_config, resolve
 
     content: dict[str, Any] = {}
     select_dataset(content, ctx.params.get("dataset"), ctx.params.get("data"), None)
@@ -277,7 +277,7 @@ def chosen(
     seed: int | None = None,
 ) -> dict[str, Any]:
     """Return options as settings; --set (`settings`) and --option (`options`) have priority."""
-    from semstab.config.settings import in_full
+    from semstab.config.groups import in_full
     from semstab.core.files import parse_yaml
 
     content = {key: None if value == ["all"] else value for key, value in named.items() if value is not None}

@@ -51,8 +51,8 @@ def run(
 
 def _configured(prediction: opt.Prediction, config: Path | None, content: dict[str, Any]) -> Config:
     """Return the configuration of a file and further settings, of stored labels or of a model that predicts them."""
+    from semstab.configure import filtered_config, load_config, predicted_config
     from semstab.predict.predictor import parse_predictors
-    from semstab.settings import filtered_config, load_config, predicted_config
 
     filters = prediction.filters or []
     if prediction.predict:
@@ -98,8 +98,8 @@ def study(
     verbose: opt.Verbose = False,
 ) -> None:  # fmt: skip
     """Run everything that the paper reports: scenes x models x backends x variations. A second start resumes."""
+    from semstab.configure import load_study
     from semstab.data.results import slug
-    from semstab.settings import load_study
 
     config = load_study(file, chosen({"check_geometry": False if trust_geometry else None}, settings, options))
     config = config if only is None else config.only(only)

@@ -150,10 +150,10 @@ def list_(
 
     from semstab import backends, datasets, models
     from semstab.config import read_yaml
+    from semstab.configure import load_study, shipped_benchmarks, shipped_studies
     from semstab.data.labels import LabelSpace, shipped_taxonomies
     from semstab.errors import MissingDependencyError
     from semstab.predict import filters
-    from semstab.settings import load_study, shipped_benchmarks, shipped_studies
 
     table = Table(show_edge=False)
     for name in ("kind", "name", "", "description"):

@@ -28,7 +28,7 @@ from semstab.comparison.gate_rules import ALL, Rule, parse
 from semstab.comparison.runs import RunHandle, open_run, shared_scenes
 from semstab.comparison.tables import COVERAGE, FLICKER
 from semstab.config import read_yaml, validated
-from semstab.config.settings import ScopeSetting
+from semstab.config.groups import ScopeSetting
 from semstab.core.types import THESE_FRAMES, THIS_SCENE, Scope
 from semstab.data.statistics import UNKNOWN
 from semstab.errors import ConfigError

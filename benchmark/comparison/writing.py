@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 from semstab.comparison.differences import ComparisonData, Progress, find
 from semstab.comparison.locations import Changes
 from semstab.comparison.tables import HEADLINES, IN_CLASSES, IOU, by_key, heading, scopes, sentences, tables
-from semstab.config.settings import ScopeOption, validated
+from semstab.config.groups import ScopeOption, validated
 from semstab.core.files import TEMPORARY, FolderLock, keep_only, read_json, write_json, write_text
 from semstab.core.json_form import from_json
 from semstab.core.types import THIS_SCENE

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any, ClassVar, Literal, Self
 import yaml
 from pydantic import Field, ValidationError, ValidationInfo, field_validator
 
-from semstab.config.settings import (
+from semstab.config.groups import (
     Deviation,
     FrameSelection,
     Noise,

@@ -247,14 +247,14 @@ ENTROPY = Measure(
 MARGIN = Measure(key="margin", title="Margin", short="M", better="higher", of=margin, range=(0.0, 1.0), panel=False)
 
 RESERVED = frozenset((
-    "K", "backend", "categories", "classes", "confused_with", "entropy_between", "entropy_within",
-    "flicker_percent", "frames", "frames_empty", "frames_left_out", "fuse_ms_per_frame", "image_space", "key",
-    "left_out", "mean_op", "means", "model", "name", "observations", "points", "psa", "quality", "recurrent",
-    "reduced", "sbd_excess", "sbd_null", "scene", "scores_left_out", "share", "sizes", "stages_ms",
-    "statistics", "strata", "summary", "table", "taxonomy", "truth_file", "unit", "variation", "video_measures",
-    "voxel_size", "voxels", "voxels_file", "well_seen", "op", "evidence", "label", "alpha", "voxel_alpha",
-    "accuracy", "observation_accuracy", "precision", "iou", "miou", "ece", "wrong_of_consistent", "coverage",
-    "compensated_flicker_percent",
+    "K", "accuracy", "advice", "alpha", "backend", "categories", "checked", "classes",
+    "compensated_flicker_percent", "confused_with", "coverage", "ece", "entropy_between", "entropy_within",
+    "evidence", "files", "flicker_percent", "frames", "frames_empty", "frames_left_out", "fuse_ms_per_frame",
+    "image_space", "input", "iou", "key", "label", "left_out", "mean_op", "means", "miou", "model", "name", "notes",
+    "observation_accuracy", "observations", "op", "points", "precision", "psa", "quality", "recurrent", "reduced",
+    "sbd_excess", "sbd_null", "scene", "scores_left_out", "share", "sizes", "stages_ms", "statistics", "strata",
+    "summary", "table", "taxonomy", "truth_file", "unit", "up", "variation", "video_measures", "voxel_alpha",
+    "voxel_size", "voxels", "voxels_file", "well_seen", "wrong_of_consistent",
 ))  # fmt: skip
 """Keys that no measure may have: fields beside its mean in JSON, other differences of maps, other compared numbers."""
 

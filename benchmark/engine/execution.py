@@ -14,6 +14,7 @@ from pathlib import Path
 from semstab.check import Verdict, advise, quick_sample, refuse_unsound, with_invalid_depth, with_voxel_size
 from semstab.check.scene_notes import scene_notes
 from semstab.config import Config
+from semstab.configure import resolve
 from semstab.core.process import trim_malloc
 from semstab.data.records import Record, Result
 from semstab.engine.executors import Executor, InProcess
@@ -26,7 +27,6 @@ from semstab.engine.tiled_units import TiledUnit
 from semstab.engine.units import Plan, Unit, make_plan
 from semstab.engine.work import Job, Start, Work, jobs_of
 from semstab.errors import ConfigError, DataError
-from semstab.settings import resolve
 from semstab.task import open_scenes
 
 logger = logging.getLogger("semstab")

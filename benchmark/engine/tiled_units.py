@@ -44,9 +44,6 @@ GUESS = 4
 UP_VOXELS = 1 << 20
 """The up axis of more voxels is estimated from every n-th."""
 
-TileFrames = tuple[UnitTile, list[int] | None]
-"""A tile and the frames that meet it; of the pass over all frames None."""
-
 
 class TiledUnit:
     """A unit while its tiles are computed: first a pass over its frames, which gives the frames of each tile.
@@ -57,14 +54,14 @@ class TiledUnit:
     def __init__(self, unit: Unit, size: int, folder: Folder, start: Start) -> None:
         self._folder, self._work = folder, Work.of(unit, start)
         self._frames = UnitTile(unit.key, size)
-        self._results: dict[str, TileResult] = {}
+        self._results: dict[UnitTile, TileResult] = {}
         self._samples: list[MapSample] = []
         self._bound: int | None = None
-        self._tiles: dict[str, TileFrames] | None = None
-        self._waiting: list[TileFrames] = [(self._frames, None)]
+        self._tiles: dict[UnitTile, list[int]] | None = None  # the frames that meet each
+        self._waiting = [self._work.in_tile(self._frames)]
         self._advanced, self._failed = 0, False
         if self._take_over(self._frames):
-            self._waiting = self._begin_tiles()
+            self._begin_tiles()
 
     @property
     def name(self) -> str:
@@ -75,8 +72,7 @@ class TiledUnit:
         """Return the next tile; None where there is none, or before the pass over the frames has ended."""
         if self._failed or not self._waiting:
             return None
-        task, frames = self._waiting.pop(0)
-        return (self._work.in_tile(dataclasses.replace(task, bound=self._bound), frames),)
+        return (self._waiting.pop(0).bounded(self._bound),)
 
     def take(self, work: Work) -> Work | None:
         """Take a tile that a worker gave back; return the unit where it came to its end."""
@@ -90,17 +86,17 @@ class TiledUnit:
             self._failed = True
             return self._work.failed(f"{self.name}: tile {work.tile.name} is not in the folder; start it again")
         if self._tiles is None:
-            self._waiting = self._begin_tiles()
+            self._begin_tiles()
         return self.ended()
 
     def ended(self) -> Work | None:
         """Return the unit with its record once all of its tiles are there."""
         if self._tiles is None or len(self._results) < 1 + len(self._tiles):
             return None
-        tiles = {task: self._results[name] for name, (task, _) in self._tiles.items()}
+        tiles = {tile: self._results[tile] for tile in self._tiles}
         sample = MapSample.merged(self._samples) if self._samples else None
         try:
-            record = assembled(self._work, self._results[self._frames.name], tiles, sample)
+            record = assembled(self._work, self._results[self._frames], tiles, sample)
         except SemstabError as error:
             return self._work.failed(error)
         return dataclasses.replace(self._work, record=record)
@@ -112,24 +108,22 @@ class TiledUnit:
         step, self._advanced = max(0, reached - self._advanced), max(reached, self._advanced)
         return step
 
-    def _begin_tiles(self) -> list[TileFrames]:
-        """Return the tiles that are still to be computed; files of the unit that belong to none of them are removed."""
-        frames = self._results[self._frames.name]
-        self._tiles = {}
-        for index, own in frames.tiles().items():
-            task = dataclasses.replace(self._frames, index=index, origin=frames.origin)
-            self._tiles[task.name] = task, own
-        waiting = [own for own in self._tiles.values() if not self._take_over(own[0])]
+    def _begin_tiles(self) -> None:
+        """Queue the tiles that are still to be computed; files of the unit that belong to none of them are removed."""
+        met = self._results[self._frames]
+        any_tile = dataclasses.replace(self._frames, origin=met.origin)
+        self._tiles = {dataclasses.replace(any_tile, index=index): frames for index, frames in met.tiles().items()}
+        missing = {tile: frames for tile, frames in self._tiles.items() if not self._take_over(tile)}
+        self._waiting = [self._work.in_tile(tile, frames) for tile, frames in missing.items()]
         self._folder.clear(self._work.unit, {name for result in self._results.values() for name in result.files})
-        return waiting
 
-    def _take_over(self, task: UnitTile) -> bool:
+    def _take_over(self, tile: UnitTile) -> bool:
         """Take a result from the folder, if its files are there as they were."""
-        result = TileResult.load(self._folder.path / task.folder / f"{task.name}.npz")
+        result = TileResult.load(self._folder.path / tile.folder / f"{tile.name}.npz")
         if result is None or not self._folder.are_whole(result.files):
             return False
-        self._results[task.name] = result
-        if (name := f"{task.folder}/{task.name}.sample") in result.files:
+        self._results[tile] = result
+        if (name := f"{tile.folder}/{tile.name}.sample") in result.files:
             self._samples.append(MapSample.load(self._folder.path / name))
             if sum(len(sample.table) for sample in self._samples) > 2 * MOST_VOXELS:
                 self._samples = [MapSample.merged(self._samples)]

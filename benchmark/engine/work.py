@@ -117,6 +117,10 @@ class Work:
         """Return the same of one tile and these frames alone."""
         return replace(self, tile=tile, frames=self.frames if frames is None else as_range(frames))
 
+    def bounded(self, bound: int | None) -> Work:
+        """Return the same of its tile, with the bound of a sample of voxels."""
+        return self if self.tile is None else replace(self, tile=replace(self.tile, bound=bound))
+
     def failed(self, error: str | Exception) -> Work:
         """Return it with the line of an error; one that is not semstab's own says its type."""
         if isinstance(error, str):

@@ -10,6 +10,7 @@ from typing import Literal
 
 import numpy as np
 
+from semstab.configure import load_config
 from semstab.core.files import write_json
 from semstab.core.prefetch import prefetch
 from semstab.core.types import Int64, UInt8, UInt16
@@ -23,7 +24,6 @@ from semstab.errors import ConfigError, DataError
 from semstab.exports.fused_labels import Belief, FusedLabels, labels_of
 from semstab.exports.relabel_counts import Relabelled, Tally
 from semstab.predict.folder import NO_FOLDER_NAME, PredictionFolder, names_a_folder
-from semstab.settings import load_config
 from semstab.task import Task, read, truth_task
 
 __all__ = ["Belief", "Relabelled", "relabel"]

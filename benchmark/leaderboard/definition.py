@@ -21,12 +21,12 @@ from semstab.config import (
     read_yaml,
     validated,
 )
+from semstab.configure import load_config, predicted_config, shipped_benchmarks
 from semstab.core.prefetch import prefetch
 from semstab.data.labels import LabelSpace
 from semstab.datasets import Scene, open_dataset
 from semstab.errors import ConfigError, DataError
 from semstab.predict.predictor import PredictorConfig
-from semstab.settings import load_config, predicted_config, shipped_benchmarks
 from semstab.task import frame_indices
 
 Number = Literal["alpha", "flicker", "accuracy", "miou", "wrong_of_consistent"]

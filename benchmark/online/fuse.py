@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from semstab.api import run
+from semstab.configure import as_config
 from semstab.core.files import ScratchFolder
 from semstab.data.frames import Frame
 from semstab.data.records import Result
@@ -19,7 +20,6 @@ from semstab.errors import ConfigError
 from semstab.online.frames import Frames, Sequence
 from semstab.online.summary import Summary
 from semstab.report import Reporting, write_report
-from semstab.settings import as_config
 
 
 @dataclasses.dataclass(frozen=True, repr=False)

@@ -17,6 +17,7 @@ import rerun as rr
 
 from semstab.backends import FusionBackend, changes_of, create, expected_bytes
 from semstab.config import BACKENDS, BASE, Config
+from semstab.configure import load_config
 from semstab.core.prefetch import prefetch
 from semstab.core.process import available_bytes
 from semstab.core.types import Float64, Int64
@@ -47,7 +48,6 @@ from semstab.recording.voxel_maps import (
     verdict_report,
 )
 from semstab.report.narrative import not_assessed
-from semstab.settings import load_config
 from semstab.task import Task, read
 
 logger = logging.getLogger("semstab")

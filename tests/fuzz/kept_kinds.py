@@ -15,6 +15,7 @@ from posed_config import configure
 
 import semstab
 from semstab.comparison.writing import compare, load_comparison
+from semstab.configure import load_config, resolve
 from semstab.conformance import case_folder, compared
 from semstab.data.frames import Intrinsics
 from semstab.data.labels import LabelSpace
@@ -32,7 +33,6 @@ from semstab.predict.producer import Producer
 from semstab.recording import Recording
 from semstab.recording.target import is_whole
 from semstab.recording.timeline import Clock, log_file
-from semstab.settings import load_config, resolve
 
 
 def of_kept(folder: Path) -> Iterator[Kind]:

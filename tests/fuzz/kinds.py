@@ -29,6 +29,7 @@ from semstab.comparison.gate import gate_config
 from semstab.comparison.gate_rules import parse
 from semstab.comparison.pairing import pair
 from semstab.comparison.runs import open_run, open_runs, save_summary, shared_scenes
+from semstab.configure import load_config, load_study
 from semstab.convert import convert
 from semstab.core.files import read_json
 from semstab.core.json_form import from_json
@@ -59,7 +60,6 @@ from semstab.predict.folder import PredictionFolder
 from semstab.report.figures.maps import Overview
 from semstab.report.tables import tables
 from semstab.report.terminal import print_summary
-from semstab.settings import load_config, load_study
 from semstab.statistics import CellObservations
 from semstab.statistics.acceptance import AcceptanceThresholds
 from semstab.statistics.cluster_sums import ClusterSums

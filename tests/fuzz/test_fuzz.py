@@ -15,6 +15,7 @@ import pytest
 import yaml
 from image_files import npy_bytes, npz_bytes
 
+from semstab.configure import load_config, resolve
 from semstab.core.files import parse_json
 from semstab.data.georeference import wkt
 from semstab.data.voxels import VoxelTable
@@ -28,7 +29,6 @@ from semstab.models.names import class_names
 from semstab.models.segearth_ov import read_prompts
 from semstab.report.figures.maps import Overview
 from semstab.report.saved_run import read_series
-from semstab.settings import load_config, resolve
 from semstab.statistics import CellObservations
 from semstab.statistics.cluster_sums import ClusterSums
 

@@ -98,8 +98,8 @@ def surface_content(surface):
 
 def write_benchmark_digests():
     """The digest of each benchmark that ships, benchmarks.json: new versions are added, published ones stay."""
+    from semstab.configure import shipped_benchmarks
     from semstab.leaderboard.definition import load_benchmark
-    from semstab.settings import shipped_benchmarks
 
     path = FILE.with_name("benchmarks.json")
     known = json.loads(path.read_text()) if path.exists() else {}

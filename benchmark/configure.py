@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from semstab.config import Config, merge, nearest, read_yaml, validated
-from semstab.config.settings import in_full
+from semstab.config.groups import in_full
 from semstab.datasets import GROUND_TRUTH, open_dataset, resolved
 from semstab.errors import ConfigError
 from semstab.predict.dataset import NAME as PREDICTED
