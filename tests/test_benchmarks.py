@@ -19,6 +19,7 @@ SMALL = {
     "end_to_end": ("96x54", "--size 96x54 --frames 3 --runs 1 --noise 0 --backend numpy --depth png"),
     "gpu": ("96x54", "--device CPU:0 --sizes 96x54 --classes 3 --voxels 9000 --rounds 2 --copied-megabytes 1 "
             "--cpu-backends numba"),
+    "rivals": ("semstab numba", "--size 96x54 --frames 3 --voxel-size 0.2"),
     "statistics": ("all statistics", "--frames 4 --size 64x48 --voxel-size 0.2"),
 }  # fmt: skip
 
@@ -44,3 +45,44 @@ def test_the_benchmark_of_whole_runs_prints_its_tables() -> None:
     assert done.returncode == 0, done.stderr
     assert "as it is" in done.stdout
     assert "with --statistics" in done.stdout
+
+
+TRUNCATING = """
+import json, sys
+import numpy as np
+
+data = open(sys.argv[1], "rb").read()
+size, (K, frames) = np.frombuffer(data, "<f8", 1)[0], np.frombuffer(data, "<i8", 2, 8)
+at, found = 24, {}
+for _ in range(frames):
+    n = int(np.frombuffer(data, "<i8", 1, at)[0])
+    points = np.frombuffer(data, "<f8", 3 * n, at + 32).reshape(n, 3)
+    for point, label in zip(points, np.frombuffer(data, "<i4", n, at + 32 + 24 * n)):
+        found[tuple(np.trunc(point / size))] = label
+    at += 32 + 28 * n
+assert at == len(data) and K == 7
+with open(sys.argv[2], "wb") as out:
+    out.write(np.array(len(found), "<i8").tobytes())
+    out.write(((np.array(list(found)) + 0.5) * size).astype("<f8").tobytes())
+    out.write(np.array(list(found.values()), "<i4").tobytes())
+print(json.dumps({"ms": [1.0] * int(frames), "bytes": 0, "peak_bytes": 0}))
+"""
+"""A program that fuses by truncation towards zero, and keeps the last label."""
+
+
+def test_the_benchmark_of_rivals_compares_a_program_of_the_user(tmp_path) -> None:
+    program, file = tmp_path / "truncating.py", tmp_path / "figures.json"
+    program.write_text(TRUNCATING)
+    (tmp_path / "COMMIT").write_text("abc123\n")
+    words = ["--size", "64x48", "--frames", "2", "--voxel-size", "0.2", "--json", str(file)]
+    words += ["--rival", f"last={sys.executable} {program}", "--commit", f"last={tmp_path}"]
+    command = [sys.executable, str(BENCHMARKS / "bench_rivals.py"), *words]
+    done = subprocess.run(command, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+    assert "last: abc123" in done.stdout
+    rows = {row["name"]: row for row in json.loads(file.read_text())["rows"]}
+    ours, images, last = rows["semstab numba"], rows["semstab numba, depth images"], rows["last"]
+    assert ours["missing"] == ours["extra"] == ours["label_differs"] == 0
+    assert images["voxels"] == pytest.approx(ours["voxels"], rel=0.02)
+    assert last["missing"] > 0  # the noise of a wall at 0 reaches below it
+    assert 0 < last["label_differs"] < 0.5

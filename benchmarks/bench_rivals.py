@@ -1,0 +1,275 @@
+"""CPU time, memory, voxels and labels of semstab's fusion beside other programs that fuse the same points.
+
+    python benchmarks/bench_rivals.py [--rival "NAME=PROGRAM WORDS" ...] [--commit NAME=FOLDER_OR_HASH ...]
+                                      [--size 640x480] [--frames 20] [--classes 7] [--voxel-size 0.02] [--rounds 1]
+                                      [--json FILE]
+
+A camera walks round a noisy room; 12 % of the patches of its label maps err. Each implementation runs as a program of
+its own on one core, and they take turns. The columns:
+
+- CPU ms: a frame after the first, the median over frames and rounds; faster: the time of Open3D's own
+  `VoxelBlockGrid.integrate`, which has no labels, over it
+- bytes: what the process grew by from before the first frame to after the last one, a voxel; peak: to its highest
+- missing, extra: voxels that only numba's map of the same points has, or only the program's
+- label differs: share of their common voxels with another most likely class; without ties: of those where the largest
+  evidence of numba's map is one class's
+
+A rival is a program that you have built from your own checkout; nothing of it is part of semstab. It is called as
+PROGRAM WORDS IN OUT. All numbers are little-endian:
+
+- IN: float64 voxel size, int64 K, int64 frames; then of each frame int64 n, three float64 of the camera's position,
+  n x 3 float64 world points, n int32 labels 0..K-1. A coordinate is a float32 number.
+- OUT: int64 n, n x 3 float64 points, each anywhere in its voxel, n int32 labels. The voxel of x is floor(x / size).
+- Standard output: one line of JSON, {"ms": [CPU time of each frame], "bytes": resident memory after the last frame less
+  that before the first, "peak_bytes": the highest (VmHWM) less that before the first}.
+
+SLIM-VDB (umfieldrobotics/slim-vdb, 89e10e32) was not measured: `VDBVolume.h` names `VecXFGrid` and `VecXF32`, which
+branch slim-vdb of its fork of OpenVDB (7e1f4fe2, the newest at hand) does not have, nor does OpenVDB itself; the fork
+also asks for Boost 1.80, where Debian 12 has 1.74. It fuses along each ray within the truncation of a distance field:
+its voxels would not be those of the points.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import logging
+import os
+import shlex
+import shutil
+import subprocess
+import sys
+import tempfile
+import time
+from collections import defaultdict
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from statistics import median
+from typing import Any
+
+from semstab.core.process import configure_process, trim_malloc
+
+configure_process()  # as the command line does, before anything starts threads
+
+import numpy as np  # noqa: E402
+import room  # noqa: E402
+from bench_statistics import resident  # noqa: E402
+
+import semstab  # noqa: E402
+from semstab import backends  # noqa: E402
+from semstab.core.files import write_json  # noqa: E402
+from semstab.metrics import dominant  # noqa: E402
+
+BASELINE, OURS, IMAGES = "Open3D integrate", "semstab numba", "semstab numba, depth images"
+OWN = {BASELINE: "open3d", OURS: "points", IMAGES: "images"}
+HEADER = "| implementation | CPU ms | faster | voxels | bytes | peak | missing | extra | label differs | without ties |"
+
+
+def seen(size: str, frames: int, K: int) -> list[semstab.Frame]:
+    """The frames of the walk."""
+    width, height = map(int, size.split("x"))
+    return [room.frame(index, width, height, K) for index in range(frames)]
+
+
+def world(frame: semstab.Frame) -> tuple[Any, Any]:
+    """World points of the valid pixels, float32 as a scan has them, and their labels."""
+    assert frame.labels is not None
+    x, y = np.meshgrid(*frame.rays)
+    z = frame.depth.astype(np.float64)
+    points = np.stack([x * z, y * z, z], axis=-1)[frame.valid] @ frame.T_wc[:3, :3].T + frame.T_wc[:3, 3]
+    return points.astype(np.float32), frame.labels[frame.valid]
+
+
+def scan(frame: semstab.Frame) -> semstab.Frame:
+    """The frame as a scan of world points."""
+    points, labels = world(frame)
+    return semstab.Frame(frame.index, points=points, labels=labels, T_wc=np.eye(4))
+
+
+def write_frames(path: Path, frames: Sequence[semstab.Frame], voxel_size: float, K: int) -> None:
+    """Write IN."""
+    with path.open("wb") as file:
+        file.write(np.array(voxel_size, "<f8").tobytes() + np.array([K, len(frames)], "<i8").tobytes())
+        for frame in frames:
+            points, labels = world(frame)
+            file.write(np.array(len(points), "<i8").tobytes() + frame.T_wc[:3, 3].astype("<f8").tobytes())
+            file.write(points.astype("<f8").tobytes() + labels.astype("<i4").tobytes())
+
+
+def highest() -> int:
+    """Bytes of the most memory that this process has had since it last forgot."""
+    status = Path("/proc/self/status").read_text()
+    return 1024 * int(status.split("VmHWM:")[1].split()[0])
+
+
+def fuse(kind: str, out: Path, arguments: argparse.Namespace) -> None:
+    """Be one of our own programs: 'open3d', 'points' or 'images'."""
+    size, K = arguments.voxel_size, arguments.classes
+    small, *frames = seen("64x48", 1, K) + seen(arguments.size, arguments.frames, K)
+    if kind == "points":
+        small, *frames = (scan(frame) for frame in (small, *frames))
+    grid: list[Any] = []
+    make: Callable[[], Callable[[semstab.Frame], object]]
+    if kind == "open3d":
+        import bench_fusion
+
+        for frame in frames:
+            bench_fusion.prepare(frame)
+        small = frames[0]  # it is known by its index
+
+        def make() -> Callable[[semstab.Frame], object]:
+            return bench_fusion.open3d_integrate(size)
+    else:
+
+        def make() -> Callable[[semstab.Frame], object]:
+            grid[:] = [backends.create("numba", voxel_size=size, num_classes=K)]
+            integrate: Callable[[semstab.Frame], object] = grid[0].integrate
+            return integrate
+
+    make()(small)  # loads and compiles
+    integrate = make()
+    trim_malloc()
+    Path("/proc/self/clear_refs").write_text("5")
+    before, ms = resident(), []
+    for frame in frames:
+        started = time.process_time()
+        integrate(frame)
+        ms.append(1e3 * (time.process_time() - started))
+    report = {"ms": ms, "bytes": resident() - before, "peak_bytes": highest() - before}
+    if grid:
+        table = grid[0].table()
+        evidence = np.asarray(table.evidence)
+        ties = (evidence == evidence.max(axis=1, keepdims=True)).sum(axis=1) > 1
+        index = np.stack([table.ix, table.iy, table.iz], axis=1)
+        with out.open("wb") as file:
+            file.write(np.array(len(table), "<i8").tobytes() + ((index + 0.5) * size).astype("<f8").tobytes())
+            file.write(dominant(table).astype("<i4").tobytes() + ties.tobytes())
+    print(json.dumps(report))
+
+
+def read_map(path: Path, voxel_size: float) -> dict[str, Any]:
+    """The distinct voxels of OUT as one sorted number each, their labels, and ties where they are told."""
+    data = path.read_bytes()
+    (n,) = np.frombuffer(data, "<i8", 1)
+    points = np.frombuffer(data, "<f8", 3 * n, 8).reshape(n, 3)
+    labels = np.frombuffer(data, "<i4", n, 8 + 24 * n)
+    a, b, c = np.floor(points / voxel_size).astype(np.int64).T + (1 << 20)
+    voxel, first = np.unique((a << 42) | (b << 21) | c, return_index=True)
+    ties = np.frombuffer(data, np.bool_, -1, 8 + 28 * n)
+    return {"voxel": voxel, "label": labels[first], "ties": ties[first] if len(ties) else None}
+
+
+def compared(ours: dict[str, Any], theirs: dict[str, Any]) -> dict[str, Any]:
+    """Voxels that one of two maps has, and how many labels differ in those of both."""
+    _, a, b = np.intersect1d(ours["voxel"], theirs["voxel"], assume_unique=True, return_indices=True)
+    differs, unique = ours["label"][a] != theirs["label"][b], ~ours["ties"][a]
+    return {
+        "voxels": len(theirs["voxel"]),
+        "missing": len(ours["voxel"]) - len(a),
+        "extra": len(theirs["voxel"]) - len(b),
+        "label_differs": float(differs.mean()) if len(a) else None,
+        "without_ties": float(differs[unique].mean()) if unique.any() else None,
+    }
+
+
+def run(command: Sequence[str], files: Sequence[Path]) -> dict[str, Any]:
+    """Run a program on one core; return what it prints."""
+    one = ["taskset", "-c", str(max(os.sched_getaffinity(0)))] if shutil.which("taskset") else []
+    threads = dict.fromkeys(("NUMBA_NUM_THREADS", "OMP_NUM_THREADS"), "1")
+    words = [*one, *command, *map(str, files)]
+    done = subprocess.run(words, capture_output=True, text=True, check=False, env={**os.environ, **threads})
+    if done.returncode:
+        raise SystemExit(f"{' '.join(words)} ended with {done.returncode}:\n{done.stderr}")
+    report: dict[str, Any] = json.loads(done.stdout.splitlines()[-1])
+    return report
+
+
+def commit(given: str) -> str:
+    """The commit of a checkout: of git, or of the file COMMIT in an archive; a hash is itself."""
+    folder = Path(given)
+    if not folder.is_dir():
+        return given
+    if (folder / "COMMIT").is_file():
+        return (folder / "COMMIT").read_text().strip()
+    words = ["git", "-C", str(folder), "rev-parse", "HEAD"]
+    return subprocess.run(words, capture_output=True, text=True, check=True).stdout.strip()
+
+
+def named(given: Sequence[str]) -> dict[str, str]:
+    """NAME=VALUE as a dictionary."""
+    return {name: value for name, _, value in (one.partition("=") for one in given)}
+
+
+def line(row: dict[str, Any]) -> str:
+    """A row of the table."""
+    cells = [row["name"], f"{row['ms']:.1f}", f"{row['faster']:.2f}"]
+    cells += [f"{row[key]:,.0f}" if row.get(key) is not None else "" for key in ("voxels", "bytes", "peak")]
+    cells += [f"{row[key]:,}" if key in row else "" for key in ("missing", "extra")]
+    cells += [
+        f"{100 * row[key]:.2f} %" if row.get(key) is not None else "" for key in ("label_differs", "without_ties")
+    ]
+    return "| " + " | ".join(cells) + " |"
+
+
+def measure(arguments: argparse.Namespace, rivals: dict[str, str], folder: Path) -> list[dict[str, Any]]:
+    """Rows of the table: Open3D, ours, then the rivals in the order given."""
+    frames = seen(arguments.size, arguments.frames, arguments.classes)
+    given = folder / "frames.bin"
+    write_frames(given, frames, arguments.voxel_size, arguments.classes)
+    options = ["--size", arguments.size, "--frames", str(arguments.frames), "--classes", str(arguments.classes),
+               "--voxel-size", str(arguments.voxel_size)]  # fmt: skip
+    commands = {name: [sys.executable, __file__, *options, "--as", kind] for name, kind in OWN.items()}
+    commands |= {name: shlex.split(words) for name, words in rivals.items()}
+    out = {name: folder / f"{k}.bin" for k, name in enumerate(commands)}
+    reports = defaultdict(list)
+    for _ in range(arguments.rounds):
+        for name, command in commands.items():
+            reports[name].append(run(command, [out[name]] if name in OWN else [given, out[name]]))
+    maps = {name: read_map(path, arguments.voxel_size) for name, path in out.items() if path.exists()}
+    ms = {name: median([t for r in some for t in r["ms"][1:]]) for name, some in reports.items()}
+    rows = []
+    for name, some in reports.items():
+        row = {"name": name, "ms": ms[name], "faster": ms[BASELINE] / ms[name]}
+        if name in maps:
+            row |= compared(maps[OURS], maps[name])
+            row |= {short: median([r[key] for r in some]) / max(1, row["voxels"])
+                    for short, key in (("bytes", "bytes"), ("peak", "peak_bytes"))}  # fmt: skip
+        rows.append(row)
+    return rows
+
+
+def main() -> None:
+    """Print the table."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--rival", action="append", default=[], help="NAME=PROGRAM WORDS, again for each")
+    parser.add_argument("--commit", action="append", default=[], help="NAME=FOLDER of its checkout, or =HASH")
+    parser.add_argument("--size", default="640x480")
+    parser.add_argument("--frames", type=int, default=20)
+    parser.add_argument("--classes", type=int, default=7)
+    parser.add_argument("--voxel-size", type=float, default=0.02)
+    parser.add_argument("--rounds", type=int, default=1)
+    parser.add_argument("--json", help="also write the figures there")
+    parser.add_argument("--as", dest="kind", choices=list(OWN.values()), help=argparse.SUPPRESS)
+    parser.add_argument("out", nargs="?", type=Path, help=argparse.SUPPRESS)
+    arguments = parser.parse_args()
+    logging.getLogger("semstab").setLevel(logging.ERROR)
+    if arguments.kind:
+        fuse(arguments.kind, arguments.out, arguments)
+        return
+    commits = {name: commit(given) for name, given in named(arguments.commit).items()}
+    with tempfile.TemporaryDirectory() as folder:
+        rows = measure(arguments, named(arguments.rival), Path(folder))
+    print(
+        f"{arguments.frames} frames of {arguments.size}, K = {arguments.classes}, {arguments.voxel_size:g} m, one core"
+    )
+    for name, which in commits.items():
+        print(f"{name}: {which}")
+    print(f"{HEADER}\n|---|{'---:|' * (HEADER.count('|') - 2)}")
+    for row in rows:
+        print(line(row), flush=True)
+    if arguments.json:
+        write_json(arguments.json, {"commits": commits, "rows": rows})
+
+
+if __name__ == "__main__":
+    main()
