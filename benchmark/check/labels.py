@@ -215,7 +215,7 @@ def _smooth(edges: Mask) -> Float64:
     grid = edges[: H * cell, : W * cell].reshape(H, cell, W, cell).mean(axis=(1, 3))
     smooth = np.asarray(cv2.GaussianBlur(grid, (0, 0), 1.0), dtype=np.float64)
     smooth -= smooth.mean()
-    normed: Float64 = smooth / max(float(np.linalg.norm(smooth)), 1e-12)
+    normed: Float64 = smooth / max(math.sqrt(np.square(smooth).sum()), 1e-12)
     return normed
 
 

@@ -118,14 +118,15 @@ def _fits(a: Map, b: Map) -> Map:
 
     H, W = a.shape
     reach = max(1, round(REACH * W))
-    spectrum = np.fft.rfft2(a - a.mean(), (2 * H, 2 * W))
+    a = a - a.mean()
+    spectrum = np.fft.rfft2(a, (2 * H, 2 * W))
     fits = []
     for scale in SCALES:
         about = np.array([[scale, 0, (1 - scale) * (W - 1) / 2], [0, scale, (1 - scale) * (H - 1) / 2]])
         warped = cv2.warpAffine(b, about, (W, H), flags=cv2.INTER_LINEAR)
         warped = warped - warped.mean()
         product = np.fft.irfft2(spectrum * np.conj(np.fft.rfft2(warped, (2 * H, 2 * W))), (2 * H, 2 * W))
-        norm = float(np.linalg.norm(a - a.mean()) * np.linalg.norm(warped))
+        norm = math.sqrt(np.square(a).sum() * np.square(warped).sum())  # BLAS would wake its threads for each of them
         near = np.roll(product, (reach, reach), axis=(0, 1))[: 2 * reach + 1, : 2 * reach + 1]
         fits.append(near / max(norm, 1e-12))
     return np.array(fits)
