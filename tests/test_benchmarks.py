@@ -14,6 +14,7 @@ import pytest
 BENCHMARKS = Path(__file__).parents[1] / "benchmarks"
 SMALL = {
     "fusion": ("96x54", "--sizes 96x54 --rounds 1 --conditions", "noise 0.3 %"),
+    "random_scenes": ("worst", "--sizes 96x54 --scenes 2 --noise 0.3 --many 1"),
     "scaling": ("96x54", "--size 96x54 --voxels 1000 5000"),
     "casting": ("96x54", "--size 96x54 --triangles 200 --rounds 1"),
     "end_to_end": ("96x54", "--size 96x54 --frames 3 --runs 1 --noise 0 --backend numpy --depth png"),
