@@ -45,3 +45,13 @@ def test_the_benchmark_of_whole_runs_prints_its_tables() -> None:
     assert done.returncode == 0, done.stderr
     assert "as it is" in done.stdout
     assert "with --statistics" in done.stdout
+
+
+def test_the_benchmark_of_growth_prints_its_exponents_and_draws_them(tmp_path) -> None:
+    """In a process of its own, as it starts others."""
+    words = ["--size", "96x54", "--frames", "1", "--voxels", "500", "--classes", "2", "--times", "1", "2"]
+    command = [sys.executable, str(BENCHMARKS / "bench_growth.py"), *words, "--figure", str(tmp_path / "growth.png")]
+    done = subprocess.run(command, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+    assert "exponent" in done.stdout
+    assert (tmp_path / "growth.png").stat().st_size
