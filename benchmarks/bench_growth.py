@@ -80,7 +80,7 @@ def draw(rows: list[dict[str, Any]], file: Path) -> None:
             own = [row for row in rows if row["growing"] == growing]
             axis.plot([row["times"] for row in own], [row[cost] for row in own], style, color=color, label=growing)
         axis.set_xscale("log", base=2)
-        axis.set_ylim(bottom=0)
+        axis.set_ylim(0, 1.15 * max(row[cost] for row in rows))
         axis.set_ylabel(unit, fontsize=9)
         axis.tick_params(labelsize=8)
         axis.grid(alpha=0.3)
