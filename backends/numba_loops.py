@@ -244,7 +244,10 @@ def count_chain(records, nodes, dense, order, count):
     for i in nb.prange(order.shape[0]):
         at = np.int64(records[order[i]].next)
         if at <= DENSE:
-            count[i + 1] = np.count_nonzero(dense[DENSE - at])
+            classes = 0
+            for k in range(dense.shape[1]):
+                classes += dense[DENSE - at, k] != 0.0
+            count[i + 1] = classes
             continue
         count[i + 1] = 1
         while at >= 0:

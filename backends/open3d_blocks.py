@@ -18,7 +18,7 @@ from open3d.t.geometry import VoxelBlockGrid
 from semstab.backends import FusionBackend
 from semstab.backends.shared.aggregator import Aggregator
 from semstab.backends.shared.association import check_depth, check_frame, check_settings
-from semstab.backends.shared.columns import blocks_of, update_rows
+from semstab.backends.shared.columns import blocks_of, mask_words, update_rows
 from semstab.backends.shared.observations import BeliefChange, Change, MapTotal, Observed, ObservedScores
 from semstab.core.types import Int64
 from semstab.data.evidence import Evidence
@@ -39,12 +39,17 @@ FILLED, OFTEN = 0.2, 1.2
 SPARE, GROWING = 1.3, 1.0
 """Blocks that a grid has room for, and those of the one that it grew from, to each that is seen, on average."""
 
+DENSE = ("evidence", "classes")
+"""Attributes of more than one number."""
+
 COPIED_BLOCKS = 1024
 """Blocks that move at a time when a map grows, so that the copy needs no second map's worth of memory."""
 
 
 class Open3DBlocks(FusionBackend):
     """Incremental fusion on voxel blocks; `grid` is the VoxelBlockGrid, its attributes named as VoxelTable's columns.
+
+    One is not among those: the bits of `classes` tell of which classes a voxel has evidence.
 
     A map reaches 2^20 voxels to either side of its first camera.
 
@@ -72,6 +77,7 @@ class Open3DBlocks(FusionBackend):
         self.attributes = {
             "op": (o3c.int32, 1),
             "evidence": (o3c.float64, num_classes),
+            "classes": (o3c.int64, mask_words(num_classes)),
             "drift_sum": (o3c.float64, 1),
             "pixels": (o3c.int64, 1),
             "first_frame": (o3c.int32, 1),
@@ -90,7 +96,8 @@ class Open3DBlocks(FusionBackend):
         other. An empty one has blocks.
         """
         room = SPARE if soft else SPARE + GROWING
-        return int(max(room * voxels / (OFTEN * FILLED), LEAST_BLOCKS * 4**3) * (8 * num_classes + 48))
+        voxel_bytes = 8 * (num_classes + mask_words(num_classes)) + 48
+        return int(max(room * voxels / (OFTEN * FILLED), LEAST_BLOCKS * 4**3) * voxel_bytes)
 
     def integrate(self, frame: Frame) -> FrameReport:
         """Fuse one frame: aggregate its pixels to voxels, activate the blocks, update the touched voxels."""
@@ -121,7 +128,8 @@ class Open3DBlocks(FusionBackend):
         index = self._index_of(rows)
         order = np.lexsort(index.T[::-1])
         rows = rows[order]
-        values: dict[str, Any] = {name: self._read(name, rows) for name in self.attributes if name != "evidence"}
+        columns = [name for name in self.attributes if name not in DENSE]
+        values: dict[str, Any] = {name: self._read(name, rows) for name in columns}
         evidence = Evidence.read(len(rows), self.num_classes, lambda some: self._read("evidence", rows[some]))
         return VoxelTable(**index_columns(index[order]), **values, evidence=evidence, voxel_size=self.voxel_size)
 
@@ -178,7 +186,7 @@ class Open3DBlocks(FusionBackend):
         """Add one observation to each row; return the change of the map, and of each voxel as `Changes` has it."""
         names = tuple(self.attributes)
         values = {name: self._attribute(name).numpy() if self.in_place else self._read(name, rows) for name in names}
-        columns = {name: value if name == "evidence" else value.reshape(-1) for name, value in values.items()}
+        columns = {name: value if name in DENSE else value.reshape(-1) for name, value in values.items()}
         change = update_rows(rows if self.in_place else np.arange(len(rows)), seen, frame, **columns)
         if not self.in_place:
             for name in names:
@@ -195,7 +203,7 @@ class Open3DBlocks(FusionBackend):
 
     def _read(self, name: str, rows: Int64) -> npt.NDArray[Any]:
         values: npt.NDArray[Any] = self._attribute(name)[self._tensor(rows)].cpu().numpy()
-        return values if name == "evidence" else values[:, 0]
+        return values if name in DENSE else values[:, 0]
 
     def _write(self, name: str, rows: Int64, values: npt.NDArray[Any]) -> None:
         attribute = self._attribute(name)

@@ -1,6 +1,6 @@
 """The command line on a folder of PNGs, against the bare OpenCV decode of the same files on the same cores.
 
-    python benchmarks/bench_end_to_end.py --backend open3d --json end_to_end.json
+    python benchmarks/bench_end_to_end.py --backend open3d --size 640x480 3840x2160 --json end_to_end.json
 
 A folder is made for each kind of depth and noise level: views of the built-in city, rendered at half the size and
 scaled up (depth linearly, labels to the nearest), depth with Gaussian noise of so many mm, as sensors have it, as
@@ -44,17 +44,19 @@ DEPTH_SCALE = 500  # units a metre: 16 bits reach 131 m, beyond the city's farth
 def main() -> None:
     arguments = parsed()
     os.sched_setaffinity(0, sorted(os.sched_getaffinity(0))[: arguments.threads])
-    width, height = (int(number) for number in arguments.size.split("x"))
-    results = []
-    with tempfile.TemporaryDirectory() as folder:
-        views = rendered(width, height, arguments.frames)
-        for depth, noise in itertools.product(arguments.depth, arguments.noise):
-            root = Path(folder) / f"{depth}{noise:g}"
-            write_scene(root, views, (width, height), noise, depth)
-            for backend in arguments.backend:
-                results.append({"depth": depth, "noise_mm": noise, **measured(root, backend, arguments)})
-                print(f"{depth}, {noise:g} mm, {backend}: {results[-1]['ratio']:.2f}", file=sys.stderr, flush=True)
-            shutil.rmtree(root)
+    results: list[dict[str, Any]] = []
+    for size in arguments.size:
+        width, height = (int(number) for number in size.split("x"))
+        with tempfile.TemporaryDirectory() as folder:
+            views = rendered(width, height, arguments.frames)
+            for depth, noise in itertools.product(arguments.depth, arguments.noise):
+                root = Path(folder) / f"{depth}{noise:g}"
+                write_scene(root, views, (width, height), noise, depth)
+                for backend in arguments.backend:
+                    row = measured(root, backend, arguments)
+                    results.append({"size": size, "depth": depth, "noise_mm": noise, **row})
+                    print(f"{size}, {depth}, {noise:g} mm, {backend}: {row['ratio']:.2f}", file=sys.stderr, flush=True)
+                shutil.rmtree(root)
     report = {
         "command": " ".join(["python", *sys.argv]),
         "machine": f"{platform.processor() or platform.machine()}, {arguments.threads} cores",
@@ -70,7 +72,7 @@ def main() -> None:
 def parsed() -> argparse.Namespace:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--backend", nargs="+", default=["numba"])
-    parser.add_argument("--size", default="3840x2160")
+    parser.add_argument("--size", nargs="+", default=["3840x2160"])
     parser.add_argument("--frames", type=int, default=24)
     parser.add_argument("--noise", type=float, nargs="+", default=[0.0, 10.0, 50.0], help="of the depth, mm")
     parser.add_argument(
@@ -184,9 +186,10 @@ def seconds(work: Callable[[], object]) -> float:
 
 def print_report(report: dict[str, Any]) -> None:
     console = Console(width=120)
-    table = Table(title=f"end to end, {report['size']}, {report['frames']} frames, {report['machine']}")
+    table = Table(title=f"end to end, {report['frames']} frames, {report['machine']}")
     stages = Table(title="mean ms a frame by stage (decode: in the workers, beside the rest)")
     for name in (
+        "size",
         "backend",
         "depth",
         "noise mm",
@@ -199,10 +202,10 @@ def print_report(report: dict[str, Any]) -> None:
         "results s",
     ):
         table.add_column(name, justify="right")
-    for name in ("backend", "depth", "noise mm", *report["results"][0]["stages_ms"]):
+    for name in ("size", "backend", "depth", "noise mm", *report["results"][0]["stages_ms"]):
         stages.add_column(name, justify="right")
     for row in report["results"]:
-        lead = (row["backend"], row["depth"], f"{row['noise_mm']:g}")
+        lead = (row["size"], row["backend"], row["depth"], f"{row['noise_mm']:g}")
         spent = row["seconds"]
         table.add_row(
             *lead, f"{row['megabytes_a_frame']:.1f}", f"{row['bare_decode_ms']:.1f}", f"{row['loop_ms']:.1f}",

@@ -6,7 +6,7 @@
 The frames fly along a street of facades, trees and sky. 'first' is the first frame of a new map, code already compiled;
 'later' the median of all others, most of whose voxels are known; both user and system time of all threads, which other
 work on the machine changes little. 'faster' is Open3D's own time over that of the backend, later frames. The
-implementations take turns.
+implementations take turns, frame by frame.
 """
 
 from __future__ import annotations
@@ -92,15 +92,19 @@ def measure(
             return lambda: open3d_integrate(voxel_size)
         return lambda: backends.create(name, voxel_size=voxel_size, num_classes=K).integrate
 
-    first, later = defaultdict(list), defaultdict(list)
+    times: dict[str, list[list[float]]] = defaultdict(list)
     for name in names:  # compiles what is compiled on first use
         maker(name)()(frames[0])
     for _ in range(rounds):
+        maps = {name: maker(name)() for name in names}
         for name in names:
-            integrate = maker(name)()
-            times = [cpu_milliseconds(integrate, frame) for frame in (*frames, *frames)]
-            first[name].append(times[0])
-            later[name].extend(times[1:])
+            times[name].append([])
+        for frame in (*frames, *frames):  # in turns: what else the machine does meets all of them alike
+            for name in names:
+                times[name][-1].append(cpu_milliseconds(maps[name], frame))
+        del maps
+    first = {name: [a_round[0] for a_round in times[name]] for name in names}
+    later = {name: [each for a_round in times[name] for each in a_round[1:]] for name in names}
     return {name: {"first_ms": median(first[name]), "later_ms": median(later[name])} for name in names}
 
 

@@ -14,6 +14,7 @@ import pytest
 BENCHMARKS = Path(__file__).parents[1] / "benchmarks"
 SMALL = {
     "fusion": ("96x54", "--sizes 96x54 --rounds 1 --conditions", "noise 0.3 %"),
+    "random_scenes": ("worst", "--sizes 96x54 --scenes 2 --noise 0.3 --many 1"),
     "scaling": ("96x54", "--size 96x54 --voxels 1000 5000"),
     "casting": ("96x54", "--size 96x54 --triangles 200 --rounds 1"),
     "end_to_end": ("96x54", "--size 96x54 --frames 3 --runs 1 --noise 0 --backend numpy --depth png"),
@@ -86,3 +87,13 @@ def test_the_benchmark_of_rivals_compares_a_program_of_the_user(tmp_path) -> Non
     assert images["voxels"] == pytest.approx(ours["voxels"], rel=0.02)
     assert last["missing"] > 0  # the noise of a wall at 0 reaches below it
     assert 0 < last["label_differs"] < 0.5
+
+
+def test_the_benchmark_of_growth_prints_its_exponents_and_draws_them(tmp_path) -> None:
+    """In a process of its own, as it starts others."""
+    words = ["--size", "96x54", "--frames", "1", "--voxels", "500", "--classes", "2", "--times", "1", "2"]
+    command = [sys.executable, str(BENCHMARKS / "bench_growth.py"), *words, "--figure", str(tmp_path / "growth.png")]
+    done = subprocess.run(command, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+    assert "exponent" in done.stdout
+    assert (tmp_path / "growth.png").stat().st_size

@@ -81,6 +81,42 @@ def test_where_nothing_can_be_kept_it_is_compiled_anew(installed, tmp_path) -> N
     assert not list(theirs.iterdir())
 
 
+COUNT = """
+from numba.core import event
+
+class Counter(event.Listener):
+    compiled = 0
+
+    def on_start(self, event):
+        Counter.compiled += 1
+
+    def on_end(self, event):
+        pass
+
+event.register("numba:compile", Counter())
+
+import numpy as np
+from semstab.backends.shared.columns import blocks_of
+
+blocks_of(np.zeros((1, 3), np.int64), 4)
+print(Counter.compiled)
+"""
+
+
+def test_a_read_only_install_is_compiled_once_into_the_cache_of_the_user(installed, tmp_path) -> None:
+    (installed / "program_that_counts.py").write_text(COUNT)
+    home = tmp_path / "of the user"
+    home.mkdir()
+    counts = []
+    for _ in range(2):
+        done = run(installed / "program_that_counts.py", (), tmp_path, HOME=str(home))
+        assert done.returncode == 0, done.stderr
+        counts.append(int(done.stdout))
+    assert counts[0] > 0
+    assert counts[1] == 0
+    assert list(home.rglob("columns._number*.nbi"))
+
+
 HELPERS = """
 from semstab.core.compiled import serial
 

@@ -12,8 +12,9 @@ from posed_config import configure
 
 import semstab
 from semstab.backends import create, expected_bytes
+from semstab.backends.shared.observations import WorkSpace
 from semstab.config import Config
-from semstab.core.process import available_bytes
+from semstab.core.process import available_bytes, resident_bytes
 from semstab.data.frames import Frame, Intrinsics
 from semstab.engine import memory
 from semstab.engine.units import Plan, make_plan
@@ -125,3 +126,12 @@ def test_the_reference_with_many_classes_takes_little_more_than_its_map_for_a_fr
     _, peak = tracemalloc.get_traced_memory()
     tracemalloc.stop()
     assert peak < expected_bytes("numpy", voxels, voxels, K) + 10 * 8 * K * voxels + 1e7
+
+
+def test_room_that_is_not_written_to_takes_no_memory() -> None:
+    """Large pages would take all of it: work space of a 4K image has a gap after the entries of each band of rows."""
+    before = resident_bytes()
+    room = WorkSpace().room("word", 1 << 25, gaps=True)
+    room[:: 1 << 18] = 1  # every 2 MB
+    assert room[1 << 18] == 1
+    assert resident_bytes() - before < 32e6

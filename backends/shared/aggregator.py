@@ -148,9 +148,9 @@ class Aggregator:
         room = rows * width + (columns + 1) * rows + 2 * table  # memory that is not written to is not taken
         stretches = space.room("stretches", threads, 4, columns + 2 * tile_loops.LANES)
         found = Words(
-            space.room("word", bands * room),
-            space.room("count", bands * room, dtype=np.int32),
-            space.room("partition", bands * room, dtype=np.uint8),
+            space.room("word", bands * room, gaps=True),
+            space.room("count", bands * room, dtype=np.int32, gaps=True),
+            space.room("partition", bands * room, dtype=np.uint8, gaps=True),
             room,
             entries=np.zeros(bands, dtype=np.int64),
             lost=np.zeros(bands, dtype=np.int64),

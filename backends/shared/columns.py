@@ -6,6 +6,9 @@ from typing import Any
 
 import numba as nb
 import numpy as np
+from llvmlite import ir
+from numba.core import types
+from numba.extending import intrinsic
 
 from semstab.backends.shared.beliefs import js_term, plogp
 from semstab.backends.shared.keys import PARTITIONS, mix
@@ -15,11 +18,27 @@ from semstab.core.compiled import parallel, serial
 from semstab.core.types import Int32, Int64
 from semstab.data.results import RECURRENT
 
+WORD = 64
+"""Classes whose bits are in one number of a row's mask."""
+
+
+def mask_words(num_classes: int) -> int:
+    """Return the numbers of a mask."""
+    return -(-num_classes // WORD)
+
+
+@intrinsic
+def _lowest(_typing: Any, _mask: Any) -> Any:
+    """Return the position of the lowest bit of an int64 that is not 0."""
+    signature = types.int64(types.int64)
+    return signature, lambda _, builder, __, given: builder.cttz(given[0], ir.Constant(ir.IntType(1), 1))
+
 
 def update_rows(rows: Int64, seen: Observed, frame: int, **columns: Any) -> tuple[Change, BeliefChange]:
     """Add a frame's observations to rows of dense columns, in place.
 
-    columns are evidence (N, K) and the others of VoxelTable (N,), all 0 in rows not seen before.
+    columns are evidence (N, K), classes (N, `mask_words`), whose bits tell which evidence is not 0, and the others of
+    VoxelTable (N,), all 0 in rows not seen before. So a row costs the classes that it has seen, not K.
 
     Returns:
         The change of the map, and that of the belief of each row.
@@ -28,9 +47,9 @@ def update_rows(rows: Int64, seen: Observed, frame: int, **columns: Any) -> tupl
     sums = np.zeros((PARTITIONS, 5))
     changed = BeliefChange.room(len(rows))
     _update_rows(
-        rows, chunks, seen.start, seen.label, seen.weight, seen.pixels, frame, sums, columns["evidence"], columns["op"],
-        columns["drift_sum"], columns["pixels"], columns["first_frame"], columns["last_frame"], columns["self_sum"],
-        columns["frame_entropy_sum"], *changed,
+        rows, chunks, seen.start, seen.label, seen.weight, seen.pixels, frame, sums, columns["evidence"],
+        columns["classes"], columns["op"], columns["drift_sum"], columns["pixels"], columns["first_frame"],
+        columns["last_frame"], columns["self_sum"], columns["frame_entropy_sum"], *changed,
     )  # fmt: skip
     vss, entropy, drift, new, recurrent = sums.sum(axis=0)
     return Change.of((seen.pixels.sum(), len(rows), new, drift, vss, entropy, recurrent)), changed
@@ -38,19 +57,22 @@ def update_rows(rows: Int64, seen: Observed, frame: int, **columns: Any) -> tupl
 
 @parallel
 def _update_rows(
-    rows, chunks, start, label, weight, seen_pixels, frame, sums, evidence, op, drift_sum, pixels, first_frame,
-    last_frame, self_sum, frame_entropy_sum, drift_of, class_before, class_after,
+    rows, chunks, start, label, weight, seen_pixels, frame, sums, evidence, classes, op, drift_sum, pixels,
+    first_frame, last_frame, self_sum, frame_entropy_sum, drift_of, class_before, class_after,
 ):  # fmt: skip
     K = evidence.shape[1]
-    flat = evidence.reshape(-1)
+    flat, masks = evidence.reshape(-1), classes.reshape(-1)
+    words = classes.shape[1]
     for chunk in nb.prange(PARTITIONS):
         s = np.zeros(K)
         vss = entropy = drifted = 0.0
         new = recurrent = 0
         for i in range(chunks[chunk], chunks[chunk + 1]):
-            ahead = rows[min(i + AHEAD, chunks[chunk + 1] - 1)]
+            later = min(i + AHEAD, chunks[chunk + 1] - 1)
+            ahead = rows[later]
             touch(op, ahead)
-            touch(flat, ahead * K)
+            touch(flat, ahead * K + label[start[later]])
+            touch(masks, ahead * words)
             touch(drift_sum, ahead)
             touch(pixels, ahead)
             touch(first_frame, ahead)
@@ -60,26 +82,30 @@ def _update_rows(
             r = rows[i]
             T = op[r]
             for e in range(start[i], start[i + 1]):
+                k = np.int64(label[e])
                 share = weight[e] / seen_pixels[i]
-                s[label[e]] = share
+                s[k] = share
+                classes[r, k // WORD] |= np.int64(1) << (k % WORD)
                 self_sum[r] += share * share
-                frame_entropy_sum[r] -= plogp(share)
+                frame_entropy_sum[r] -= plogp(share) if share != 1.0 else 0.0
             top_before = top_after = drift = 0.0
-            before = after = 0
-            for k in range(K):
-                if evidence[r, k] == 0.0 and s[k] == 0.0:
-                    continue
-                p = evidence[r, k] / max(T, 1)
-                evidence[r, k] += s[k]
-                q = evidence[r, k] / (T + 1)
-                s[k] = 0.0
-                if p > top_before:
-                    top_before, before = p, k
-                if q > top_after:
-                    top_after, after = q, k
-                if p != 1.0 or q != 1.0:
-                    entropy += plogp(p) - plogp(q)
-                    drift += js_term(p, q)
+            before = after = np.int64(0)
+            for word in range(words):
+                left = classes[r, word]
+                while left != 0:
+                    k = word * WORD + _lowest(left)
+                    left &= left - 1
+                    p = evidence[r, k] / max(T, 1)
+                    evidence[r, k] += s[k]
+                    q = evidence[r, k] / (T + 1)
+                    s[k] = 0.0
+                    if p > top_before:
+                        top_before, before = p, k
+                    if q > top_after:
+                        top_after, after = q, k
+                    if p != 1.0 or q != 1.0:
+                        entropy += plogp(p) - plogp(q)
+                        drift += js_term(p, q)
             vss += top_after - top_before
             if T == 0:
                 new += 1

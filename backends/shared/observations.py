@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import contextlib
 import math
+import mmap
 import time
 from collections.abc import Iterable
 from dataclasses import dataclass
@@ -85,15 +87,25 @@ class WorkSpace:
     def __init__(self) -> None:
         self._arrays: dict[str, npt.NDArray[Any]] = {}
 
-    def room(self, name: str, *shape: int, dtype: Any = np.int64) -> npt.NDArray[Any]:
-        """Return an array of that shape with whatever is in it."""
+    def room(self, name: str, *shape: int, dtype: Any = np.int64, gaps: bool = False) -> npt.NDArray[Any]:
+        """Return an array of that shape with whatever is in it; with `gaps`, most of it will not be written to."""
         size = int(np.prod(shape))
         if name not in self._arrays or len(self._arrays[name]) < size:
             length = max(size, 1) * np.dtype(dtype).itemsize
-            room = np.empty(length + LINE, dtype=np.uint8)
+            room = _in_small_pages(length + LINE) if gaps else np.empty(length + LINE, dtype=np.uint8)
             start = -room.ctypes.data % LINE
             self._arrays[name] = room[start : start + length].view(dtype)
         return self._arrays[name][:size].reshape(shape)
+
+
+def _in_small_pages(length: int) -> npt.NDArray[np.uint8]:
+    """Return bytes of which only pages that are written to take memory; numpy asks for pages of 2 MB where it can."""
+    own = {"flags": mmap.MAP_PRIVATE | mmap.MAP_ANONYMOUS} if hasattr(mmap, "MAP_ANONYMOUS") else {}
+    pages = mmap.mmap(-1, length, **own)
+    if hasattr(mmap, "MADV_NOHUGEPAGE"):
+        with contextlib.suppress(OSError):  # a kernel without large pages
+            pages.madvise(mmap.MADV_NOHUGEPAGE)
+    return np.frombuffer(pages, dtype=np.uint8)
 
 
 # Totals of a map as it grows, whatever holds its voxels, and the report of each frame made of them.
