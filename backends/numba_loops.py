@@ -12,7 +12,7 @@ from typing import Any
 import numba as nb
 import numpy as np
 
-from semstab.backends.shared.beliefs import observe_row, plogp
+from semstab.backends.shared.beliefs import observe_row, plogp, plogp_unseen
 from semstab.backends.shared.keys import PARTITIONS, mix
 from semstab.backends.shared.pixel_keys import AHEAD, touch
 from semstab.core.compiled import compiled, parallel, serial
@@ -108,7 +108,7 @@ def _observe_voxel(record, nodes, ranges, s, label, weight, first, last, pixels,
     for e in range(first, last):
         s[label[e]] = weight[e] / pixels
     before, after = 1.0 / max(op, 1), 1.0 / (op + 1)
-    top_before = top_after = plogp_before = plogp_between = plogp_after = 0.0
+    plogp_before = plogp_between = plogp_after = unseen = logarithms = 0.0
     most_before = most_after = -1.0
     dominant_before = dominant_after = np.int64(0)
     at = np.int64(-2)  # the record itself
@@ -118,23 +118,26 @@ def _observe_voxel(record, nodes, ranges, s, label, weight, first, last, pixels,
         leads = (value > most_before) | ((value == most_before) & (lab < dominant_before))
         dominant_before = lab if leads else dominant_before
         most_before = max(most_before, value)
-        p = value * before
-        value += s[lab]
+        was, share = value, s[lab]
+        value += share
         s[lab] = 0.0
         leads = (value > most_after) | ((value == most_after) & (lab < dominant_after))
         dominant_after = lab if leads else dominant_after
         most_after = max(most_after, value)
-        q = value * after
         if at == -2:
             record.value = value
             following = np.int64(record.next)
         else:
             nodes[at].value = value
             following = np.int64(nodes[at].next)
-        top_before, top_after = max(top_before, p), max(top_after, q)
-        plogp_before += plogp(p)
-        plogp_between += plogp(0.5 * (p + q))
-        plogp_after += plogp(q)
+        if share == 0.0:
+            unseen += value
+            logarithms += plogp(value)
+        else:
+            p, q = was * before, value * after
+            plogp_before += plogp(p)
+            plogp_between += plogp(0.5 * (p + q))
+            plogp_after += plogp(q)
         if following < 0:
             break
         at = following
@@ -159,10 +162,14 @@ def _observe_voxel(record, nodes, ranges, s, label, weight, first, last, pixels,
             if share > most_after or (share == most_after and lab < dominant_after):
                 most_after, dominant_after = share, lab
             q = share * after
-            top_after = max(top_after, q)
             plogp_between += plogp(0.5 * q)
             plogp_after += plogp(q)
-    out[0] = top_after - top_before
+    if unseen > 0.0:
+        of_unseen = plogp_unseen(unseen, logarithms, np.int64(op))
+        plogp_before += of_unseen[0]
+        plogp_between += of_unseen[1]
+        plogp_after += of_unseen[2]
+    out[0] = most_after * after - most_before * before
     out[1] = plogp_before - plogp_after
     out[2] = min(max(0.5 * (plogp_before + plogp_after) - plogp_between, 0.0), 1.0) if op > 0 else 0.0
     out[3], out[4] = dominant_before, dominant_after

@@ -181,6 +181,35 @@ def js_term(p, q):
     return 0.5 * term
 
 
+WHOLE = np.concatenate([[0.0], np.log2(np.arange(1, 2048))])
+"""The binary logarithms of the first whole numbers, 0 for 0."""
+
+
+@serial
+def _log_of_whole(n):
+    return WHOLE[n] if n < len(WHOLE) else np.log2(np.float64(n))
+
+
+@serial
+def plogp_unseen(evidence, logarithms, op):
+    """Return what classes that a frame does not see add to the sums of p log2 p before the frame, between and after.
+
+    Their evidence v stays, and its share goes from v / op to v / (op + 1): one logarithm a class is enough for all
+    three sums. `op` is 1 at least; between is the mean of both distributions, as for the drift.
+
+    - `evidence`: the sum of v over these classes
+    - `logarithms`: the sum of v log2 v
+    """
+    log_before, log_after = _log_of_whole(op), _log_of_whole(op + 1)
+    before, after = 1.0 / op, 1.0 / (op + 1)
+    mean, log_mean = 0.5 * (before + after), _log_of_whole(2 * op + 1) - log_before - log_after - 1.0
+    return (
+        before * (logarithms - evidence * log_before),
+        mean * (logarithms + evidence * log_mean),
+        after * (logarithms - evidence * log_after),
+    )
+
+
 @compiled(forceinline=True)
 def observe_row(evidence, sums, pixels, op, dominant, plogp_before, out):
     """Add one observation to a voxel's dense evidence, seen `op` times before.

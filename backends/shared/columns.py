@@ -10,7 +10,7 @@ from llvmlite import ir
 from numba.core import types
 from numba.extending import intrinsic
 
-from semstab.backends.shared.beliefs import js_term, plogp
+from semstab.backends.shared.beliefs import plogp, plogp_unseen
 from semstab.backends.shared.keys import PARTITIONS, mix
 from semstab.backends.shared.observations import BeliefChange, Change, Observed
 from semstab.backends.shared.pixel_keys import AHEAD, touch
@@ -88,30 +88,43 @@ def _update_rows(
                 classes[r, k // WORD] |= np.int64(1) << (k % WORD)
                 self_sum[r] += share * share
                 frame_entropy_sum[r] -= plogp(share) if share != 1.0 else 0.0
-            top_before = top_after = drift = 0.0
+            most_before = most_after = plogp_before = plogp_between = plogp_after = unseen = logarithms = 0.0
             before = after = np.int64(0)
+            share_before, share_after = 1.0 / max(T, 1), 1.0 / (T + 1)
             for word in range(words):
                 left = classes[r, word]
                 while left != 0:
                     k = word * WORD + _lowest(left)
                     left &= left - 1
-                    p = evidence[r, k] / max(T, 1)
-                    evidence[r, k] += s[k]
-                    q = evidence[r, k] / (T + 1)
+                    was, share = evidence[r, k], s[k]
+                    value = was + share
+                    evidence[r, k] = value
                     s[k] = 0.0
-                    if p > top_before:
-                        top_before, before = p, k
-                    if q > top_after:
-                        top_after, after = q, k
-                    if p != 1.0 or q != 1.0:
-                        entropy += plogp(p) - plogp(q)
-                        drift += js_term(p, q)
-            vss += top_after - top_before
+                    if was > most_before:
+                        most_before, before = was, k
+                    if value > most_after:
+                        most_after, after = value, k
+                    if share == 0.0:
+                        unseen += value
+                        logarithms += plogp(value)
+                    elif was != T or share != 1.0:  # else a voxel of one class, whose belief stays
+                        p, q = was * share_before, value * share_after
+                        plogp_before += plogp(p)
+                        plogp_between += plogp(0.5 * (p + q))
+                        plogp_after += plogp(q)
+            if unseen > 0.0:
+                of_unseen = plogp_unseen(unseen, logarithms, np.int64(T))
+                plogp_before += of_unseen[0]
+                plogp_between += of_unseen[1]
+                plogp_after += of_unseen[2]
+            entropy += plogp_before - plogp_after
+            drift = 0.0
+            vss += most_after * share_after - most_before * share_before
             if T == 0:
                 new += 1
                 first_frame[r], last_frame[r] = frame, frame
             else:
-                drift = min(max(drift, 0.0), 1.0)
+                drift = min(max(0.5 * (plogp_before + plogp_after) - plogp_between, 0.0), 1.0)
                 drifted += drift
                 drift_sum[r] += drift
                 first_frame[r], last_frame[r] = min(first_frame[r], frame), max(last_frame[r], frame)
