@@ -9,7 +9,8 @@ where the run is `--recorded`, and only there; so does the bare decode. A bare r
 Noise 0 compresses best, so its bare decode is the fastest: the harder case. Both sides read files that are in the page
 cache, and are bound to the same cores. Command and bare decode take turns; the figures are medians. One unmeasured
 start compiles what is compiled on first use. Nothing is subtracted: the whole process has a row of its own, and `loop`
-is what manifest.json says of reading, flicker, fusion and observers.
+is what manifest.json says of reading, flicker, fusion and observers. `CPU ratio` is that of the user and system time of
+all threads meanwhile (staged.py) to that of the bare decode: the one to look at on a machine that is not quiet.
 """
 
 from __future__ import annotations
@@ -37,7 +38,7 @@ from rich.table import Table
 
 from semstab.datasets import open_dataset
 
-COMMAND = str(Path(sys.executable).with_name("semstab-bench"))
+COMMAND = (sys.executable, str(Path(__file__).with_name("staged.py")))
 DEPTH_SCALE = 500  # units a metre: 16 bits reach 131 m, beyond the city's farthest corner
 
 
@@ -55,7 +56,9 @@ def main() -> None:
                 for backend in arguments.backend:
                     row = measured(root, backend, arguments)
                     results.append({"size": size, "depth": depth, "noise_mm": noise, **row})
-                    print(f"{size}, {depth}, {noise:g} mm, {backend}: {row['ratio']:.2f}", file=sys.stderr, flush=True)
+                    print(
+                        f"{size}, {depth}, {noise:g} mm, {backend}: {row['cpu_ratio']:.2f}", file=sys.stderr, flush=True
+                    )
                 shutil.rmtree(root)
     report = {
         "command": " ".join(["python", *sys.argv]),
@@ -80,6 +83,7 @@ def parsed() -> argparse.Namespace:
         help="16-bit PNG, alone or beside colour as JPEG; or float32 metres",
     )  # fmt: skip
     parser.add_argument("--recorded", action="store_true", help="write the recording, which takes colour")
+    parser.add_argument("--voxel-size", type=float, help="metres; else what the command chooses")
     parser.add_argument("--runs", type=int, default=5)
     parser.add_argument("--threads", type=int, default=2, help="cores for both sides, and decoding threads")
     parser.add_argument("--json", type=Path)
@@ -128,9 +132,11 @@ def measured(root: Path, backend: str, arguments: argparse.Namespace) -> dict[st
     colors = root.glob("color/*") if arguments.recorded else ()
     files = sorted([*root.glob("depth/*"), *root.glob("labels/net/*.png"), *colors], key=lambda path: path.stem)
     run_command(root, backend, arguments)
-    runs, bare = [], []
+    runs, bare, bare_cpu = [], [], []
     for _ in range(arguments.runs):
+        used = time.process_time()
         bare.append(seconds(lambda: decode_all(files, arguments.threads)) * 1e3 / arguments.frames)
+        bare_cpu.append(time.process_time() - used)
         runs.append(run_command(root, backend, arguments))
     middle = {key: statistics.median(run[key] for run in runs) for key in runs[0] if key != "stages_ms"}
     stages = {name: [run["stages_ms"][name] for run in runs] for name in runs[0]["stages_ms"]}
@@ -140,9 +146,11 @@ def measured(root: Path, backend: str, arguments: argparse.Namespace) -> dict[st
         "megabytes_a_frame": sum(path.stat().st_size for path in files) / arguments.frames / 1e6,
         "bare_decode_ms": decode,
         "bare_decode_ms_runs": bare,
+        "voxel_size": middle["voxel_size"],
         "loop_ms": middle["loop"] * 1e3 / arguments.frames,
         "loop_ms_runs": [run["loop"] * 1e3 / arguments.frames for run in runs],
         "ratio": middle["loop"] * 1e3 / arguments.frames / decode,
+        "cpu_ratio": middle["loop_cpu"] / statistics.median(bare_cpu),
         "seconds": middle,
         "stages_ms": {k: None if None in v else statistics.median(v) for k, v in stages.items()},
     }  # fmt: skip
@@ -165,13 +173,24 @@ def run_command(root: Path, backend: str, arguments: argparse.Namespace) -> dict
         recording = str(Path(out) / "recording.rrd") if arguments.recorded else "off"
         options = ["--check", "none", "--rerun", recording, "--quiet", "--set", f"threads={arguments.threads}"]
         options += ["--report", "off", "--out", out]
-        command = [COMMAND, "--backend", backend, "--data", str(root), *options]
+        watched = Path(out) / "stages.json"
+        options += [] if arguments.voxel_size is None else ["--voxel-size", str(arguments.voxel_size)]
+        command = [*COMMAND, str(watched), "run", "--backend", backend, "--data", str(root), *options]
         whole = seconds(lambda: subprocess.run(command, check=True))
         spent = json.loads((Path(out) / "manifest.json").read_text())["seconds"]
+        used = {name: stage["all_s"] for name, stage in json.loads(watched.read_text()).items()}
         (run,) = json.loads((Path(out) / "summary.json").read_text())["runs"]
-    loop = spent["read"] + spent["flicker"] + spent["observe"] + spent[f"fuse {backend}"]
+    stages = ("read", "flicker", "observe", f"fuse {backend}")
+    loop, loop_cpu = sum(spent[stage] for stage in stages), sum(used.get(stage, 0) for stage in stages)
     after = spent["measure"] + spent["write"] + spent["digest"]
-    parts = {"whole": whole, "loop": loop, "results": after, "start": whole - loop - after}
+    parts = {
+        "whole": whole,
+        "loop": loop,
+        "loop_cpu": loop_cpu,
+        "voxel_size": run["voxel_size"],
+        "results": after,
+        "start": whole - loop - after,
+    }
     return {**parts, "stages_ms": run["stages_ms"] | {"fusion": run["fuse_ms_per_frame"]}}
 
 
@@ -193,10 +212,12 @@ def print_report(report: dict[str, Any]) -> None:
         "backend",
         "depth",
         "noise mm",
+        "voxel m",
         "MB",
         "bare decode ms",
         "loop ms",
         "ratio",
+        "CPU ratio",
         "whole s",
         "start s",
         "results s",
@@ -208,8 +229,9 @@ def print_report(report: dict[str, Any]) -> None:
         lead = (row["size"], row["backend"], row["depth"], f"{row['noise_mm']:g}")
         spent = row["seconds"]
         table.add_row(
-            *lead, f"{row['megabytes_a_frame']:.1f}", f"{row['bare_decode_ms']:.1f}", f"{row['loop_ms']:.1f}",
-            f"{row['ratio']:.2f}", *(f"{spent[part]:.2f}" for part in ("whole", "start", "results")),
+            *lead, f"{row['voxel_size']:.2g}", f"{row['megabytes_a_frame']:.1f}", f"{row['bare_decode_ms']:.1f}",
+            f"{row['loop_ms']:.1f}", f"{row['ratio']:.2f}", f"{row['cpu_ratio']:.2f}",
+            *(f"{spent[part]:.2f}" for part in ("whole", "start", "results")),
         )  # fmt: skip
         stages.add_row(*lead, *("-" if value is None else f"{value:.1f}" for value in row["stages_ms"].values()))
     console.print(table)
