@@ -17,7 +17,7 @@ TRANSLATED = {
     ROOT / name
     for name in (
         "benchmark/backbones.py", "benchmark/cli/__init__.py", "benchmark/cli/show_commands.py",
-        "benchmark/core/registry.py", "benchmark/data/earlier.py", "benchmark/settings.py",
+        "benchmark/core/registry.py", "benchmark/data/earlier.py", "benchmark/configure.py",
         "datasets/files/options.py",
     )
 }  # fmt: skip
