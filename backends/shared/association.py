@@ -83,28 +83,25 @@ def check_depth(frame: Frame) -> None:
     some = depth[::step, ::step]
     if depth.size >= CHECKED and not np.isfinite(some).any() and not np.isfinite(depth).any():
         raise DataError(f"{frame.where('depth')}: depth is finite nowhere (NaN or inf); leave this frame out")
-    if frame.points is not None:
-        some = np.abs(frame.points[::step, ::step])
-        if _whole_millimetres(some[np.isfinite(some) & (some > 0)]):
-            raise DataError(
-                f"{frame.where('points')}: points look like millimetres, whole numbers up to"
-                f" {np.max(some, initial=0, where=np.isfinite(some)):.0f}; divide them by 1000"
-            )
-    elif _whole_millimetres(some[np.isfinite(some) & (some > 0)]):
+    if frame.points is not None and _whole_millimetres(some := frame.points[::step, ::step]):
+        raise DataError(
+            f"{frame.where('points')}: points look like millimetres, whole numbers up to"
+            f" {np.max(np.abs(some), initial=0, where=np.isfinite(some)):.0f}; divide them by 1000"
+        )
+    if frame.points is None and _whole_millimetres(some):
         raise DataError(
             f"{frame.where('depth')}: depth looks like millimetres, whole numbers up to {np.nanmax(some):.0f};"
             " divide it by 1000, or set depth_scale"
         )
 
 
-def _whole_millimetres(depth: Float32) -> bool:
-    """Return whether valid depths (n,) are whole numbers, as no measurement in metres is, and too large to be near."""
-    for some in (depth[: 8 * DISTINCT], depth):  # a few tell of nearly all that are none
-        if depth.size < DISTINCT or not np.array_equal(some, np.floor(some)):
+def _whole_millimetres(measured: Float32) -> bool:
+    """Return whether what is measured is whole numbers, as nothing in metres is, and too large to be near."""
+    for some in (measured[:DISTINCT, : 8 * DISTINCT], measured):  # a few tell of nearly all that are none
+        known = np.abs(some[np.isfinite(some) & (some != 0)])
+        if known.size >= DISTINCT and not np.array_equal(known, np.floor(known)):
             return False
-    if np.median(depth) < FAR:
-        return False
-    return len(np.unique(depth)) >= DISTINCT
+    return known.size >= DISTINCT and bool(np.median(known) >= FAR) and len(np.unique(known)) >= DISTINCT
 
 
 def observe(frame: Frame, voxel_size: float, num_classes: int, pixels: Mask | None = None) -> Observations:
