@@ -237,7 +237,7 @@ class Record:
 
     def without_own(self) -> Record:
         """Return it without what stands in the unit's own file alone."""
-        return replace(self, input="", up=None, files={}, checked=None, advice=None, notes=())
+        return replace(self, **OF_THE_UNIT)
 
     def table(self) -> VoxelTable:
         """Return its voxels, read from their file."""
@@ -315,8 +315,8 @@ class RegionFlicker:
     input: str = ""
 
 
-OF_THE_UNIT = ("input", "up", "files", "checked", "advice", "notes")
-"""Fields of a record that stand in the unit's own file alone, not in summary.json."""
+OF_THE_UNIT: Mapping[str, Any] = {"input": "", "up": None, "files": {}, "checked": None, "advice": None, "notes": ()}
+"""Fields of a record that stand in the unit's own file alone, not in summary.json, and their values elsewhere."""
 
 
 @dataclass(frozen=True)
