@@ -224,10 +224,10 @@ def sample_of(
 
 def totals_of(sums: ClusterSums, key: str) -> np.ndarray:
     """Return what a number is of, (parts, C): it adds up over flights."""
-    return np.stack([columns_of(part, key).sum(axis=0) for part, _ in parts_of(sums, FUNCTIONALS[key])])
+    number = FUNCTIONALS[key]
+    return np.stack([columns_of(part, number).sum(axis=0) for part, _ in parts_of(sums, number)])
 
 
 def number_of(totals: np.ndarray, key: str) -> np.ndarray:
     """Return the number (...,) of such totals (..., parts, C)."""
-    number = FUNCTIONALS[key]
-    return sum(weight * number.of(totals[..., part, :]) for part, (_, weight) in enumerate(number.parts))
+    return FUNCTIONALS[key].of_parts(np.moveaxis(totals, -2, 0))

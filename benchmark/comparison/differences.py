@@ -36,7 +36,7 @@ from semstab.errors import ConfigError
 from semstab.metrics import macro_mean
 from semstab.statistics.accumulate import Cubes
 from semstab.statistics.agreement import ALPHA, ratio_of
-from semstab.statistics.cluster_sums import ClusterSums, functional, of_space_alone, value
+from semstab.statistics.cluster_sums import ClusterSums, functional, value
 from semstab.statistics.correctness import ACCURACY, MIOU
 from semstab.statistics.intervals import (
     coverage,
@@ -172,7 +172,8 @@ def sums_difference(
         new, base = new.without_truth(), base.without_truth()
     if key == COVERAGE.key:
         return _with_p_value(coverage(new, base, level, same_frames=same_frames))
-    scope, number = THESE_FRAMES if of_space_alone(key, k) else scope, functional(key, k)
+    number = functional(key, k)
+    scope = THESE_FRAMES if number.of_space_alone else scope
     if apart:
         return unpaired(estimate(new, key, k, scope, level), estimate(base, key, k, scope, level))
     result, most = difference(new, base, key, k, scope, same_frames=same_frames, level=level), number.high - number.low

@@ -32,7 +32,7 @@ from semstab.config.groups import ScopeSetting
 from semstab.core.types import THESE_FRAMES, THIS_SCENE, Scope
 from semstab.data.statistics import UNKNOWN
 from semstab.errors import ConfigError
-from semstab.statistics.cluster_sums import of_space_alone
+from semstab.statistics.cluster_sums import functional
 
 
 class GateConfig(BaseModel):
@@ -167,7 +167,7 @@ def _without_frames(judgements: Sequence[Judgement], wanted: Scope) -> list[str]
         if each.interval.scope == THESE_FRAMES != wanted
         and not each.counted
         and each.rule.measure.quantity not in (FLICKER, COVERAGE)
-        and not of_space_alone(each.rule.measure.quantity.key)
+        and not functional(each.rule.measure.quantity.key).of_space_alone
     ]
     why = "as the run kept no sums of its map by frame or has few; --statistics, or more frames"
     return [f"judged for these frames, {why}: {', '.join(names)}"] if names else []

@@ -22,15 +22,7 @@ from semstab.data.measures import Measure
 from semstab.data.statistics import ORDER_KNOWN, Interval
 from semstab.errors import ConfigError, DataError
 from semstab.statistics.agreement import ALPHA, PSA, VOXEL_ALPHA
-from semstab.statistics.cluster_sums import (
-    ClusterSums,
-    chance_of,
-    columns_of,
-    functional,
-    of_space_alone,
-    parts_of,
-    value,
-)
+from semstab.statistics.cluster_sums import ClusterSums, chance_of, functional, parts_of, value
 from semstab.statistics.correctness import ECE
 from semstab.statistics.intervals import counted, estimate, mean_of, mean_over_frames, shares_of, within_a_flight
 from semstab.statistics.verdict import LEAST_CLASSES
@@ -79,7 +71,7 @@ def _has(rule: Rule, entry: Entry) -> bool:
 
 def _order_known(sums: ClusterSums) -> tuple[float, int]:
     """Return at how many locations SBD in random order is known, and of how many."""
-    return float(columns_of(sums, SBD_EXCESS.key)[:, 1].sum()), round(float(sums["voxels"].sum()))
+    return float(sums["sbd_known"].sum()), round(float(sums["voxels"].sum()))
 
 
 def _few_known(rule: Rule, entry: Entry) -> str:
@@ -231,7 +223,7 @@ def bounded(
     """Return the value, drop or rise that a rule bounds, from sums; each end is missed with probability `level`."""
     key, both = rule.measure.quantity.key, 1 - 2 * level
     if base is None or rule.change is None:
-        return estimate(new, key, k, THESE_FRAMES if of_space_alone(key, k) else scope, both)
+        return estimate(new, key, k, THESE_FRAMES if functional(key, k).of_space_alone else scope, both)
     same_frames = True if scope == THESE_FRAMES else None
     result = sums_difference(key, new, base, k, scope=scope, same_frames=same_frames, level=both)
     return result if rule.change == "rise" else negative(result)

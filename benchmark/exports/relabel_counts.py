@@ -11,7 +11,7 @@ import numpy as np
 from semstab.core.types import Int64
 from semstab.data.frames import Frame
 from semstab.exports.fused_labels import UNSEEN, UNSTABLE
-from semstab.statistics.correctness import mean_iou
+from semstab.metrics.correctness import mean_iou
 
 
 @dataclass(frozen=True)
@@ -27,7 +27,7 @@ class Accuracy:
         """Return the accuracy of pixels (K, K) by true and given class; a class without pixels does not count."""
         right, n = confusion.diagonal(), int(confusion.sum())
         miou = mean_iou(right, confusion.sum(axis=1), confusion.sum(axis=0))
-        return cls(n, float(right.sum() / n) if n else math.nan, miou)
+        return cls(n, float(right.sum() / n) if n else math.nan, float(miou))
 
 
 @dataclass(frozen=True)

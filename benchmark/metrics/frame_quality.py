@@ -11,6 +11,7 @@ import numpy.typing as npt
 from semstab.core.types import Mask
 from semstab.data.frames import Frame
 from semstab.data.records import FrameQuality
+from semstab.metrics.correctness import mean_iou
 from semstab.pixels.warp import Correspondence, correspond
 
 HORIZON = 8
@@ -56,8 +57,6 @@ class FrameQualityMeter:
         """Return the quality so far of filters over a model, which took so many milliseconds per frame."""
         n = dict(zip(COUNTS, self._counts.tolist(), strict=True))
         right = np.diag(self._confusion)
-        union = self._confusion.sum(axis=0) + self._confusion.sum(axis=1) - right
-        there = union > 0
         return FrameQuality(
             model=model,
             filters=filters,
@@ -67,7 +66,7 @@ class FrameQualityMeter:
             coverage=_share(n["labelled"], n["sayable"]),
             next_frame=_share(n["foreseen"], n["met"]),
             accuracy=_share(right.sum(), self._confusion.sum()),
-            miou=float(np.mean(right[there] / union[there])) if there.any() else math.nan,
+            miou=float(mean_iou(right, self._confusion.sum(axis=1), self._confusion.sum(axis=0))),
             consistent_wrong=_share(n["stale"], n["compared"]),
             lag=self._lag.mean,
             changes=self._lag.changes,

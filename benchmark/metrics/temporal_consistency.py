@@ -15,6 +15,7 @@ import numpy.typing as npt
 from semstab.core.types import Float32, Float64, Mask, UInt8
 from semstab.data.frames import Frame
 from semstab.errors import ConfigError, DataError
+from semstab.metrics.correctness import iou, mean_iou
 from semstab.pixels.warp import DEPTH_TOLERANCE, correspond
 
 Form = Literal["vspw", "etc", "ssp"]
@@ -79,7 +80,7 @@ class TemporalConsistency:
         pair = np.bincount(own * (K + 1) + other, minlength=K * (K + 1)).reshape(K, K + 1)
         sums = np.stack([np.diag(pair), pair[:, :K].sum(axis=1), pair[:, :K].sum(axis=0), pair[:, K]])
         self._sums += sums
-        value = _mean_iou(sums, sums[1] + sums[2] > 0)
+        value = float(mean_iou(*sums[:3]))
         if not math.isnan(value):
             self._pairs.append(value)
         return value
@@ -120,16 +121,9 @@ def pooled_tc(sums: npt.NDArray[np.int64], form: Literal["vspw", "etc"]) -> floa
     """Return TC in a form that pools pixels, from `TemporalConsistency.sums`; NaN where no pixel counts."""
     same, own, warped, lost = sums
     if form == "vspw":
-        return _mean_iou(sums, own > 0)
-    if not sums.any():
-        return math.nan
-    return float(np.mean(same / np.maximum(own + lost + warped - same, 1)))
-
-
-def _mean_iou(sums: npt.NDArray[np.int64], there: Mask) -> float:
-    """Return the mean IoU over these classes; NaN where there is none."""
-    same, own, warped, _ = sums
-    return float(np.mean(same[there] / (own + warped - same)[there])) if there.any() else math.nan
+        there = own > 0
+        return float(mean_iou(same[there], own[there], warped[there]))
+    return float(np.nan_to_num(iou(same, own + lost, warped)).mean()) if sums.any() else math.nan
 
 
 def warp_labels(labels: Labels, flow: npt.NDArray[np.floating[Any]], sampling: Sampling = "nearest") -> Labels:

@@ -18,10 +18,9 @@ from semstab.core.types import Float64, Int32, Int64, Mask
 from semstab.data.measures import Beliefs, dominant, margin, vss
 from semstab.data.voxels import VoxelTable
 from semstab.errors import ConfigError, DataError
-from semstab.statistics.agreement import ratio_of
-from semstab.statistics.cluster_sums import cubes_of
+from semstab.statistics.cluster_sums import ClusterSums, cubes_of, mean_functional
 from semstab.statistics.correctness import Truth
-from semstab.statistics.intervals import interval_of_cubes
+from semstab.statistics.intervals import estimate
 
 Evidence = Literal["op", "belief", "margin"]
 
@@ -224,9 +223,8 @@ class _Labels:
         sums = sums[sums[:, 1] > 0]
         if np.count_nonzero(sums[:, 0] < sums[:, 1]) <= FEW_CUBES:
             return _of_few(sums, error)
-        result = interval_of_cubes(
-            self._cell[np.unique(of)], self._edge, sums, ratio_of, "share", (0.0, 1.0), 1 - 2 * error
-        )
+        there = ClusterSums.of_cubes(self._cell[np.unique(of)], self._edge, {"right": sums})
+        result = estimate(there, mean_functional("right"), level=1 - 2 * error)
         return result.value, result.low if result.decided else 0.0
 
 

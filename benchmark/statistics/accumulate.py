@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-import functools
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -18,26 +17,24 @@ from semstab.data.measures import dominant, entropy, vss
 from semstab.data.results import RECURRENT
 from semstab.data.statistics import Interval
 from semstab.data.voxels import VoxelTable
-from semstab.statistics.agreement import consistency_posterior, one_hot_where, psa, ratio_of
+from semstab.metrics.correctness import BINS, confidence_bin
+from semstab.statistics.agreement import consistency_posterior, one_hot_where, psa
 from semstab.statistics.cluster_sums import (
-    BINS,
     DRIFT,
-    MOST_CELLS,
     MOST_CLASSES,
-    ClusterIndex,
     ClusterSums,
     FirstColumns,
+    Functional,
     Scale,
     Statistic,
     cubes_of,
-    distinct_rows,
     layout,
     most_groups,
     of_measure,
     summed,
     width,
 )
-from semstab.statistics.intervals import EstimateSpec, confidence_intervals, spec_of_cubes
+from semstab.statistics.intervals import estimate
 from semstab.statistics.observations import CellObservations
 
 # Cubes of space over any set of voxels, and intervals for these frames of any statistic of their sums.
@@ -99,80 +96,19 @@ class Cubes:
         sums = (np.bincount(key, weights=weight[rows], minlength=size).astype(np.float64) for weight in weights)
         return [total.reshape(shape) for total in sums]
 
+    def named(self, sums: Mapping[str, Float64]) -> ClusterSums:
+        """Return sums (G, C) over these cubes by name."""
+        return ClusterSums.of_cubes(self.cell, self.edge, sums)
+
     def estimate(
         self,
         columns: Float64,
         statistic: Statistic,
         bounds: tuple[float, float] = (0.0, 1.0),
-        scale: Scale | None = None,
+        scale: Scale = "share",
     ) -> Interval:
-        """Return the statistic of sums of columns (n, C), the second of which counts, with its interval; see `Mean`."""
-        return CubeSums(self.cell, self.edge, {"": self.sums(columns)}).estimate("", statistic, bounds, scale)
-
-
-@dataclass(frozen=True)
-class Mean:
-    """A statistic of sums (..., C) by name, the second of which counts: a mean, or any other.
-
-    Where no scale is given, a number from 0 to 1 is a share.
-    """
-
-    sums: str
-    of: Statistic = ratio_of
-    bounds: tuple[float, float] = (0.0, 1.0)
-    scale: Scale | None = None
-
-    @property
-    def kind(self) -> Scale:
-        """The scale of its interval."""
-        return self.scale or ("share" if self.bounds == (0.0, 1.0) else "plain")
-
-
-@dataclass(frozen=True, eq=False)
-class CubeSums:
-    """Sums by name over the voxels of each cube; sums of the parts of a map add up to the sums of the map.
-
-    Attributes:
-        cell: (G, 3) int32 the cubes, of an edge in metres, a power of 2.
-        sums: (G, C) sums of each name.
-    """
-
-    cell: Int32
-    edge: float
-    sums: Mapping[str, Float64]
-
-    def __getitem__(self, name: str) -> Float64:
-        """Return sums (C,) over all cubes."""
-        total: Float64 = self.sums[name].sum(axis=0)
-        return total
-
-    def estimate(
-        self, name: str, statistic: Statistic, bounds: tuple[float, float] = (0.0, 1.0), scale: Scale | None = None
-    ) -> Interval:
-        """Return the statistic of sums (..., C), the second of which counts, with its interval; see `Mean`."""
-        return confidence_intervals(self.specs({name: Mean(name, statistic, bounds, scale)}))[0]
-
-    def specs(self, means: Mapping[str, Mean]) -> Iterator[EstimateSpec]:
-        """Yield the specs of several means for `confidence_intervals`."""
-        for mean in means.values():
-            yield spec_of_cubes(self._index, self.sums[mean.sums], mean.of, mean.kind, mean.bounds)
-
-    @functools.cached_property
-    def _index(self) -> ClusterIndex:
-        return ClusterIndex.of(self.cell, None, self.edge)
-
-    @classmethod
-    def merged(cls, parts: Sequence[CubeSums]) -> CubeSums:
-        """Return the sums of a map from the sums of its parts, by the cubes of the whole map."""
-        edge = max(part.edge for part in parts)
-        cells = np.concatenate([part.cell // round(edge / part.edge) for part in parts])
-        while len((cubes := distinct_rows(cells))[0]) > MOST_CELLS:
-            cells, edge = cells // 2, 2 * edge
-        distinct, of = cubes
-        sums = {name: np.zeros((len(distinct), values.shape[1])) for name, values in parts[0].sums.items()}
-        for name, total in sums.items():
-            np.add.at(total, of, np.concatenate([part.sums[name] for part in parts]))
-        return cls(distinct.astype(np.int32), edge, sums)
+        """Return the statistic of sums of columns (n, C), the second of which counts, with its interval."""
+        return estimate(self.named({"": self.sums(columns)}), Functional(("",), statistic, *bounds, scale))
 
 
 # --- Sums of a map ----------------------------------------------------------------------------------------------------
@@ -246,8 +182,9 @@ def sums_of_cells(cells: CellObservations, edge: float | None = None) -> Cluster
         edge: Edge of the cubes in metres, a power of 2; the smallest that leaves at most MOST_CELLS by default.
     """
     none, frame = np.zeros((0, 3), np.int32), np.zeros(0, np.int32)
-    columns = np.zeros((0, width(cells.K, truth=False)))
-    empty = ClusterSums(none, frame, columns, cells.cell_size, 0, cells.cell_size, cells.K, cells.classes)
+    slices = layout(cells.K, truth=False)
+    columns = np.zeros((0, width(slices)))
+    empty = ClusterSums(none, frame, columns, slices, cells.cell_size, 0, cells.cell_size, cells.classes)
     return with_cells(empty, cells, edge)
 
 
@@ -269,7 +206,8 @@ def _sums_of_log(
     again = np.flatnonzero(cubes.at >= 0)
     order = again[np.argsort(cubes.at[again], kind="stable")]
     bounds = np.concatenate([[0], np.cumsum(np.bincount(cubes.at[again], minlength=cubes.count))])
-    sums = np.zeros((cubes.count * len(groups), width(K, truth=truth)))
+    slices = layout(K, truth=truth)
+    sums = np.zeros((cubes.count * len(groups), width(slices)))
     longest = int((events.ends - events.starts).max(initial=0))
     own = np.zeros(0, np.int64) if fused is None else fused
     label = np.zeros(0, np.int64) if true_label is None else true_label
@@ -278,18 +216,17 @@ def _sums_of_log(
         add_influences, order, bounds, (events.starts, events.ends), longest, events.evidence.entries, K, group, own,
         label, consistent, FirstColumns.of(K, truth=truth), len(groups), sums,
     )  # fmt: skip
-    rows = np.flatnonzero(sums[:, layout(K, truth=False)["observations"].start])
+    rows = np.flatnonzero(sums[:, slices["observations"].start])
     cell, frame = np.divmod(rows, max(len(groups), 1))
     return ClusterSums(
         cubes.cell[cell],
         groups[frame].astype(np.int32),
         sums[rows],
+        slices,
         cubes.edge,
         step,
         events.voxel_size,
-        K,
         events.classes,
-        truth,
         len(np.unique(events.frame)),
     )
 
@@ -304,7 +241,7 @@ def _with_frameless_sums(
     values = {measure.key: measure.of(table) for measure in summed()}
     measured = tuple(values)
     slices = layout(sums.K, truth=sums.truth, measured=measured)
-    columns = np.zeros((cubes.count, width(sums.K, truth=sums.truth, measured=measured)))
+    columns = np.zeros((cubes.count, width(slices)))
     for key, both in cubes.means(values).items():
         for name, column in zip(of_measure(key), both.T, strict=True):
             columns[:, slices[name].start] = column
@@ -313,8 +250,7 @@ def _with_frameless_sums(
             columns[:, slices[name].start] = values
     if true_label is not None:
         confidence, right = vss(table), dominant(table) == true_label
-        bins = np.clip(np.ceil(confidence * BINS - 1e-9).astype(np.int64) - 1, 0, BINS - 1)
-        group = np.where((cubes.at >= 0) & (true_label >= 0), cubes.at * BINS + bins, -1)
+        group = np.where((cubes.at >= 0) & (true_label >= 0), cubes.at * BINS + confidence_bin(confidence), -1)
         gap, known = by_group(group, [right - confidence], cubes.count * BINS)
         columns[:, slices["gap"]] = gap.reshape(-1, BINS)
         columns[:, slices["calibrated"]] = known.reshape(-1, BINS).sum(axis=1, keepdims=True)
@@ -324,7 +260,7 @@ def _with_frameless_sums(
     return replace(
         sums,
         classes=table.classes,
-        measured=measured,
+        layout=slices,
         cell=np.concatenate([sums.cell, cubes.cell[filled]]),
         frame=np.concatenate([sums.frame, np.full(filled.sum(), -1, np.int32)]),
         columns=np.concatenate([of_frames, columns[filled]]),
@@ -354,13 +290,14 @@ def _sums_of_table(table: VoxelTable, cubes: Cubes, true_label: Int64 | None, li
         likely = recurrent if likely is None else likely * recurrent
         plain, further = _sums_with_truth(table, cubes, true_label, likely)
         values, by_class = values | plain, by_class | further
-    sums, slices = np.zeros((cubes.count, width(K, truth=truth))), layout(K, truth=truth)
+    slices = layout(K, truth=truth)
+    sums = np.zeros((cubes.count, width(slices)))
     for name, column in zip(values, by_group(cubes.at, [*values.values()], cubes.count)[0].T, strict=True):
         sums[:, slices[name].start] = column
     for name, columns in by_class.items():
         sums[:, slices[name]] = columns
     unknown = np.full(cubes.count, -1, dtype=np.int32)
-    return ClusterSums(cubes.cell, unknown, sums, cubes.edge, 0, table.voxel_size, K, table.classes, truth)
+    return ClusterSums(cubes.cell, unknown, sums, slices, cubes.edge, 0, table.voxel_size, table.classes)
 
 
 def _sums_with_truth(

@@ -102,7 +102,7 @@ def kappa_of(sums: Float64) -> Float64:
     observed = ratio_of(sums[..., :2])
     with np.errstate(invalid="ignore", divide="ignore"):
         expected = ((sums[..., 2:] / sums[..., 1:2]) ** 2).sum(axis=-1)
-    return _beyond_chance(observed, expected)
+    return beyond_chance(1 - observed, 1 - expected)
 
 
 def alpha_columns(table: VoxelTable) -> Float64:
@@ -118,7 +118,19 @@ def alpha_of(sums: Float64) -> Float64:
     n = sums[..., 1]
     with np.errstate(invalid="ignore", divide="ignore"):
         expected = ((sums[..., 3:] ** 2).sum(axis=-1) - sums[..., 2]) / (n * (n - 1))
-    return _beyond_chance(ratio_of(sums[..., :2]), expected)
+    return beyond_chance(1 - ratio_of(sums[..., :2]), 1 - expected)
+
+
+def class_alpha_of(sums: Float64) -> Float64:
+    """Return alpha (...,) of a class against all others, from sums (..., 4).
+
+    They are of the disagreement of each observation with the others of its location, of observations, of evidence s for
+    the class, and of s^2 of single observations.
+    """
+    apart, n, total, squares = np.moveaxis(sums, -1, 0)
+    with np.errstate(invalid="ignore", divide="ignore"):
+        expected = 2 * ((n - 1) * total - total**2 + squares) / (n * (n - 1))
+        return beyond_chance(apart / n, expected)
 
 
 def disagreement(table: VoxelTable) -> tuple[Float64, Float64]:
@@ -180,9 +192,8 @@ def class_agreement_of(sums: Float64, classes: Sequence[str] = ()) -> tuple[Clas
     total, shares, apart, weighted, squares, voxels, n = sums
     with np.errstate(invalid="ignore", divide="ignore"):
         p = shares / voxels
-        kappa = _beyond_chance(1 - apart / voxels, 1 - 2 * p * (1 - p))
-        expected = 2 * ((n - 1) * total - total**2 + squares) / (n * (n - 1))
-        alpha = _beyond_chance(1 - weighted / n, 1 - expected)
+        kappa = beyond_chance(apart / voxels, 2 * p * (1 - p))
+    alpha = class_alpha_of(np.stack([weighted, n, total, squares], axis=-1))
     names = classes or tuple(str(k) for k in range(len(total)))
     rows = zip(names, total, kappa, alpha, strict=True)
     return tuple(ClassAgreement(name, *(float(value) for value in values)) for name, *values in rows)
@@ -193,11 +204,11 @@ def one_hot_where(table: VoxelTable, where: Mask) -> bool:
     return bool((np.abs(table.self_sum - table.op) <= ONE_HOT * table.op)[where].all())
 
 
-def _beyond_chance(observed: Float64, expected: Float64) -> Float64:
-    """Return 1 - (1 - observed) / (1 - expected); NaN where chance alone would always agree."""
+def beyond_chance(observed: Float64, expected: Float64) -> Float64:
+    """Return 1 - D_o / D_e from disagreement, observed and by chance; NaN where chance alone would always agree."""
     with np.errstate(invalid="ignore", divide="ignore"):
-        ratio = (1 - observed) / (1 - expected)
-    beyond: Float64 = np.where(1 - expected.real > ONE_HOT, 1 - ratio, np.nan)
+        ratio = observed / expected
+    beyond: Float64 = np.where(expected.real > ONE_HOT, 1 - ratio, np.nan)
     return beyond
 
 

@@ -8,7 +8,6 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 
 from semstab.core.types import Float64, Int32, Int64, Mask
 from semstab.data.evidence import Evidence
@@ -18,9 +17,12 @@ from semstab.data.statistics import UNKNOWN, Correctness, Interval, Quadrants, R
 from semstab.data.voxels import VoxelTable
 from semstab.metrics import strata
 from semstab.metrics.agreement import require_same_grid, same_voxels, shared_rows
+from semstab.metrics.correctness import BINS, calibration_error, confidence_bin, mean_iou
 from semstab.metrics.summary import groups_of
-from semstab.statistics.accumulate import Cubes, CubeSums
-from semstab.statistics.agreement import CONSISTENT, LIKELY, consistency_posterior, ratio_of
+from semstab.statistics.accumulate import Cubes
+from semstab.statistics.agreement import CONSISTENT, LIKELY, consistency_posterior
+from semstab.statistics.cluster_sums import mean_functional
+from semstab.statistics.intervals import estimate
 
 ACCURACY = Quantity(key="accuracy", title="Accuracy", better="higher", needs="truth")
 MIOU = Quantity(key="miou", title="mIoU", better="higher", needs="truth")
@@ -30,8 +32,6 @@ BRIER = Quantity(key="brier", title="Brier", better="lower", needs="truth")
 PURE = 0.5 + 1e-9
 """A voxel has a true class where more than this share of its ground truth evidence is of one class: exactly a half
 is not enough, however it is rounded."""
-
-BINS = 15
 
 
 @dataclass(frozen=True, eq=False)
@@ -123,7 +123,7 @@ def _prediction_sums_by_group(predictions: Predictions, group: Int64, groups: in
         predictions.confidence[rows],
     )
     right = predictions.right[rows].astype(np.float64)
-    bins = np.clip(np.ceil(confidence * BINS - 1e-9).astype(np.int64) - 1, 0, BINS - 1)
+    bins = confidence_bin(confidence)
 
     def sums(width: int, within: Any, weights: Any = None) -> Float64:
         result = np.bincount(of * width + within, weights=weights, minlength=groups * width)
@@ -141,21 +141,19 @@ def correctness_of(sums: Float64, name: str = "all") -> Correctness:
     n, right, error = sums[:3]
     if not n:
         return Correctness(name, 0, math.nan, math.nan, math.nan, math.nan)
-    ece = sum(row.voxels * abs(row.accuracy - row.confidence) for row in reliability_of(sums) if row.voxels) / n
-    miou = mean_iou(*sums[3 + 3 * BINS :].reshape(3, -1))
-    return Correctness(name, int(n), float(right / n), miou, float(ece), float(error / n))
+    _, confidence, right_of_bin = _by_bin(sums)
+    ece, miou = calibration_error(right_of_bin - confidence, n), mean_iou(*sums[3 + 3 * BINS :].reshape(3, -1))
+    return Correctness(name, int(n), float(right / n), float(miou), float(ece), float(error / n))
 
 
-def mean_iou(right: npt.NDArray[Any], true: npt.NDArray[Any], predicted: npt.NDArray[Any]) -> float:
-    """Return the mean over classes of intersection over union, from counts (K,); classes without any do not count."""
-    union = true + predicted - right
-    occurs = union > 0
-    return float((right[occurs] / union[occurs]).mean()) if occurs.any() else math.nan
+def _by_bin(sums: Float64) -> Float64:
+    """Return voxels, confidence and right ones (3, BINS) by bin of confidence, of `prediction_sums`."""
+    return sums[3 : 3 + 3 * BINS].reshape(3, BINS)
 
 
 def reliability_of(sums: Float64) -> tuple[Reliability, ...]:
     """Return the bins of the reliability diagram of voxels with these sums, see `prediction_sums`."""
-    count, confidence, right = sums[3 : 3 + 3 * BINS].reshape(3, BINS)
+    count, confidence, right = _by_bin(sums)
     with np.errstate(invalid="ignore"):
         confidence, accuracy = confidence / count, right / count
     return tuple(
@@ -197,8 +195,8 @@ def quadrants(table: VoxelTable, truth: Truth, consistent: Float64, edge: float,
         return Quadrants(0, *[UNKNOWN] * 5)
     cubes = Cubes.of(table, edge, where=counted)
     parts = (likely * right, likely * ~right, (1 - likely) * right, (1 - likely) * ~right)
-    sums = CubeSums(cubes.cell, edge, cubes.means(dict(zip(QUADRANTS, parts, strict=True))))
-    shares = {name: sums.estimate(name, ratio_of) for name in QUADRANTS}
+    sums = cubes.named(cubes.means(dict(zip(QUADRANTS, parts, strict=True))))
+    shares = {name: estimate(sums, mean_functional(name)) for name in QUADRANTS}
     return Quadrants(int(counted.sum()), **shares, wrong_of_consistent=wrong)
 
 

@@ -17,8 +17,8 @@ from semstab.data.events import Events
 from semstab.data.evidence import Evidence
 from semstab.data.statistics import UNKNOWN, Correlogram, LagBin
 from semstab.statistics.agreement import alpha_of
-from semstab.statistics.cluster_sums import MOST_GROUPS, cubes_of
-from semstab.statistics.intervals import confidence_intervals, spec_of_observations
+from semstab.statistics.cluster_sums import ALPHA_SUMS, MOST_GROUPS, ClusterSums, Functional, cubes_of, side_by_side
+from semstab.statistics.intervals import confidence_intervals, scope_of, spec_of
 from semstab.statistics.observations import CellObservations
 
 STANDARD = (5.0, 15.0)
@@ -39,6 +39,10 @@ EDGES: dict[str, tuple[float, ...]] = {
 """Edges of the bins: frames, degrees, ratio of the ranges, metres."""
 
 AXES = EDGES | {"standard": STANDARD}
+
+
+PAIRED_ALPHA = Functional(ALPHA_SUMS, alpha_of, -1.0, 1.0, "agreement", pairs=ALPHA_SUMS[:2])
+"""Alpha of pairs of observations: neither has half of its agreement with the other one for itself alone."""
 
 
 BINS = tuple((axis, *edges) for axis, limits in AXES.items() for edges in itertools.pairwise(limits))
@@ -67,15 +71,14 @@ def correlogram(cells: CellObservations) -> Correlogram:
         pairs += np.bincount(bins.ravel(), minlength=len(pairs))
         distance += np.bincount(bins.ravel(), weights=apart.ravel(), minlength=len(pairs))
         sums.add(bins, first, second, cluster)
+    columns = side_by_side(dict(zip(ALPHA_SUMS, (1, 1, 1, len(labels)), strict=True)))
     rows, specs = [], []
     for k in np.flatnonzero(pairs[:-1] >= LEAST_PAIRS):
         some = np.flatnonzero(sums.total[k, :, 1])
         if len(np.unique(cube[some])) < LEAST_CUBES:
             continue
-        totals = sums.total[k, some]
-        halves = totals[:, :2]  # neither observation has half of its agreement with the other one for itself alone
-        where = cubes[cube[some]], frames[group[some]], edge, step
-        specs.append(spec_of_observations(*where, totals, halves, alpha_of))
+        of_bin = ClusterSums(cubes[cube[some]], frames[group[some]], sums.total[k, some], columns, edge, step)
+        specs.append(spec_of(of_bin, PAIRED_ALPHA, scope=scope_of(of_bin, key=PAIRED_ALPHA)))
         rows.append((k, float(distance[k] / pairs[k]), int(pairs[k])))
     of_axis: dict[str, tuple[LagBin, ...]] = dict.fromkeys(AXES, ())
     for (k, lag, count), alpha in zip(rows, confidence_intervals(specs), strict=True):

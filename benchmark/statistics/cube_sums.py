@@ -14,10 +14,11 @@ from semstab.core.types import Float64
 from semstab.data.measures import sbd, vss
 from semstab.data.statistics import Flipping
 from semstab.data.voxels import VoxelTable
-from semstab.statistics.accumulate import Cubes, CubeSums, Mean
+from semstab.statistics.accumulate import Cubes
 from semstab.statistics.agreement import decompose, disagreement, kappa_of, psa
+from semstab.statistics.cluster_sums import ClusterSums, Functional, mean_functional
 from semstab.statistics.drift import flips, trends
-from semstab.statistics.intervals import confidence_intervals
+from semstab.statistics.intervals import estimate
 from semstab.statistics.sample import MapSample
 
 Columns = dict[str, npt.NDArray[Any]]
@@ -41,30 +42,24 @@ def row_columns(table: VoxelTable, null: Float64) -> Columns:
     }
 
 
-SIGNED = (-1.0, 1.0)
-MEANS: Mapping[str, Mean] = {
-    **{name: Mean(name) for name in ("vss", "within", "between", "sbd", "null", "entropy_within", "entropy_between")},
-    "kappa": Mean("kappa", kappa_of, SIGNED, "agreement"),
+MEANS: Mapping[str, Functional] = {
+    **{name: mean_functional(name) for name in ("vss", "within", "between", "sbd", "null")},
+    **{name: mean_functional(name) for name in ("entropy_within", "entropy_between")},
+    "kappa": Functional(("kappa",), kappa_of, -1.0, 1.0, "agreement"),
 }
 """Means over the voxels with OP >= 2 where values are defined, and kappa."""
 
 OF_CLUSTERS = {"psa": "psa", "voxel_alpha": "voxel_alpha", "entropy": "entropy", "excess": "sbd_excess"}
 """Numbers of the same voxels that verdicts, gates and comparisons print, too, with their names in `FUNCTIONALS`."""
 
-OF_FLIPS: Mapping[str, Mean] = {
-    **{name: Mean(name) for name in ("flip_rate", "flip_null")},
-    "flip_excess": Mean("flip_excess", bounds=SIGNED),
-}
+OF_FLIPS = (mean_functional("flip_rate"), mean_functional("flip_null"), mean_functional("flip_excess", -1.0))
 """Means over the same voxels as the first of `MEANS`, so that those are identical without a log."""
 
-OF_CHANGES: Mapping[str, Mean] = {
-    "frames_since": Mean("frames_since", bounds=(0.0, math.inf)),
-    "trend": Mean("trend", bounds=SIGNED),
-}
+OF_CHANGES = (mean_functional("frames_since", 0.0, math.inf), mean_functional("trend", -1.0))
 """Means over fewer voxels."""
 
 
-def location_sums(table: VoxelTable, columns: Columns, cubes: Cubes) -> CubeSums:
+def location_sums(table: VoxelTable, columns: Columns, cubes: Cubes) -> ClusterSums:
     """Return the sums over cubes of the voxels with OP >= 2 that give `MEANS`."""
     sums = cubes.means(
         {
@@ -80,7 +75,7 @@ def location_sums(table: VoxelTable, columns: Columns, cubes: Cubes) -> CubeSums
     each = np.repeat(table.op.astype(np.float64), np.diff(table.evidence.starts))
     (by_voxel,) = cubes.sums_by_class(table.evidence, table.evidence.weight / each)
     kappa = np.hstack([sums["psa"], by_voxel])  # as of `kappa_columns`
-    return CubeSums(cubes.cell, cubes.edge, sums | {"kappa": kappa})
+    return cubes.named(sums | {"kappa": kappa})
 
 
 # --- Locations that flip
@@ -103,7 +98,7 @@ class FlippingSums:
             it is not consistent.
     """
 
-    share: CubeSums
+    share: ClusterSums
     often: int
     together: Float64
 
@@ -111,14 +106,14 @@ class FlippingSums:
     def of(cls, table: VoxelTable, consistent: Float64, cubes: Cubes) -> FlippingSums:
         """Return the sums of a table by the stability posterior (n,), over the cubes of its voxels with OP >= 2."""
         inconsistent = np.round((1 - consistent) / UNIT) * UNIT
-        share = CubeSums(cubes.cell, cubes.edge, cubes.means({"": inconsistent}))
+        share = cubes.named(cubes.means({"inconsistent": inconsistent}))
         return cls(share, int(np.count_nonzero(table.op >= ENOUGH)), _together(table, inconsistent))
 
     def flipping(self, classes: Sequence[str] = ()) -> Flipping:
         """Return the share of the locations that are not consistent, and the two classes that most often meet there."""
-        (share,) = confidence_intervals(self.share.specs({"": Mean("")}))
-        locations = self.share[""][1]
-        seen = float(self.often / locations) if locations else float("nan")
+        share = estimate(self.share, mean_functional("inconsistent"))
+        locations = float(self.share["inconsistent"][:, 1].sum())
+        seen = self.often / locations if locations else float("nan")
         total = float(self.together.sum())
         if not total > 0:
             return Flipping(share, seen)
@@ -145,7 +140,7 @@ def _together(table: VoxelTable, inconsistent: Float64) -> Float64:
 class LogSums:
     """The sums over cubes that need a log, and how many voxels can show a trend."""
 
-    sums: CubeSums
+    sums: ClusterSums
     telling: int
 
 
@@ -162,7 +157,7 @@ def log_sums(sample: MapSample, cubes: Cubes) -> tuple[Columns, LogSums | None]:
     }
     sums = cubes.means(means)
     sums["trend"] = cubes.sums(np.nan_to_num(np.stack([trend.common, trend.variation], axis=1)))
-    log = LogSums(CubeSums(cubes.cell, cubes.edge, sums), int(np.count_nonzero(~np.isnan(trend.variation))))
+    log = LogSums(cubes.named(sums), int(np.count_nonzero(~np.isnan(trend.variation))))
     columns: Columns = {
         "trend": trend.share,
         "flip_rate": changes.rate,

@@ -23,8 +23,10 @@ from semstab.data.voxels import VoxelTable
 from semstab.errors import DataError
 from semstab.metrics import dominant
 from semstab.metrics.agreement import shared_rows, voxel_keys
-from semstab.statistics.accumulate import Cubes, CubeSums
-from semstab.statistics.agreement import psa, ratio_of
+from semstab.statistics.accumulate import Cubes
+from semstab.statistics.agreement import psa
+from semstab.statistics.cluster_sums import mean_functional
+from semstab.statistics.intervals import estimate
 
 
 def ceiling(
@@ -87,13 +89,13 @@ def losses(table: VoxelTable, limit: VoxelTable) -> Losses:
     cubes = Cubes.of(table.rows(rows), where=np.ones(len(rows), np.bool_))
     means = cubes.means({"total": total, "geometry": geometry, "model": total - geometry})
     means["share"] = np.stack([means["geometry"][:, 0], means["total"][:, 0]], axis=1)
-    sums = CubeSums(cubes.cell, cubes.edge, means)
+    sums = cubes.named(means)
     return Losses(
         voxels=len(rows),
-        total=sums.estimate("total", ratio_of).ends,
-        geometry=sums.estimate("geometry", ratio_of).ends,
-        model=sums.estimate("model", ratio_of, (-1.0, 1.0)).ends,
-        share=sums.estimate("share", ratio_of, (0.0, math.inf)).ends,
+        total=estimate(sums, mean_functional("total")).ends,
+        geometry=estimate(sums, mean_functional("geometry")).ends,
+        model=estimate(sums, mean_functional("model", -1.0)).ends,
+        share=estimate(sums, mean_functional("share", 0.0, math.inf)).ends,
     )
 
 

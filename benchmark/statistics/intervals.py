@@ -15,15 +15,13 @@ from semstab.data.statistics import CONFIDENCE, UNKNOWN, HeadlineStatistics, Int
 from semstab.statistics.agreement import ratio_of
 from semstab.statistics.cluster_sums import (
     MOST_GROUPS,
-    ClusterIndex,
     ClusterSums,
+    Functional,
     Scale,
-    Statistic,
     aligned,
     columns_of,
     frames_of,
     functional,
-    of_space_alone,
     parts_of,
     value,
 )
@@ -76,9 +74,13 @@ def confidence_intervals(specs: Iterable[EstimateSpec]) -> list[Interval]:
 
 
 def estimate(
-    sums: ClusterSums, key: str, k: int | None = None, scope: Scope = THIS_SCENE, level: float = CONFIDENCE
+    sums: ClusterSums,
+    key: str | Functional,
+    k: int | None = None,
+    scope: Scope = THIS_SCENE,
+    level: float = CONFIDENCE,
 ) -> Interval:
-    """Return a number of a map with its interval; see `FUNCTIONALS` for its key, k is a class.
+    """Return a number with its interval: any functional of the sums, or one of `FUNCTIONALS` by its key; k is a class.
 
     The scope is explained at `Interval`; where frames are unknown it is 'these frames'.
     """
@@ -86,13 +88,17 @@ def estimate(
 
 
 def spec_of(
-    sums: ClusterSums, key: str, k: int | None = None, scope: Scope = THIS_SCENE, level: float = CONFIDENCE
+    sums: ClusterSums,
+    key: str | Functional,
+    k: int | None = None,
+    scope: Scope = THIS_SCENE,
+    level: float = CONFIDENCE,
 ) -> EstimateSpec:
-    """Return the spec of a number of a map, see `estimate`."""
+    """Return the spec of a number, see `estimate`."""
     number = functional(key, k)
-    bounds, point = (number.low, number.high), value(sums, key, k)
+    bounds, point = (number.low, number.high), value(sums, number)
     clipped = point if math.isnan(point) else min(max(point, number.low), number.high)
-    return EstimateSpec(clipped, grid_of(sums, key, k), scope, number.scale, bounds, level)
+    return EstimateSpec(clipped, influences_of(sums, number), scope, number.scale, bounds, level)
 
 
 def difference(
@@ -114,13 +120,14 @@ def difference(
     have no difference anywhere: exactly 0, without a p-value.
     """
     a, b = aligned(a, b)
-    result = value(a, key, k) - value(b, key, k)
-    if identical(a, b, key, k) and not math.isnan(result):
-        return no_difference(estimate(a, key, k, scope, level))
-    one, other = grid_of(a, key, k), grid_of(b, key, k)
+    number = functional(key, k)
+    result = value(a, number) - value(b, number)
+    if identical(a, b, number) and not math.isnan(result):
+        return no_difference(estimate(a, number, scope=scope, level=level))
+    one, other = influences_of(a, number), influences_of(b, number)
     if one is None or other is None:
         return Interval(result, math.nan, math.nan, undecided=NO_LOCATIONS)
-    first, second = (parts_of(sums, functional(key, k))[0][0] for sums in (a, b))
+    first, second = (parts_of(sums, number)[0][0] for sums in (a, b))
     scope = scope if first.step else THESE_FRAMES
     paired = (not first.step or same_flight(first, second)) if same_frames is None else same_frames
     between = one.minus(other)
@@ -129,19 +136,19 @@ def difference(
     half = spread.half(level)
     low, high = result - half, result + half
     if spread.variance <= TINY:
-        ends = confidence_intervals(spec_of(sums, key, k, scope, level) for sums in (a, b))
+        ends = confidence_intervals(spec_of(sums, number, scope=scope, level=level) for sums in (a, b))
         low, high = ends[0].low - ends[1].high, ends[0].high - ends[1].low
     change = _interval(result, low, high, between, spread, scope, level)
     return dataclasses.replace(change, p_value=spread.p_value(result))
 
 
-def identical(a: ClusterSums, b: ClusterSums, key: str, k: int | None = None) -> bool:
+def identical(a: ClusterSums, b: ClusterSums, number: Functional) -> bool:
     """Return whether a number has identical sums in two maps, so that it has no difference anywhere."""
-    one, other = ([part for part, _ in parts_of(each, functional(key, k))] for each in aligned(a, b))
+    one, other = ([part for part, _ in parts_of(each, number)] for each in aligned(a, b))
     if len(one) != len(other):
         return False
     for pair in zip(one, other, strict=True):
-        columns = [columns_of(part, key, k) for part in pair]
+        columns = [columns_of(part, number) for part in pair]
         rows = [values.any(axis=1) for values in columns]
         same = [
             (values[where], part.cell[where], part.frame[where])
@@ -157,60 +164,12 @@ def no_difference(interval: Interval) -> Interval:
     return dataclasses.replace(interval, value=0.0, low=0.0, high=0.0, degrees=math.inf, undecided="", p_value=math.nan)
 
 
-def interval_of_cubes(
-    cell: npt.NDArray[np.integer],
-    edge: float,
-    columns: Float64,
-    statistic: Statistic,
-    scale: Scale,
-    bounds: tuple[float, float] = (-math.inf, math.inf),
-    level: float = CONFIDENCE,
-) -> Interval:
-    """Return the statistic of sums (m, C) of cubes (m, 3) of an edge in metres, with its interval for these frames.
-
-    The second column counts the terms of the first.
-    """
-    return confidence_intervals(
-        [spec_of_cubes(ClusterIndex.of(cell, None, edge), columns, statistic, scale, bounds, level)]
-    )[0]
-
-
-def spec_of_cubes(
-    index: ClusterIndex,
-    columns: Float64,
-    statistic: Statistic,
-    scale: Scale,
-    bounds: tuple[float, float] = (-math.inf, math.inf),
-    level: float = CONFIDENCE,
-) -> EstimateSpec:
-    """Return the spec of a statistic of cubes, see `interval_of_cubes`."""
-    grid = influences(index, columns, statistic)
-    return EstimateSpec(float(statistic(columns.sum(axis=0))), grid, THESE_FRAMES, scale, bounds, level)
-
-
-def spec_of_observations(
-    cell: npt.NDArray[np.integer],
-    frame: npt.NDArray[np.integer],
-    edge: float,
-    step: int,
-    columns: Float64,
-    halves: Float64,
-    statistic: Statistic,
-    level: float = CONFIDENCE,
-) -> EstimateSpec:
-    """Return the spec of an agreement of sums (m, C) of cubes and groups of frames, see `influences`.
-
-    Its interval is for this scene flown again where there are enough frames for that, else for these frames.
-    """
-    result = float(statistic(columns.sum(axis=0)))
-    grid = influences(ClusterIndex.of(cell, frame, edge, step), columns, statistic, halves)
-    notes = grid is not None and len(grid.frames) * step >= LEAST_FRAMES
-    return EstimateSpec(result, grid, THIS_SCENE if notes else THESE_FRAMES, "agreement", (-1.0, 1.0), level)
-
-
-def scope_of(sums: ClusterSums, wanted: Scope = THIS_SCENE, key: str = "alpha", k: int | None = None) -> Scope:
+def scope_of(
+    sums: ClusterSums, wanted: Scope = THIS_SCENE, key: str | Functional = "alpha", k: int | None = None
+) -> Scope:
     """Return the scope of a number's interval: the wanted one if enough frames show it, else these frames."""
-    shown = frames_of(sums, key, k) >= LEAST_FRAMES and not of_space_alone(key, k)
+    number = functional(key, k)
+    shown = frames_of(sums, number) >= LEAST_FRAMES and not number.of_space_alone
     return wanted if shown else THESE_FRAMES
 
 
@@ -232,12 +191,12 @@ def _answer(spec: EstimateSpec, grid: Influences) -> Interval:
     return _interval(result, max(low, spec.bounds[0]), min(high, spec.bounds[1]), grid, spread, scope, level)
 
 
-def grid_of(sums: ClusterSums, key: str, k: int | None = None) -> Influences | None:
+def influences_of(sums: ClusterSums, number: Functional) -> Influences | None:
     """Return the influences on a number; None where it is not defined, or all is in one cube."""
-    number, total = functional(key, k), None
+    total = None
     for part, weight in parts_of(sums, number):
-        halves = part.of(("twice_agreeing", "twice")) * (0.5 if key == "psa" else 1.0) if number.pairs else None
-        influence = influences(part.index, columns_of(part, key, k), number.of, halves)
+        halves = number.pair_weight * part.of(number.pairs) if number.pairs else None
+        influence = influences(part.index, columns_of(part, number), number.of, halves)
         if influence is None:
             return None
         total = influence.times(weight) if total is None else total.plus(influence.times(weight))
@@ -414,9 +373,13 @@ def coverage(
     after, before = (
         np.bincount(at, weights=part["voxels"][:, 0], minlength=len(cell)) for at, part in zip(of, parts, strict=True)
     )
-    columns = np.stack([after - before, after + before, before], axis=1)
-    result = interval_of_cubes(cell, edge, columns, lambda s: ratio_of(s[..., [0, 2]]), "plain", level=level)
+    voxels = np.stack([after - before, after + before, before], axis=1)
+    result = estimate(ClusterSums.of_cubes(cell, edge, {"voxels": voxels}), GROWTH, level=level)
     return no_difference(result) if np.allclose(after, before, rtol=1e-9) else result
+
+
+GROWTH = Functional(("voxels",), lambda sums: ratio_of(sums[..., [0, 2]]), -math.inf, math.inf, "plain")
+"""The difference of voxels, then those of both maps, over those of the earlier one."""
 
 
 def shares_of(new: ClusterSums, base: ClusterSums) -> dict[str, float]:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -31,10 +31,10 @@ from semstab.data.statistics import (
 from semstab.data.voxels import VoxelTable
 from semstab.metrics.agreement import shared_rows
 from semstab.metrics.summary import STRATA, groups_of
-from semstab.statistics.accumulate import Cubes, CubeSums, cluster_sums_of
+from semstab.statistics.accumulate import Cubes, cluster_sums_of
 from semstab.statistics.agreement import class_agreement_of, class_sums, consistency_posterior, shares_of
 from semstab.statistics.cell_agreement import cell_agreement
-from semstab.statistics.cluster_sums import ClusterSums
+from semstab.statistics.cluster_sums import ClusterSums, Functional
 from semstab.statistics.correctness import (
     MIOU,
     Predictions,
@@ -63,7 +63,7 @@ from semstab.statistics.cube_sums import (
 from semstab.statistics.drift import expected_sbd
 from semstab.statistics.frame_disagreement import LoneDisagreement, lone_disagreement, outlying_frames
 from semstab.statistics.geometry import losses
-from semstab.statistics.intervals import confidence_intervals, estimate, headline_specs, scope_of
+from semstab.statistics.intervals import confidence_intervals, estimate, headline_specs, scope_of, spec_of
 from semstab.statistics.observations import CellObservations
 from semstab.statistics.ranges import range_agreement
 from semstab.statistics.sample import MapSample
@@ -242,10 +242,15 @@ def analyse(
     return Analysis(summary, whole, sums, sample, shares, drawn, lone)
 
 
-def _means(locations: CubeSums, sums: ClusterSums, scope: Scope) -> dict[str, Interval]:
+def _means(locations: ClusterSums, sums: ClusterSums, scope: Scope) -> dict[str, Interval]:
     """Return the means over the voxels with OP >= 2 by name, those of `OF_CLUSTERS` in the scope where they can be."""
-    of_cubes = dict(zip(MEANS, confidence_intervals(locations.specs(MEANS)), strict=True))
+    of_cubes = dict(zip(MEANS, _intervals(locations, MEANS.values()), strict=True))
     return of_cubes | {name: estimate(sums, key, scope=scope_of(sums, scope, key)) for name, key in OF_CLUSTERS.items()}
+
+
+def _intervals(sums: ClusterSums, numbers: Iterable[Functional]) -> list[Interval]:
+    """Return numbers of the same sums with their intervals."""
+    return confidence_intervals(spec_of(sums, number) for number in numbers)
 
 
 def _agreement(means: Mapping[str, Interval], classes: tuple[ClassAgreement, ...]) -> FrameAgreement:
@@ -253,16 +258,16 @@ def _agreement(means: Mapping[str, Interval], classes: tuple[ClassAgreement, ...
     return FrameAgreement(**{name: means[name] for name in names}, classes=classes)
 
 
-def _drift(repeats: int, means: Mapping[str, Interval], locations: CubeSums, log: LogSums | None) -> DriftStatistics:
+def _drift(repeats: int, means: Mapping[str, Interval], locations: ClusterSums, log: LogSums | None) -> DriftStatistics:
     """Return SBD and its null; without a log only for one-hot evidence, and without flips and trend."""
-    trend, rates, sampled = None, None, locations["psa"][1]
+    trend, rates, (sampled, known) = None, None, (locations[name][:, 1].sum() for name in ("psa", "null"))
     if log is not None:
-        since, share = confidence_intervals(log.sums.specs(OF_CHANGES))
+        since, share = _intervals(log.sums, OF_CHANGES)
         trend = Trend(share, log.telling)
-        rate, null, excess = confidence_intervals(log.sums.specs(OF_FLIPS))
+        rate, null, excess = _intervals(log.sums, OF_FLIPS)
         rates = FlipRates(rate, null, excess, since)
     return DriftStatistics(
-        voxels=round(locations["null"][1] / sampled * repeats) if sampled else 0,
+        voxels=round(known / sampled * repeats) if sampled else 0,
         sbd=means["sbd"],
         null=means["null"],
         excess=means["excess"],

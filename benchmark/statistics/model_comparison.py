@@ -17,9 +17,8 @@ from semstab.data.statistics import CONFIDENCE, UNDEFINED, Estimate
 from semstab.data.voxels import VoxelTable
 from semstab.errors import ConfigError
 from semstab.metrics.agreement import require_same_grid, shared_rows
-from semstab.statistics.accumulate import CubeSums
 from semstab.statistics.agreement import ALPHA, PSA, VOXEL_ALPHA, alpha_columns, alpha_of, ratio_of
-from semstab.statistics.cluster_sums import CELLS, ClusterSums, Statistic, columns_of, distinct_rows
+from semstab.statistics.cluster_sums import FUNCTIONALS, ClusterSums, Statistic, columns_of, distinct_rows
 from semstab.statistics.correctness import ACCURACY, join_truth
 from semstab.statistics.drift import streams
 from semstab.statistics.intervals import estimate, scope_of
@@ -147,7 +146,7 @@ def _by_cube(cells: Mapping[str, ClusterSums]) -> dict[str, Float64]:
     for name, each in parts.items():
         sums = []
         for own in each:
-            columns = columns_of(own, ALPHA.key)
+            columns = columns_of(own, FUNCTIONALS[ALPHA.key])
             sums.append(np.zeros((len(cubes), columns.shape[1])))
             np.add.at(sums[-1], next(ends), columns)
         result[name] = np.hstack(sums)
@@ -156,9 +155,7 @@ def _by_cube(cells: Mapping[str, ClusterSums]) -> dict[str, Float64]:
 
 def _alpha_of_cells(sums: Float64) -> Float64:
     """Return alpha (...,) from sums (..., 2 C) of fine cells and of coarse ones."""
-    parts = zip(CELLS, np.split(sums, 2, axis=-1), strict=True)
-    alpha: Float64 = np.sum([weight * alpha_of(own) for (_, weight), own in parts], axis=0)
-    return alpha
+    return FUNCTIONALS[ALPHA.key].of_parts(np.split(sums, 2, axis=-1))
 
 
 def _columns(
@@ -267,7 +264,7 @@ def compare_regions(
     names = tuple(first.tables)
     require_same_grid(*first.tables.values())
     shared = None if observations is None else compared_observations({name: observations[name] for name in names})
-    held_there, counts, strata = [], list[Int64](), dict[str, list[CubeSums]]()
+    held_there, counts, strata = [], list[Int64](), dict[str, list[ClusterSums]]()
     for region in regions():
         held_there.append(held(region.tables))
         counts.append(stratum_counts(region.tables))
@@ -275,7 +272,7 @@ def compare_regions(
             strata.setdefault(name, []).append(stratum_sums(table))
     observed = np.sum(counts, axis=0)
     weights = common_weights(observed)
-    means = {name: standardised_of(CubeSums.merged(parts), weights) for name, parts in strata.items()}
+    means = {name: standardised_of(ClusterSums.joined(parts), weights) for name, parts in strata.items()}
     keys = () if mixed else voxelwise()  # means of labels and means of scores are not comparable
     everywhere = {quantity.key: {name: own[quantity.key] for name, own in means.items()} for quantity in keys}
     return ModelComparison(

@@ -22,9 +22,9 @@ from semstab.data.statistics import UNDEFINED, UNKNOWN, Estimate, Interval
 from semstab.data.voxels import VoxelTable
 from semstab.errors import ConfigError, DataError
 from semstab.metrics.agreement import observations, require_same_grid, rows_of
-from semstab.statistics.accumulate import Cubes, CubeSums, cluster_sums_of, sums_of_cells
-from semstab.statistics.agreement import ALPHA, ONE_HOT, PSA, VOXEL_ALPHA, psa, ratio_of
-from semstab.statistics.cluster_sums import ClusterSums, Statistic
+from semstab.statistics.accumulate import Cubes, cluster_sums_of, sums_of_cells
+from semstab.statistics.agreement import ALPHA, ONE_HOT, PSA, VOXEL_ALPHA, psa
+from semstab.statistics.cluster_sums import ClusterSums, Statistic, mean_functional
 from semstab.statistics.cluster_sums import value as value_of
 from semstab.statistics.correctness import ACCURACY, join_truth
 from semstab.statistics.intervals import difference, estimate, scope_of
@@ -193,7 +193,7 @@ def standardised(
     return {name: standardised_of(stratum_sums(table, edges), weights)[measure.key] for name, table in tables.items()}
 
 
-def stratum_sums(table: VoxelTable, edges: Sequence[int] = EDGES) -> CubeSums:
+def stratum_sums(table: VoxelTable, edges: Sequence[int] = EDGES) -> ClusterSums:
     """Return the sums of each quantity over the voxels of each cube and stratum, then how many (G, 2 S)."""
     stratum, S, cubes = _stratum(table, edges), len(edges) + 1, Cubes.of(table)
     group = np.where(cubes.at >= 0, cubes.at * S + stratum - 1, -1)
@@ -201,17 +201,18 @@ def stratum_sums(table: VoxelTable, edges: Sequence[int] = EDGES) -> CubeSums:
     both = by_group(group, [formula(table) for formula in quantities.values()], cubes.count * S)
     sums, counts = (own.T.reshape(len(quantities), cubes.count, S) for own in both)
     named = zip(quantities, sums, counts, strict=True)
-    return CubeSums(cubes.cell, cubes.edge, {quantity.key: np.hstack(own) for quantity, *own in named})
+    return cubes.named({quantity.key: np.hstack(own) for quantity, *own in named})
 
 
-def standardised_of(sums: CubeSums, weights: Float64) -> dict[str, Estimate]:
+def standardised_of(sums: ClusterSums, weights: Float64) -> dict[str, Estimate]:
     """Return each quantity's mean at these weights, by key, from `stratum_sums`.
 
     Its interval is that of a ratio of sums with the same influences: a voxel's value counts by how far it is from the
     mean of its stratum.
     """
     S, result = len(weights), {}
-    for key, own in sums.sums.items():
+    for key in sums.layout:
+        own = sums[key]
         total, count = own[:, :S].sum(axis=0), own[:, S:].sum(axis=0)
         used = (weights > 0) & (count > 0)
         if not used.any():
@@ -223,7 +224,7 @@ def standardised_of(sums: CubeSums, weights: Float64) -> dict[str, Estimate]:
         value = float(each @ total)
         above = own[:, :S] @ each - own[:, S:] @ (each * mean_of)
         columns = {key: np.stack([above + value * size, size], axis=1)}
-        result[key] = CubeSums(sums.cell, sums.edge, columns).estimate(key, ratio_of).ends
+        result[key] = estimate(ClusterSums.of_cubes(sums.cell, sums.edge, columns), mean_functional(key)).ends
     return result
 
 

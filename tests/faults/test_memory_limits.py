@@ -17,7 +17,8 @@ from semstab.core.process import available_bytes, group_bytes
 from semstab.data.frames import Frame, Intrinsics
 from semstab.errors import ConfigError
 from semstab.statistics.agreement import alpha_of
-from semstab.statistics.intervals import confidence_intervals, spec_of_observations
+from semstab.statistics.cluster_sums import ALPHA_SUMS, ClusterSums, Functional, side_by_side
+from semstab.statistics.intervals import estimate
 
 SIDE, FRAMES = 160, 6
 
@@ -105,8 +106,10 @@ def test_thousands_of_classes_take_no_square_of_them() -> None:
     tracemalloc.start()
     try:
         NumpyReference(0.5, K).integrate(frame)
-        of_nine = np.arange(27).reshape(9, 3), np.arange(9), 1.0, 1, sums, sums[:, :2], alpha_of
-        assert confidence_intervals([spec_of_observations(*of_nine)])[0].value < 1
+        columns = side_by_side(dict(zip(ALPHA_SUMS, (1, 1, 1, K), strict=True)))
+        of_nine = ClusterSums(np.arange(27).reshape(9, 3), np.arange(9), sums, columns, 1.0, 1)
+        number = Functional(ALPHA_SUMS, alpha_of, -1.0, 1.0, "agreement", pairs=ALPHA_SUMS[:2])
+        assert estimate(of_nine, number).value < 1
         assert tracemalloc.get_traced_memory()[1] < 1e8
     finally:
         tracemalloc.stop()

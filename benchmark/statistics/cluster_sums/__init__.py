@@ -3,8 +3,17 @@
 They add up over clusters, and are a small file: comparisons and gates need no voxels.
 """
 
-from semstab.statistics.cluster_sums.columns import BINS, DRIFT, MOST_CLASSES, FirstColumns, layout, of_measure, width
+from semstab.statistics.cluster_sums.columns import (
+    DRIFT,
+    MOST_CLASSES,
+    FirstColumns,
+    layout,
+    of_measure,
+    side_by_side,
+    width,
+)
 from semstab.statistics.cluster_sums.functionals import (
+    ALPHA_SUMS,
     BY_CLASS,
     CELLS,
     FUNCTIONALS,
@@ -15,7 +24,7 @@ from semstab.statistics.cluster_sums.functionals import (
     columns_of,
     frames_of,
     functional,
-    of_space_alone,
+    mean_functional,
     parts_of,
     summed,
     value,
@@ -31,7 +40,7 @@ from semstab.statistics.cluster_sums.index import (
 from semstab.statistics.cluster_sums.sums import ClusterSums, aligned
 
 __all__ = [
-    "BINS",
+    "ALPHA_SUMS",
     "BY_CLASS",
     "CELLS",
     "DRIFT",
@@ -53,10 +62,11 @@ __all__ = [
     "frames_of",
     "functional",
     "layout",
+    "mean_functional",
     "most_groups",
     "of_measure",
-    "of_space_alone",
     "parts_of",
+    "side_by_side",
     "summed",
     "value",
     "width",

@@ -3,17 +3,15 @@
 from __future__ import annotations
 
 import functools
+import itertools
 from collections.abc import Mapping
 from types import MappingProxyType
 from typing import NamedTuple
 
-import numpy as np
+from semstab.metrics.correctness import BINS
 
 MOST_CLASSES = 64
 """Sums by class are stored up to so many classes."""
-
-BINS = 15
-"""Bins of the reliability diagram; bin b has voxels whose largest belief lies in (b / BINS, (b + 1) / BINS]."""
 
 PLAIN = (
     "voxels", "psa", "observations", "agreeing", "own", "twice", "twice_agreeing", "recurrent", "vss", "entropy",
@@ -22,7 +20,9 @@ BY_CLASS_ALONE = ("class_apart", "class_own")
 DRIFT = ("sbd_excess", "sbd_known")
 WITH_TRUTH = ("known", "right", "observed", "observed_right", "consistent", "consistent_wrong")
 BY_TRUE_CLASS = ("class_known", "class_right", "class_predicted")
-WITHOUT_FRAMES = (*DRIFT, "calibrated", "gap")
+CALIBRATION = ("calibrated", "gap")
+OF_TRUTH = (*WITH_TRUTH, *BY_TRUE_CLASS, *CALIBRATION)
+WITHOUT_FRAMES = (*DRIFT, *CALIBRATION)
 """Sums that belong to no frame: they stand in rows whose frame is -1, as do sums of the register of measures."""
 
 
@@ -46,8 +46,13 @@ def layout(K: int, *, truth: bool, measured: tuple[str, ...] = ()) -> Mapping[st
         widths += [(name, K) for name in BY_TRUE_CLASS] if by_class else []
         widths += [("calibrated", 1), ("gap", BINS)]
     widths += [(name, 1) for key in measured for name in of_measure(key)]
-    ends = np.cumsum([width for _, width in widths])
-    slices = {name: slice(int(end) - width, int(end)) for (name, width), end in zip(widths, ends, strict=True)}
+    return side_by_side(dict(widths))
+
+
+def side_by_side(widths: Mapping[str, int]) -> Mapping[str, slice]:
+    """Return the columns by name of sums that have so many each."""
+    ends = itertools.accumulate(widths.values())
+    slices = {name: slice(end - width, end) for (name, width), end in zip(widths.items(), ends, strict=True)}
     return MappingProxyType(slices)
 
 
@@ -84,15 +89,15 @@ class FirstColumns(NamedTuple):
         return cls(*(columns[name].start if name in columns else -1 for name in cls._fields))
 
 
-def width(K: int, *, truth: bool, measured: tuple[str, ...] = ()) -> int:
-    """Return how many columns there are."""
-    return max(int(part.stop) for part in layout(K, truth=truth, measured=measured).values())
+def width(columns: Mapping[str, slice]) -> int:
+    """Return how many columns a layout has."""
+    return max(int(part.stop) for part in columns.values())
 
 
-def column_names(K: int, *, truth: bool, measured: tuple[str, ...] = ()) -> list[str]:
-    """Return the name of each column in a file: NAME, or NAME_k for class or bin k."""
+def column_names(columns: Mapping[str, slice]) -> list[str]:
+    """Return the name of each column of a layout in a file: NAME, or NAME_k for class or bin k."""
     return [
         f"{name}_{k}" if where.stop - where.start > 1 else name
-        for name, where in layout(K, truth=truth, measured=measured).items()
+        for name, where in columns.items()
         for k in range(where.stop - where.start)
     ]

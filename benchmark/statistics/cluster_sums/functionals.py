@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import dataclasses
+import functools
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from typing import Literal
 
@@ -11,7 +13,8 @@ import numpy as np
 
 from semstab.core.types import Float64
 from semstab.data.measures import Measure, measures
-from semstab.statistics.agreement import ONE_HOT, alpha_of, ratio_of
+from semstab.metrics.correctness import calibration_error, iou, mean_iou
+from semstab.statistics.agreement import alpha_of, class_alpha_of, ratio_of
 from semstab.statistics.cluster_sums.columns import WITHOUT_FRAMES, of_measure
 from semstab.statistics.cluster_sums.sums import ClusterSums
 
@@ -25,47 +28,24 @@ Part = Literal["map", "fine", "coarse"]
 def iou_of(sums: Float64) -> Float64:
     """Return intersection over union (...,) of a class from the right, a count, the true and the predicted."""
     right, _, true, predicted = np.moveaxis(sums, -1, 0)
-    union = true + predicted - right
-    with np.errstate(invalid="ignore", divide="ignore"):
-        ratio: Float64 = np.where(union.real > 0, right / union, np.nan)
-    return ratio
+    return iou(right, true, predicted)
 
 
 def miou_of(sums: Float64) -> Float64:
-    """Return mean intersection over union (...,) over the classes that are true or predicted anywhere.
-
-    The sums (..., 2 + 3 K) are a count twice, then of each class the right, the true and the predicted.
-    """
-    right, true, predicted = np.split(sums[..., 2:], 3, axis=-1)
-    union = true + predicted - right
-    defined = union.real > 0
-    with np.errstate(invalid="ignore", divide="ignore"):
-        mean: Float64 = np.where(defined, right / np.where(defined, union, 1), 0).sum(axis=-1) / defined.sum(axis=-1)
-    return mean
+    """Return mean IoU (...,) from a count twice, then of each class the right, the true and the predicted."""
+    return mean_iou(*np.split(sums[..., 2:], 3, axis=-1))
 
 
 def ece_of(sums: Float64) -> Float64:
     """Return expected calibration error (...,) from a count twice, and right less confidence in each bin."""
-    gap = sums[..., 2:]
-    with np.errstate(invalid="ignore", divide="ignore"):
-        error: Float64 = (np.sign(gap.real) * gap).sum(axis=-1) / sums[..., 1]
-    return error
-
-
-def class_alpha_of(sums: Float64) -> Float64:
-    """Return alpha (...,) of a class against all others from the sums `CLASS_SUMS` (..., 4)."""
-    apart, n, total, squares = np.moveaxis(sums, -1, 0)
-    with np.errstate(invalid="ignore", divide="ignore"):
-        expected = 2 * ((n - 1) * total - total**2 + squares) / (n * (n - 1))
-        value: Float64 = 1 - (apart / n) / np.where(expected.real > ONE_HOT, expected, np.nan)
-    return value
+    return calibration_error(sums[..., 2:], sums[..., 1])
 
 
 @dataclass(frozen=True)
 class Functional:
-    """A number that is a smooth function of sums over a map.
+    """A number that is a smooth function of sums over clusters.
 
-    The second sum counts the terms of the first.
+    The second column of its sums counts the terms of the first.
 
     Attributes:
         names: Names of the sums.
@@ -73,10 +53,12 @@ class Functional:
         low, high: Its range.
         scale: Scale of its interval: a 'share' or mean of numbers from 0 to 1, an 'agreement', at most 1, or 'plain'.
         parts: The parts that its sums come from, each with its weight: a map, or sampled cells.
-        pairs: The first sum is of pairwise agreement; at a location that two frames saw, neither frame has it for
-            itself alone.
+        pairs: Names of the part of the first two sums that is of pairs alone, where the first is of pairwise
+            agreement: at a location that two frames saw, neither frame has it for itself alone.
+        pair_weight: Weight of an observation of these pairs in the first two sums.
         by_location: What a location adds is no frame's more than another's, so that frames do not show how much the
             number varies between flights: its intervals are for these frames (docs/validity.md).
+        k: The class whose columns are taken of sums by class; all of them where it is None.
     """
 
     names: tuple[str, ...]
@@ -84,9 +66,21 @@ class Functional:
     low: float = 0.0
     high: float = 1.0
     scale: Scale = "share"
-    pairs: bool = False
+    pairs: tuple[str, ...] = ()
+    pair_weight: float = 1.0
     parts: tuple[tuple[Part, float], ...] = (("map", 1.0),)
     by_location: bool = False
+    k: int | None = None
+
+    @property
+    def of_space_alone(self) -> bool:
+        """Whether frames do not show how much it varies, so that its intervals are for these frames."""
+        return self.by_location or set(self.names) <= set(WITHOUT_FRAMES)
+
+    def of_parts(self, sums: Iterable[Float64]) -> Float64:
+        """Return the number (...,) from the sums (..., C) of each of its parts."""
+        weighted = [weight * self.of(each) for (_, weight), each in zip(self.parts, sums, strict=True)]
+        return functools.reduce(np.add, weighted)
 
 
 CELLS: tuple[tuple[Part, float], ...] = (("fine", 2.0), ("coarse", -1.0))
@@ -95,11 +89,12 @@ CELLS: tuple[tuple[Part, float], ...] = (("fine", 2.0), ("coarse", -1.0))
 
 ALPHA_SUMS = ("agreeing", "observations", "own", "evidence")
 CLASS_SUMS = ("class_apart", "observations", "evidence", "class_own")
+PAIRS = ("twice_agreeing", "twice")
 
 FUNCTIONALS: Mapping[str, Functional] = {
-    "psa": Functional(("psa", "voxels"), ratio_of, pairs=True),
-    "alpha": Functional(ALPHA_SUMS, alpha_of, -1.0, 1.0, "agreement", pairs=True, parts=CELLS),
-    "voxel_alpha": Functional(ALPHA_SUMS, alpha_of, -1.0, 1.0, "agreement", pairs=True),
+    "psa": Functional(("psa", "voxels"), ratio_of, pairs=PAIRS, pair_weight=0.5),
+    "alpha": Functional(ALPHA_SUMS, alpha_of, -1.0, 1.0, "agreement", pairs=PAIRS, parts=CELLS),
+    "voxel_alpha": Functional(ALPHA_SUMS, alpha_of, -1.0, 1.0, "agreement", pairs=PAIRS),
     "vss": Functional(("vss", "recurrent"), ratio_of),
     "entropy": Functional(("entropy", "voxels"), ratio_of, by_location=True),
     "accuracy": Functional(("right", "known"), ratio_of),
@@ -136,10 +131,17 @@ def mean_over_voxels(measure: Measure) -> Functional:
     return Functional(of_measure(measure.key), ratio_of, 0.0, measure.largest, scale, by_location=True)
 
 
-def functional(key: str, k: int | None = None) -> Functional:
-    """Return the number that a key stands for: of all classes, or of class k."""
+def mean_functional(name: str, low: float = 0.0, high: float = 1.0) -> Functional:
+    """Return the mean of values from low to high, whose sums and numbers are the two columns of a name."""
+    return Functional((name,), ratio_of, low, high, "share" if (low, high) == (0, 1) else "plain")
+
+
+def functional(key: str | Functional, k: int | None = None) -> Functional:
+    """Return the number that a key stands for: of all classes, or of class k; a number stands for itself."""
+    if isinstance(key, Functional):
+        return key
     if k is not None:
-        return BY_CLASS[key]
+        return dataclasses.replace(BY_CLASS[key], k=k)
     if key in FUNCTIONALS:
         return FUNCTIONALS[key]
     return mean_over_voxels({measure.key: measure for measure in summed()}[key])
@@ -153,23 +155,22 @@ def parts_of(sums: ClusterSums, number: Functional) -> tuple[tuple[ClusterSums, 
     return tuple(present) if known and len(present) == len(number.parts) else ()
 
 
-def columns_of(part: ClusterSums, key: str, k: int | None = None) -> Float64:
+def columns_of(part: ClusterSums, number: Functional) -> Float64:
     """Return the sums (m, C) of a part that a number is of."""
-    selected = [part[name] for name in functional(key, k).names]
+    selected, k = [part[name] for name in number.names], number.k
     if k is not None:
         selected = [columns[:, min(k, columns.shape[1] - 1)][:, None] for columns in selected]
     return np.concatenate(selected, axis=1)
 
 
-def value(sums: ClusterSums, key: str, k: int | None = None) -> float:
+def value(sums: ClusterSums, key: str | Functional, k: int | None = None) -> float:
     """Return the number; NaN where undefined."""
     number = functional(key, k)
     parts = parts_of(sums, number)
-    weighted = [weight * float(number.of(columns_of(part, key, k).sum(axis=0))) for part, weight in parts]
-    return sum(weighted) if weighted else math.nan
+    return float(number.of_parts(columns_of(part, number).sum(axis=0) for part, _ in parts)) if parts else math.nan
 
 
-def frames_of(sums: ClusterSums, key: str, k: int | None = None) -> int:
+def frames_of(sums: ClusterSums, key: str | Functional, k: int | None = None) -> int:
     """Return how many frames, or views, a number is of, about; 0 where they are unknown."""
     parts = parts_of(sums, functional(key, k))
     return parts[0][0].frame_count if parts else 0
@@ -179,9 +180,3 @@ def chance_of(cells: ClusterSums) -> float:
     """Return the probability that two observations from anywhere, of different views, agree; NaN for fewer than two."""
     evidence, n = cells["evidence"].sum(axis=0), float(cells["observations"].sum())
     return float((evidence**2).sum() - cells["own"].sum()) / (n * (n - 1)) if n > 1 else math.nan
-
-
-def of_space_alone(key: str, k: int | None = None) -> bool:
-    """Return whether frames do not show how much a number varies, so that its intervals are for these frames."""
-    number = functional(key, k)
-    return number.by_location or set(number.names) <= set(WITHOUT_FRAMES)

@@ -6,7 +6,7 @@ import dataclasses
 import functools
 import json
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -21,8 +21,8 @@ from semstab.core.types import Float64, Int32, Int64
 from semstab.data import earlier, parquet
 from semstab.data.measures import measures
 from semstab.errors import DataError
-from semstab.statistics.cluster_sums.columns import column_names, layout, of_measure, width
-from semstab.statistics.cluster_sums.index import ClusterIndex, distinct_rows
+from semstab.statistics.cluster_sums.columns import OF_TRUTH, column_names, layout, of_measure, side_by_side, width
+from semstab.statistics.cluster_sums.index import MOST_CELLS, ClusterIndex, distinct_rows
 
 SCHEMA = 5
 WITHOUT_CELLS = 2, 3
@@ -31,21 +31,24 @@ WITHOUT_CELLS = 2, 3
 
 @dataclass(frozen=True, eq=False)
 class ClusterSums:
-    """Sums over the observations in voxels with OP >= 2, a row for each cube of space and group of frames.
+    """Sums by name, a row for each cube of space and group of frames; those of parts of a map add up to the map's.
+
+    Those of a whole map are over the observations in voxels with OP >= 2, and have the `layout` of its classes; a
+    location counts 1 / T for each of its T frames in `voxels`, 1 in `observations`, and its pairwise agreement is
+    shared out among them in `psa` and `agreeing`. Those of any values of voxels have their own names and no frames.
 
     Attributes:
         cell: (m, 3) int32 cube: floor(voxel centre / edge), so that the cubes of all maps of a scene are the
             same.
         frame: (m,) int32 group: frame index // step; -1 where the frames are unknown, without a log, and
             for sums that belong to none (`WITHOUT_FRAMES`).
-        columns: (m, C) float64, see `layout`. A location counts 1 / T for each of its T frames in `voxels`, 1 in
-            `observations`; its pairwise agreement is shared out among them in `psa` and `agreeing`.
+        columns: (m, C) float64.
+        layout: The columns of each name.
         edge: Metres, a power of 2; that of cells is their own, so that alpha and its interval are the same whatever the
             voxels of the map.
         step: Frames of a group, a power of 2; 0 where they are unknown.
+        voxel_size: Metres.
         fused: Number of frames that they come from.
-        truth: True if sums of ground truth are included.
-        measured: Keys of the measures of the register that have sums over the voxels.
         fine, coarse: The same of sampled cells, which are units instead of voxels and views instead of frames, and of
             cells twice as wide, where there are `CellObservations`.
     """
@@ -53,29 +56,53 @@ class ClusterSums:
     cell: Int32
     frame: Int32
     columns: Float64
+    layout: Mapping[str, slice]
     edge: float
-    step: int
-    voxel_size: float
-    K: int
+    step: int = 0
+    voxel_size: float = math.nan
     classes: tuple[str, ...] = ()
-    truth: bool = False
     fused: int = 0
-    measured: tuple[str, ...] = ()
     fine: ClusterSums | None = None
     coarse: ClusterSums | None = None
+
+    @classmethod
+    def of_cubes(cls, cell: npt.NDArray[np.integer], edge: float, sums: Mapping[str, Float64]) -> ClusterSums:
+        """Return sums (G, C) by name over the voxels of each cube (G, 3), whose frames are not told apart."""
+        columns = np.concatenate([*sums.values()], axis=1)
+        slices = side_by_side({name: each.shape[1] for name, each in sums.items()})
+        return cls(cell.astype(np.int32), np.full(len(cell), -1, np.int32), columns, slices, edge)
+
+    @classmethod
+    def joined(cls, parts: Sequence[ClusterSums]) -> ClusterSums:
+        """Return the sums over at most MOST_CELLS cubes of a map from those of its parts, without frames."""
+        edge = max(part.edge for part in parts)
+        parts = [part.coarsened(edge, 0) for part in parts]
+        cell, frame, columns = (
+            np.concatenate([getattr(part, name) for part in parts]) for name in ("cell", "frame", "columns")
+        )
+        whole = dataclasses.replace(parts[0], cell=cell, frame=frame, columns=columns)
+        while len(distinct_rows(whole.cell // round(edge / whole.edge))[0]) > MOST_CELLS:
+            edge *= 2
+        return whole.coarsened(edge, 0)
 
     def __getitem__(self, name: str) -> Float64:
         """Return sums (m, 1), or (m, K) by class, of that name."""
         return self.columns[:, self.layout[name]]
 
-    @property
-    def layout(self) -> Mapping[str, slice]:
-        """The columns for each name."""
-        return layout(self.K, truth=self.truth, measured=self.measured)
-
-    def of(self, names: tuple[str, ...]) -> Float64:
+    def of(self, names: Sequence[str]) -> Float64:
         """Return sums (m, C) of several names side by side."""
         return np.concatenate([self[name] for name in names], axis=1)
+
+    @property
+    def K(self) -> int:
+        """The number of classes of a whole map."""
+        evidence = self.layout["evidence"]
+        return int(evidence.stop - evidence.start)
+
+    @property
+    def truth(self) -> bool:
+        """Whether sums of ground truth are included."""
+        return "known" in self.layout
 
     @functools.cached_property
     def index(self) -> ClusterIndex:
@@ -128,8 +155,9 @@ class ClusterSums:
 
     def without_truth(self) -> ClusterSums:
         """Return the sums without the columns of ground truth."""
-        names = layout(self.K, truth=False, measured=self.measured)
-        return dataclasses.replace(self, columns=self.of(tuple(names)), truth=False)
+        names = [name for name in self.layout if name not in OF_TRUTH]
+        slices = side_by_side({name: self[name].shape[1] for name in names})
+        return dataclasses.replace(self, columns=self.of(names), layout=slices)
 
     def save(self, path: str | Path, *, single: bool = False) -> None:
         """Write Parquet, atomically; in single precision, which takes half the bytes and keeps seven digits."""
@@ -144,7 +172,7 @@ class ClusterSums:
         columns = np.zeros((sum(lengths), self.columns.shape[1]))
         for part, rows in zip(parts, np.split(np.arange(len(columns)), np.cumsum(lengths)[:-1]), strict=True):
             columns[rows, : part.columns.shape[1]] = part.columns
-        names = column_names(self.K, truth=self.truth, measured=self.measured)
+        names = column_names(self.layout)
         stored = columns.astype(np.float32) if single else columns
         arrays = [np.repeat(np.arange(len(parts)), lengths), *cell.T, frame, *stored.T]
         content = pa.table({name: arrow.column(array) for name, array in zip([*KEYS, *names], arrays, strict=True)})
@@ -178,8 +206,9 @@ class ClusterSums:
                 raise DataError(f"{len(names) - len(KEYS)} columns of sums for {meta.K} classes")
             stored = dict(zip(names, content.columns, strict=True))
             measured = tuple(each.key for each in measures() if stored.keys() >= {*of_measure(each.key)})
-            columns = np.full((len(content), width(meta.K, truth=meta.truth, measured=measured)), np.nan)
-            for k, name in enumerate(column_names(meta.K, truth=meta.truth, measured=measured)):
+            slices = layout(meta.K, truth=meta.truth, measured=measured)
+            columns = np.full((len(content), width(slices)), np.nan)
+            for k, name in enumerate(column_names(slices)):
                 if name in stored:
                     columns[:, k] = arrow.values_of(stored[name])
             if np.any(np.abs(columns) > LARGEST**2):
@@ -190,11 +219,10 @@ class ClusterSums:
             for number, (edge, step, voxel_size, fused) in enumerate(
                 zip(meta.edge, meta.step, meta.voxel_size, meta.fused, strict=True)
             ):
-                rows, truth, measures_of = part == number, meta.truth and not number, () if number else measured
-                sums = columns[rows, : width(meta.K, truth=truth, measured=measures_of)]
+                rows, its_layout = part == number, layout(meta.K, truth=False) if number else slices
                 cell, frame = np.stack([key[rows] for key in keys[:3]], axis=1), keys[3][rows]
-                where = cell.astype(np.int32), frame.astype(np.int32), sums, edge, step
-                parts.append(cls(*where, voxel_size, meta.K, meta.classes, truth, fused, measures_of))
+                where = cell.astype(np.int32), frame.astype(np.int32), columns[rows, : width(its_layout)]
+                parts.append(cls(*where, its_layout, edge, step, voxel_size, meta.classes, fused))
         whole, *cells = parts
         return dataclasses.replace(whole, fine=cells[0], coarse=cells[1]) if cells else whole
 
