@@ -76,7 +76,7 @@ def test_frames_and_tensors_and_scores_are_taken(city, classes, steady):
     soft = [{**given, "labels": None, "scores": eye[given["labels"]]} for given in frames_of(city, "sim-steady")]
     for given in (frames, tensors, soft):
         result = semstab.fuse(given, voxel_size=SIZE, classes=classes)
-        assert result.summary.vss3 == pytest.approx(steady.summary.vss3, abs=1e-12)
+        assert result.summary.recurrent_vss == pytest.approx(steady.summary.recurrent_vss, abs=1e-12)
         assert result.summary.alpha == pytest.approx(steady.summary.alpha, abs=1e-12)
 
 

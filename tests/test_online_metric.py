@@ -22,7 +22,7 @@ from semstab.errors import ConfigError, DataError
 from semstab.online.metric import TemporalStability
 from semstab.online.summary import Summary
 
-EXACT = ("vss@3", "psa", "alpha", "op3_share")
+EXACT = ("recurrent_vss", "psa", "alpha", "recurrent_share")
 """What is the same however frames are shared out among processes."""
 
 
@@ -148,7 +148,7 @@ def test_a_large_map_is_sampled_and_stays_bounded(flights):
     np.testing.assert_array_equal(sample.table.op, all_of_it.table.op[rows])
     np.testing.assert_allclose(sample.table.drift_sum, all_of_it.table.drift_sum[rows], atol=1e-12)
     np.testing.assert_allclose(sample.table.evidence, all_of_it.table.evidence[rows], atol=1e-12)
-    for name in ("vss@3", "psa", "alpha"):
+    for name in ("recurrent_vss", "psa", "alpha"):
         assert metric.compute()[name] == pytest.approx(whole.compute()[name], abs=0.06)
     metric.merge_state(whole)
     (merged,) = metric.states().values()
@@ -186,7 +186,7 @@ def test_it_is_a_metric_of_torchmetrics(flights):
     plain = updated(TemporalStability(K, SIZE), flights["scene0"]).compute()
     for frame in flights["scene0"]:
         batch = metric(frame.labels, frame.depth, frame.intrinsics, frame.T_wc)
-    assert batch["op3_share"] == 0  # of the last frame alone
+    assert batch["recurrent_share"] == 0  # of the last frame alone
     assert {name: float(value) for name, value in metric.compute().items()} == pytest.approx(plain, nan_ok=True)
     assert metric.by_sequence()[""].frames == 10
     other = semstab.TemporalStability(K, SIZE)
@@ -211,7 +211,7 @@ def test_two_processes_say_what_one_says(flights, tmp_path):
     assert {name: float(value) for name, value in first.items()} == {
         name: float(value) for name, value in other.items()
     }
-    assert float(second["op3_share"]) != float(first["op3_share"])
+    assert float(second["recurrent_share"]) != float(first["recurrent_share"])
 
 
 def test_lightning_logs_it(flights, tmp_path):

@@ -101,7 +101,7 @@ def fuse(
 
     Examples:
         >>> result = semstab.fuse(frames, voxel_size=0.5)
-        >>> result.summary.frames, round(result.summary.op3_share, 1)
+        >>> result.summary.frames, round(result.summary.recurrent_share, 1)
         (6, 1.0)
     """
     sequence, token = Sequence(frames), uuid.uuid4().hex

@@ -170,8 +170,9 @@ class TemporalStability:
         ...     predicted = labels.copy()
         ...     predicted[:, :wrong] = 2
         ...     metric.update(predicted, depth, K, pose)
-        >>> {name: round(float(value), 2) for name, value in metric.compute().items() if name in ("vss@3", "op3_share")}
-        {'vss@3': 0.93, 'op3_share': 1.0}
+        >>> numbers = metric.compute()
+        >>> {name: round(float(numbers[name]), 2) for name in ("recurrent_vss", "recurrent_share")}
+        {'recurrent_vss': 0.93, 'recurrent_share': 1.0}
     """
 
     higher_is_better = True
@@ -224,7 +225,7 @@ class TemporalStability:
             self._maps[name].add(frame)
 
     def compute(self) -> dict[str, float]:
-        """Return alpha, vss@3, sbd (bits), psa, flicker (percent) and op3_share, means over sequences.
+        """Return alpha, recurrent_vss, sbd (bits), psa, flicker (percent) and recurrent_share, means over sequences.
 
         A run of these frames gives the same numbers; a number is NaN where undefined, as before the first update.
         """

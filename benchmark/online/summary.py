@@ -20,17 +20,17 @@ class Summary:
         alpha: Agreement of two views at the same spot beyond chance, at most 1: the number that the verdict rests on.
         alpha_low, alpha_high: Ends of its confidence interval.
         confidence: Confidence of that interval, 0 to 1.
-        vss3: The paper's VSS, of the voxels with OP >= 3.
+        recurrent_vss: The paper's VSS, of the voxels with OP >= 3.
         sbd: The paper's SBD in bits, of the voxels with OP >= 2.
         entropy: The paper's entropy, of all voxels.
         psa: Probability that two frames agree, of the voxels with OP >= 2.
         flicker: Percent of the co-visible pixels whose label changes from frame to frame, motion compensated.
-        op3_share: Share of the voxels with OP >= 3, 0 to 1.
+        recurrent_share: Share of the voxels with OP >= 3, 0 to 1.
         verdict: The level.
         probability: Probability that the level is right.
     """
 
-    NAMES: ClassVar = ("alpha", "vss@3", "sbd", "psa", "flicker", "op3_share")
+    NAMES: ClassVar = ("alpha", "recurrent_vss", "sbd", "psa", "flicker", "recurrent_share")
 
     frames: int
     voxels: int
@@ -38,12 +38,12 @@ class Summary:
     alpha_low: float
     alpha_high: float
     confidence: float
-    vss3: float
+    recurrent_vss: float
     sbd: float
     entropy: float
     psa: float
     flicker: float
-    op3_share: float
+    recurrent_share: float
     verdict: str
     probability: float
 
@@ -58,17 +58,17 @@ class Summary:
             alpha_low=alpha.low,
             alpha_high=alpha.high,
             confidence=alpha.level,
-            vss3=float(table.recurrent[VSS]),
+            recurrent_vss=float(table.recurrent[VSS]),
             sbd=float(table[SBD]),
             entropy=float(table[ENTROPY]),
             psa=statistics.agreement.psa.value,
             flicker=flicker,
-            op3_share=table.recurrent.share,
+            recurrent_share=table.recurrent.share,
             verdict=verdict.level,
             probability=verdict.probability,
         )
 
     def scalars(self) -> dict[str, float]:
         """Return the numbers that are logged every epoch, by name."""
-        numbers = self.alpha, self.vss3, self.sbd, self.psa, self.flicker, self.op3_share
+        numbers = self.alpha, self.recurrent_vss, self.sbd, self.psa, self.flicker, self.recurrent_share
         return dict(zip(self.NAMES, numbers, strict=True))
