@@ -26,7 +26,7 @@ from semstab.datasets.formats.disk import natural, records, subfolders
 from semstab.datasets.formats.images import DEPTH_SUFFIXES, color_size
 from semstab.datasets.geometry.lenses import Lens
 from semstab.datasets.opensfm import read_reconstruction
-from semstab.datasets.photographs import Shot, bare_name, find_image, frame_names, written_names
+from semstab.datasets.photographs import PosedImageOptions, Shot, bare_name, find_image, frame_names, written_names
 from semstab.datasets.placing import Placement, Positions, placement_of
 from semstab.errors import DataError
 
@@ -192,19 +192,13 @@ def _view_name(path: Path) -> str | None:
     return next((value.strip() for key, _, value in said if key.strip() == "name" and value.strip()), None)
 
 
-class OdmOptions(FileOptions):
+class OdmOptions(PosedImageOptions):
     """Options with the defaults of the project."""
 
     depth_from: Kind | None = Field(None, description="source of depth; by default the first that the project has")
-    depth: str = Field("depth/{name}", description="template of depth files in the project")
-    images: Path | None = Field(None, description="folder of the posed images, where it is not in the project")
-    labels_on: Literal["undistorted", "original"] | None = Field(
-        None, description="images that labels were predicted on; by default the posed ones"
-    )
     reconstruction: int | None = Field(None, ge=0, description="which of several reconstructions, counted from 0")
     depth_kind: opt.DepthKind = None
     pose_convention: opt.PoseConvention = "world_to_camera"
-    up_axis: opt.UpAxis = "z"
 
 
 class Odm(FileDataset[OdmOptions]):

@@ -95,19 +95,24 @@ class Reconstruction:
     mesh_origin: tuple[float, float, float] | None = None
 
 
-class PhotographOptions(FileOptions):
-    """Options of photographs and their cameras."""
+class PosedImageOptions(FileOptions):
+    """Options of photographs that a program has posed."""
+
+    images: Path | None = Field(None, description="folder of the posed images, where it is not the usual one")
+    depth: str = Field("depth/{name}", description="template of depth files in the scene's folder")
+    labels_on: Literal["undistorted", "original"] | None = Field(
+        None, description="images that labels were predicted on; by default the posed ones"
+    )
+    up_axis: opt.UpAxis = "z"
+
+
+class PhotographOptions(PosedImageOptions):
+    """Options of photographs and a file of their cameras."""
 
     cameras: str | None = Field(None, description="file of the cameras in the scene's folder; found by default")
-    images: Path | None = Field(None, description="folder of the images; images/ in the scene's folder by default")
-    depth: str = Field("depth/{name}", description="template of depth files, where no surface is given")
-    labels_on: Literal["undistorted", "original"] | None = Field(
-        None, description="images that labels were predicted on; by default those that the cameras are of"
-    )
     mesh_origin: opt.Offset = Field(
         None, description="[east, north, up] in crs from which the mesh's coordinates count, if it was exported shifted"
     )
-    up_axis: opt.UpAxis = "z"
 
 
 Options = TypeVar("Options", bound=PhotographOptions)
