@@ -6,7 +6,8 @@ An indoor sequence is made once: a camera walks round a furnished room (room.py)
 PNG depth and labels, JPEG colour, voxels of 1 cm. Each command is a process of its own, bound to two cores, and they
 take turns. *Cold* is the first run of all with an empty cache of compiled code; the others are medians. `loop` is what
 manifest.json says of reading, flicker, fusion and observers in the run without the three. *again* repeats the finished
-command, which computes nothing. CPU counts all threads and child processes.
+command, which computes nothing. CPU counts all threads and child processes. Python may store its bytecode, as an
+installed package has it.
 """
 
 from __future__ import annotations
@@ -118,7 +119,8 @@ def measure(scene: Path, folder: Path, arguments: argparse.Namespace) -> dict[st
 def timed(words: list[str], variables: dict[str, str] | None = None) -> tuple[float, float]:
     """Wall-clock and CPU seconds of a command."""
     began, before = time.perf_counter(), resource.getrusage(resource.RUSAGE_CHILDREN)
-    subprocess.run([COMMAND, *words], check=True, env=os.environ | (variables or {}))
+    environment = {k: v for k, v in os.environ.items() if k != "PYTHONDONTWRITEBYTECODE"} | (variables or {})
+    subprocess.run([COMMAND, *words], check=True, env=environment)
     wall, after = time.perf_counter() - began, resource.getrusage(resource.RUSAGE_CHILDREN)
     return wall, after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime
 

@@ -10,6 +10,7 @@ import weakref
 
 import pytest
 
+from semstab.core.background import Background
 from semstab.core.prefetch import prefetch
 from semstab.errors import DataError
 
@@ -118,3 +119,15 @@ def test_workers_run_while_the_caller_works() -> None:
     for _ in prefetch(read, range(10), threads=2):
         time.sleep(0.02)
     assert time.perf_counter() - started < 0.36
+
+
+def test_jobs_beside_the_caller_are_done_in_order_and_their_errors_are_raised_where_they_are_waited_for() -> None:
+    done, jobs = list[int](), Background("beside", 2)
+    for number in range(10):
+        jobs.submit(lambda number=number: done.append(number))  # type: ignore[misc]
+        assert number - len(done) <= 2
+    jobs.drain()
+    assert done == [*range(10)]
+    jobs.submit(lambda: done.remove(-1))
+    with pytest.raises(ValueError, match="not in list"):
+        jobs.close()

@@ -38,11 +38,14 @@ def test_memory_of_an_image_is_used_again() -> None:
     assert faults("") > 50
 
 
-def test_a_choice_of_the_user_is_kept() -> None:
+@pytest.mark.parametrize(
+    ("name", "default", "other"), [("OMP_WAIT_POLICY", "PASSIVE", "ACTIVE"), ("OPENBLAS_NUM_THREADS", "1", "2")]
+)
+def test_a_choice_of_the_user_is_kept(name: str, default: str, other: str) -> None:
     script = "import os; from semstab.core import process; process.configure_process()"
-    script += "; print(os.environ['OMP_WAIT_POLICY'])"
-    for chosen, expected in ({}, "PASSIVE"), ({"OMP_WAIT_POLICY": "ACTIVE"}, "ACTIVE"):
-        environment = {k: v for k, v in os.environ.items() if k != "OMP_WAIT_POLICY"} | chosen
+    script += f"; print(os.environ['{name}'])"
+    for chosen, expected in ({}, default), ({name: other}, other):
+        environment = {k: v for k, v in os.environ.items() if k != name} | chosen
         result = subprocess.run(
             [sys.executable, "-c", script], check=True, capture_output=True, text=True, env=environment
         )

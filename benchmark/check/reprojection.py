@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any, cast
 
 import numpy as np
@@ -138,6 +138,10 @@ def frames_at(
             yield position, fetched.item
 
 
+Placed = tuple[Float64, Intrinsics, Float64]
+"""A view as a convention reads it: camera-to-world (4, 4), intrinsics, and its sample (3, N) in the camera's axes."""
+
+
 @dataclass(frozen=True, eq=False)
 class Sample:
     """The views of a check, which pairs of them are compared, and how their files are read."""
@@ -145,6 +149,7 @@ class Sample:
     views: dict[int, View]
     pairs: Sequence[Pair]
     configured: Convention
+    _placed: dict[tuple[int, Convention], Placed] = field(default_factory=dict, init=False, repr=False)
 
     def errors(self, convention: Convention, factors: Float64) -> list[Float64]:
         """Return for each pair the relative error (F, N) of the first view's sample in the second; inf if not seen."""
@@ -152,11 +157,9 @@ class Sample:
 
     def matched(self, pair: Pair, convention: Convention, factors: Float64) -> Matches:
         """Look the sample of the pair's first view up in the second one, for each factor on depth."""
-        a, b = self.views[pair[0]], self.views[pair[1]]
-        R, t = motion(a.pose(convention, self.configured), b.pose(convention, self.configured))
-        K_a, K_b = a.sampled_camera(convention), b.sampled_camera(convention)
-        depth = a.planar(a.u, a.v, convention, self.configured)
-        points = np.stack([(a.u - K_a.cx) / K_a.fx * depth, (a.v - K_a.cy) / K_a.fy * depth, depth])
+        (pose, _, points), (other, K_b, _) = (self._placed_by(convention, position) for position in pair)
+        R, t = motion(pose, other)
+        b = self.views[pair[1]]
         # depth times f and t as it is, or depth as it is and t over f: the same but for the unit
         x, y, z = (turned + t_i / factors[:, None] for turned, t_i in zip(R @ points, t, strict=True))
         with np.errstate(all="ignore"):
@@ -167,6 +170,16 @@ class Sample:
             seen = b.planar(u, v, convention, self.configured)
             error = np.where(inside & (seen > 0) & (seen < np.inf), np.abs(seen / z - 1), np.inf)
         return Matches(u, v, z, seen, inside, error)
+
+    def _placed_by(self, convention: Convention, position: int) -> Placed:
+        """Return a view as a convention reads it; it is in several pairs."""
+        if (known := self._placed.get((position, convention))) is not None:
+            return known
+        view = self.views[position]
+        K, depth = view.sampled_camera(convention), view.planar(view.u, view.v, convention, self.configured)
+        points = np.stack([(view.u - K.cx) / K.fx * depth, (view.v - K.cy) / K.fy * depth, depth])
+        placed = self._placed[position, convention] = view.pose(convention, self.configured), K, points
+        return placed
 
     def motions(self, convention: Convention) -> list[tuple[Float64, Float64]]:
         """Return for each pair the rotation and translation from the first camera to the second."""

@@ -7,6 +7,7 @@ import json
 import math
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -15,6 +16,7 @@ from semstab.backends import FusionBackend, create, takes_option
 from semstab.backends.numpy_reference import NumpySample
 from semstab.config import Config
 from semstab.core.arrays import Rows
+from semstab.core.background import Background
 from semstab.core.prefetch import Fetched
 from semstab.core.process import Stopwatch
 from semstab.core.types import Float64, Int32
@@ -51,6 +53,7 @@ class LiveMap:
 
     Attributes:
         backend: None where nothing is fused; truth fuses the ground truth, hard the likeliest class of soft scores.
+        background: The thread that fuses a frame into the reference while it is measured.
         tiles: (n, 3) each frame and a tile that it meets, where nothing is fused; origin the voxel of its first camera.
     """
 
@@ -60,6 +63,7 @@ class LiveMap:
     truth: FusionBackend | None = None
     sampler: Sampler | None = None
     reference: NumpySample | None = None
+    background: Background = field(default_factory=lambda: Background("semstab-reference", 1))
     sizes: SizeSample | None = None
     hard: FusionBackend | None = None
     rows: Series = field(default_factory=Series)
@@ -110,6 +114,7 @@ class LiveMap:
         if kind not in _warm:  # let it load what it compiles, once a process: else the first frame costs more
             _warm.add(kind)
             new_map(config, K).integrate(frame.every(WARM_UP_STRIDE))
+        self.background.drain()  # it would take the time of the map
         with watch(f"fuse {self.name.backend}"):
             report = self.backend.integrate(frame)
         if not isinstance(report, FrameReport):
@@ -118,8 +123,7 @@ class LiveMap:
                 " semstab.data.results.FrameReport (docs/tutorials/own-backend.md)"
             )
         if self.reference is not None:
-            with watch("reference"):
-                self.reference.integrate(frame)
+            self.background.submit(partial(self._integrate_reference, self.reference, frame, watch))
         if frame.scores is not None and self.work.unit.image_space:
             with watch("reduced scores"):
                 self.hard = self.hard or new_map(config, K, self.work.within, log=False)
@@ -129,6 +133,11 @@ class LiveMap:
         self.observations += report.voxels
         self.soft = self.soft or frame.scores is not None
         return report
+
+    @staticmethod
+    def _integrate_reference(reference: NumpySample, frame: Frame, watch: Stopwatch) -> None:
+        with watch("reference"):
+            reference.integrate(frame)
 
     def sample(self, prepared: Prepared, watch: Stopwatch) -> None:
         """Keep a sample of what the frame observes."""

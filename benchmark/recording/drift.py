@@ -94,7 +94,8 @@ class FrameChanges:
         key = packed(self.changes.index)
         order = np.argsort(key)
         pixels = packed(voxel_index(back_project(frame), self.voxel_size, frame).T)
-        voxel = order[np.searchsorted(key, pixels, sorter=order)]
+        first = np.flatnonzero(np.diff(pixels, prepend=-1))  # of neighbouring pixels in one voxel
+        voxel = np.repeat(order[np.searchsorted(key[order], pixels[first])], np.diff(first, append=len(pixels)))
         contradicts = frame.predicted[frame.valid] != self.changes.before[voxel]
         shown = {
             "contradictions": np.where(contradicts, CONTRADICTS, AGREES),

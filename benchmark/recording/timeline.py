@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 import csv
-from collections import deque
 from collections.abc import Callable, Mapping
-from concurrent.futures import Future, ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
 import rerun as rr
 
+from semstab.core import background
 from semstab.core.palette import model_color
 from semstab.data.digests import require_unchanged
 from semstab.data.results import UnitName
@@ -59,8 +58,7 @@ class Background:
     def __init__(self, stream: rr.RecordingStream, clock: Clock) -> None:
         self._stream = stream
         self._clock = clock
-        self._thread = ThreadPoolExecutor(1, thread_name_prefix="semstab-recording")
-        self._pending: deque[Future[None]] = deque()
+        self._jobs = background.Background("semstab-recording", MOST_PENDING)
 
     def submit(self, frame: int, timestamp: float | None, job: Callable[[], None]) -> None:
         """Submit a job, and wait while too many are pending; an error of an earlier job is raised here."""
@@ -69,18 +67,15 @@ class Background:
             self._clock.set(self._stream, frame, timestamp)  # a stream has a time for each thread
             job()
 
-        self.drain(MOST_PENDING)
-        self._pending.append(self._thread.submit(at_its_time))
+        self._jobs.submit(at_its_time)
 
-    def drain(self, pending: int = 0) -> None:
-        """Wait until at most `pending` jobs remain; an error of a job is raised here."""
-        while len(self._pending) > pending:
-            self._pending.popleft().result()
+    def drain(self) -> None:
+        """Wait until all jobs are done; an error of a job is raised here."""
+        self._jobs.drain()
 
     def close(self) -> None:
         """Finish the pending jobs, and end the thread."""
-        self._thread.shutdown()
-        self.drain()
+        self._jobs.close()
 
 
 # Time series are columns of RUN/frames/*.csv, and one that follows from two of them.

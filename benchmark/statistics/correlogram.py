@@ -14,7 +14,6 @@ import numpy as np
 
 from semstab.core.types import Float64, Int64
 from semstab.data.events import Events
-from semstab.data.evidence import Evidence
 from semstab.data.statistics import UNKNOWN, Correlogram, LagBin
 from semstab.statistics.agreement import alpha_of
 from semstab.statistics.cluster_sums import ALPHA_SUMS, MOST_GROUPS, ClusterSums, Functional, cubes_of, side_by_side
@@ -55,6 +54,8 @@ def correlogram(cells: CellObservations) -> Correlogram:
     the pairs in the bin. Bands are at CONFIDENCE, for this scene flown again where the bin has enough frames for that,
     else for these frames.
     """
+    from semstab.statistics.loops.pairs import add_pairs
+
     seen = cells.observations()
     labels = np.unique(seen.evidence.label)  # the other classes change nothing
     cubes, of, edge = _cubes(seen)
@@ -64,20 +65,21 @@ def correlogram(cells: CellObservations) -> Correlogram:
     group = np.searchsorted(frames, seen.frame // step)
     keys, cluster = np.unique(of[seen.voxel].astype(np.int64) * len(frames) + group, return_inverse=True)
     cube, group = np.divmod(keys, max(len(frames), 1))
-    sums = _BinSums(seen.evidence.only(labels), len(keys))
+    sums = np.zeros((len(BINS) + 1, len(keys), 3 + len(labels)))  # see `ALPHA_SUMS`
+    log = seen.evidence.only(labels).entries
     pairs, distance = np.zeros((2, len(BINS) + 1))
     for first, second, apart in _pairs(cells, seen):
         bins = _bins(apart)
         pairs += np.bincount(bins.ravel(), minlength=len(pairs))
         distance += np.bincount(bins.ravel(), weights=apart.ravel(), minlength=len(pairs))
-        sums.add(bins, first, second, cluster)
+        add_pairs(first, second, bins, cluster, log, sums)
     columns = side_by_side(dict(zip(ALPHA_SUMS, (1, 1, 1, len(labels)), strict=True)))
     rows, specs = [], []
     for k in np.flatnonzero(pairs[:-1] >= LEAST_PAIRS):
-        some = np.flatnonzero(sums.total[k, :, 1])
+        some = np.flatnonzero(sums[k, :, 1])
         if len(np.unique(cube[some])) < LEAST_CUBES:
             continue
-        of_bin = ClusterSums(cubes[cube[some]], frames[group[some]], sums.total[k, some], columns, edge, step)
+        of_bin = ClusterSums(cubes[cube[some]], frames[group[some]], sums[k, some], columns, edge, step)
         specs.append(spec_of(of_bin, PAIRED_ALPHA, scope=scope_of(of_bin, key=PAIRED_ALPHA)))
         rows.append((k, float(distance[k] / pairs[k]), int(pairs[k])))
     of_axis: dict[str, tuple[LagBin, ...]] = dict.fromkeys(AXES, ())
@@ -124,33 +126,3 @@ def _bins(apart: Float64) -> Int64:
         bins[:, axis] = np.where((of > 0) & (of < len(edges)), of + (before - 1), len(BINS))
         before += len(edges) - 1
     return bins
-
-
-class _BinSums:
-    """Sums of pairs of observations by bin and cluster (bins + 1, C, 3 + K), of which `alpha_of` is a function.
-
-    They are sums of s . s' with the other observation, of observations, of ||s||^2, and of s.
-    """
-
-    def __init__(self, evidence: Evidence, clusters: int) -> None:
-        from scipy.sparse import csr_array
-
-        entries = evidence.weight, evidence.label.astype(np.int32), evidence.starts
-        self._evidence = csr_array(entries, shape=evidence.shape)
-        self._squares = self._evidence.multiply(self._evidence).sum(axis=1)
-        self.total = np.zeros((len(BINS) + 1, clusters, 3 + evidence.K))
-
-    def add(self, bins: Int64, first: Int64, second: Int64, cluster: Int64) -> None:
-        """Add pairs (m,), each once in each of its bins (m, 5) for either observation, of clusters (n,)."""
-        from scipy.sparse import coo_array
-
-        product = self._evidence[first].multiply(self._evidence[second]).sum(axis=1)
-        size = self.total.shape[0] * self.total.shape[1]
-        into = self.total.reshape(size, -1)
-        for one in (first, second):
-            row, of = (bins * self.total.shape[1] + cluster[one][:, None]).ravel(), np.repeat(one, bins.shape[1])
-            into[:, 0] += np.bincount(row, weights=np.repeat(product, bins.shape[1]), minlength=size)
-            into[:, 1] += np.bincount(row, minlength=size)
-            into[:, 2] += np.bincount(row, weights=self._squares[of], minlength=size)
-            counts = coo_array((np.ones(len(row)), (row, of)), shape=(size, len(self._squares))).tocsr()
-            into[:, 3:] += (counts @ self._evidence).toarray()

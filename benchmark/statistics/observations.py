@@ -22,6 +22,7 @@ from semstab.data.evidence import Evidence
 from semstab.data.measures import dominant, mean
 from semstab.data.voxels import index_columns
 from semstab.errors import DataError
+from semstab.statistics.cluster_sums.index import distinct_rows
 from semstab.statistics.loops import CELLS, SHIFTS, SPAN, WITHIN
 
 Voxel = tuple[int, int, int]
@@ -210,11 +211,9 @@ class CellObservations:
 
     def labelled_share(self) -> float:
         """Return the share of the cells seen by two views that have a label in at least half of their observations."""
-        (coarse, _), of = np.unique(
-            np.stack([self._number(self.cell // CELLS), self.view]), axis=1, return_inverse=True
-        )
-        pixels, own = (np.bincount(of.ravel(), w) for w in (self.weight, self.weight * (self.label < self.K)))
-        _, of = np.unique(coarse, return_inverse=True)
+        seen, of = distinct_rows(np.stack([self._number(self.cell // CELLS), self.view], axis=1))
+        pixels, own = (np.bincount(of, w) for w in (self.weight, self.weight * (self.label < self.K)))
+        _, of = np.unique(seen[:, 0], return_inverse=True)
         frames, labelled = np.bincount(of), np.bincount(of, 2 * own >= pixels)
         return mean((2 * labelled >= frames)[frames >= 2].astype(np.float64))
 

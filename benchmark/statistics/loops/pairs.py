@@ -1,0 +1,38 @@
+"""Compiled pass over pairs of observations: the sums of a correlogram, from which alpha of each of its bins follows."""
+
+from __future__ import annotations
+
+from semstab.core.compiled import serial
+
+
+@serial
+def agreement(log, a, b):
+    """Return s . s' of observations a and b; log is (starts, label, weight), labels ascending within an observation."""
+    starts, label, weight = log
+    i, j, agreed = starts[a], starts[b], 0.0
+    while i < starts[a + 1] and j < starts[b + 1]:
+        if label[i] == label[j]:
+            agreed += weight[i] * weight[j]
+        i, j = i + (label[i] <= label[j]), j + (label[j] <= label[i])
+    return agreed
+
+
+@serial
+def add_pairs(first, second, bins, cluster, log, sums):
+    """Add pairs (m,) of observations to `sums` (bins, clusters, 3 + K), in each of a pair's bins (m, axes).
+
+    Either observation adds s . s', 1, ||s||^2 and s to its cluster; cluster (n,) is that of each observation, log is
+    (starts, label, weight) of all of them.
+    """
+    starts, label, weight = log
+    for pair in range(first.shape[0]):
+        agreed = agreement(log, first[pair], second[pair])
+        for one in (first[pair], second[pair]):
+            own, of = agreement(log, one, one), cluster[one]
+            for axis in range(bins.shape[1]):
+                k = bins[pair, axis]
+                sums[k, of, 0] += agreed
+                sums[k, of, 1] += 1.0
+                sums[k, of, 2] += own
+                for e in range(starts[one], starts[one + 1]):
+                    sums[k, of, 3 + label[e]] += weight[e]
