@@ -90,7 +90,21 @@ def test_the_benchmark_of_rivals_compares_a_program_of_the_user(tmp_path) -> Non
 
 def test_the_benchmark_of_growth_prints_its_exponents_and_draws_them(tmp_path) -> None:
     """In a process of its own, as it starts others."""
-    words = ["--size", "96x54", "--frames", "1", "--voxels", "500", "--classes", "2", "--times", "1", "2"]
+    words = [
+        "--size",
+        "96x54",
+        "--frames",
+        "1",
+        "--voxels",
+        "500",
+        "--classes",
+        "2",
+        "--times",
+        "1",
+        "2",
+        "--growing",
+        "voxels",
+    ]
     command = [sys.executable, str(BENCHMARKS / "bench_growth.py"), *words, "--figure", str(tmp_path / "growth.png")]
     done = subprocess.run(command, capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr
