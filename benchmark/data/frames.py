@@ -41,7 +41,7 @@ class Intrinsics:
         for name in ("fx", "fy", "cx", "cy"):
             value = float(getattr(self, name))
             object.__setattr__(self, name, value)
-            if not np.isfinite(value) or (name.startswith("f") and value <= 0):
+            if not math.isfinite(value) or (name.startswith("f") and value <= 0):
                 raise DataError(f"intrinsics: {name} = {value:g}; focal lengths must be positive and all values finite")
 
     @classmethod
