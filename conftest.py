@@ -17,8 +17,13 @@ CONFIG = {"dataset": CITY, "scenes": ["scene0"], "voxel_size": 0.5}
 
 
 def pytest_collect_file(file_path: Path, parent: pytest.Collector) -> DoctestModule | None:
-    """Collect the examples of a module that has some; others need not be imported, as `--doctest-modules` does."""
-    if file_path.suffix == ".py" and EXAMPLES.search(file_path.read_text(encoding="utf-8")):
+    """Collect the examples of a module that has some; others need not be imported, as `--doctest-modules` does.
+
+    Packages come first: pytest would put a module that it imports over what its package calls by the same name.
+    """
+    if file_path.suffix != ".py":
+        return None
+    if file_path.name == "__init__.py" or EXAMPLES.search(file_path.read_text(encoding="utf-8")):
         return DoctestModule.from_parent(parent, path=file_path)
     return None
 
