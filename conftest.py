@@ -2,14 +2,30 @@
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 from typing import Any
 
 import pytest
-from _pytest.doctest import DoctestItem
+from _pytest.doctest import DoctestItem, DoctestModule
 
 CITY = {"name": "city", "options": {"width": 160, "height": 90, "frames": 24}}
+EXAMPLES = re.compile(r"^ *>>> |\.__doc__ = ", re.MULTILINE)
+"""In a module that has examples, or takes them over."""
+
 CONFIG = {"dataset": CITY, "scenes": ["scene0"], "voxel_size": 0.5}
+
+
+def pytest_collect_file(file_path: Path, parent: pytest.Collector) -> DoctestModule | None:
+    """Collect the examples of a module that has some; others need not be imported, as `--doctest-modules` does.
+
+    Packages come first: pytest would put a module that it imports over what its package calls by the same name.
+    """
+    if file_path.suffix != ".py":
+        return None
+    if file_path.name == "__init__.py" or EXAMPLES.search(file_path.read_text(encoding="utf-8")):
+        return DoctestModule.from_parent(parent, path=file_path)
+    return None
 
 
 @pytest.fixture(scope="session")

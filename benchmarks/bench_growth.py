@@ -2,6 +2,7 @@
 
     python benchmarks/bench_growth.py [--figure FILE.png] [--json FILE] [--backend numba] [--size 3840x2160]
                                       [--frames 4] [--voxels 1000000] [--classes 7] [--times 1 2 4 8]
+                                      [--growing frames voxels classes]
 
 Frames of a flight (flight.py) are fused at places 200 m apart, each as often as there are frames. One of three grows,
 the others stay. 'ms' is the CPU time of a later frame, all of whose voxels are known, the median; 'bytes' is what the
@@ -101,12 +102,13 @@ def main() -> None:
     parser.add_argument("--voxels", type=int, default=1_000_000)
     parser.add_argument("--classes", type=int, default=7)
     parser.add_argument("--times", nargs="+", type=int, default=[1, 2, 4, 8])
+    parser.add_argument("--growing", nargs="+", choices=GROWING, default=GROWING)
     arguments = parser.parse_args()
     width, height = (int(number) for number in arguments.size.split("x"))
     rows: list[dict[str, Any]] = []
     print(f"{arguments.backend}, {arguments.size}")
     print(f"{'growing':>8} {'frames':>7} {'voxels':>11} {'K':>4} {'ms':>8} {'bytes':>6} {'most':>6} {'estimate':>8}")
-    for growing in GROWING:
+    for growing in arguments.growing:
         for times in arguments.times:
             base = {"frames": arguments.frames, "voxels": arguments.voxels, "classes": arguments.classes}
             base[growing] *= times
@@ -120,7 +122,7 @@ def main() -> None:
             )
     fits = {}
     print(f"\n{'exponent':>8} {'ms':>8} {'bytes':>6}")
-    for growing in GROWING:
+    for growing in arguments.growing:
         own = [row for row in rows if row["growing"] == growing]
         factors = [row["seen"] if growing == "voxels" else row["times"] for row in own]
         fits[growing] = {cost: exponent(factors, [row[cost] for row in own]) for cost in ("ms", "bytes")}

@@ -11,6 +11,7 @@ something else is said.
 from __future__ import annotations
 
 import argparse
+import functools
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 
@@ -107,6 +108,12 @@ def predicted(labels: np.ndarray, rng: np.random.Generator) -> np.ndarray:
 
 def scene(seed: int) -> Frames:
     """A random scene without mistakes."""
+    return list(_scene(seed))
+
+
+@functools.lru_cache(maxsize=4)
+def _scene(seed: int) -> tuple[Frame, ...]:
+    """The same, made once: most of the time of a check."""
     rng = np.random.default_rng(seed)
     boxes, classes = world(rng)
     frames = []
@@ -114,7 +121,7 @@ def scene(seed: int) -> Frames:
         depth, labels = render(boxes, classes, T)
         depth = (depth * (1 + rng.normal(0, NOISE, depth.shape))).astype(np.float32)
         frames.append(Frame(k, depth, CAMERA, T, labels=predicted(labels, rng)))
-    return frames
+    return tuple(frames)
 
 
 # --- mistakes --------------------------------------------------------------------------------------------------------

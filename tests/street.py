@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -27,32 +28,8 @@ class Street:
     @classmethod
     def made(cls, seed, rows=ROWS, turn=0.03, sideways=0.1):
         """A drive that turns by so many radians a scan, and moves by so many metres to the left."""
-        rng = np.random.default_rng(seed)
-        boxes = []
-        for side in (-1, 1):
-            for x in np.arange(-30, 60, 9.0):
-                near, deep = rng.uniform(6, 9), rng.uniform(4, 8)
-                low, high = sorted((side * near, side * (near + deep)))
-                boxes.append(
-                    ((x, low, -2), (x + rng.uniform(5, 8), high, rng.uniform(3, 8)), int(rng.choice([50, 70])))
-                )
-            for x in np.arange(-24, 50, 13.0):
-                y = side * 4.0
-                boxes.append(((x, y - 0.9, -2), (x + 4, y + 0.9, -0.5), 10))
-        up, at = np.meshgrid(np.radians(np.linspace(8, -24, rows)), np.radians(np.arange(0, 360, 360 / COLUMNS)))
-        rays = np.stack([np.cos(up) * np.cos(at), np.cos(up) * np.sin(at), np.sin(up)], axis=-1).reshape(-1, 3)
-        scans, ids, poses = [], [], []
-        for k in range(SCANS):
-            cos, sin = np.cos(turn * k), np.sin(turn * k)
-            pose = np.eye(4)
-            pose[:2, :2] = [[cos, -sin], [sin, cos]]
-            pose[:3, 3] = 1.2 * k, sideways * k, 0.0
-            distance, label = _cast(pose[:3, 3], rays @ pose[:3, :3].T, boxes)
-            hit = distance < 45
-            scans.append((rays[hit] * (distance[hit] + rng.normal(0, 0.01, hit.sum()))[:, None]).astype(np.float32))
-            ids.append(label[hit])
-            poses.append(pose)
-        return cls(scans, ids, poses)
+        scans, ids, poses = _driven(seed, rows, turn, sideways)
+        return cls([*scans], [*ids], [pose.copy() for pose in poses])
 
     def __iter__(self):
         return zip(self.scans, self.ids, self.poses, strict=True)
@@ -65,6 +42,35 @@ class Street:
     def with_ids(self, change):
         """The same with other ids: `change` takes those of a scan and its number."""
         return replace(self, ids=[change(own, k) for k, own in enumerate(self.ids)])
+
+
+@functools.lru_cache(maxsize=8)
+def _driven(seed, rows, turn, sideways):
+    """Scans, ids and poses of a drive, made once."""
+    rng = np.random.default_rng(seed)
+    boxes = []
+    for side in (-1, 1):
+        for x in np.arange(-30, 60, 9.0):
+            near, deep = rng.uniform(6, 9), rng.uniform(4, 8)
+            low, high = sorted((side * near, side * (near + deep)))
+            boxes.append(((x, low, -2), (x + rng.uniform(5, 8), high, rng.uniform(3, 8)), int(rng.choice([50, 70]))))
+        for x in np.arange(-24, 50, 13.0):
+            y = side * 4.0
+            boxes.append(((x, y - 0.9, -2), (x + 4, y + 0.9, -0.5), 10))
+    up, at = np.meshgrid(np.radians(np.linspace(8, -24, rows)), np.radians(np.arange(0, 360, 360 / COLUMNS)))
+    rays = np.stack([np.cos(up) * np.cos(at), np.cos(up) * np.sin(at), np.sin(up)], axis=-1).reshape(-1, 3)
+    scans, ids, poses = [], [], []
+    for k in range(SCANS):
+        cos, sin = np.cos(turn * k), np.sin(turn * k)
+        pose = np.eye(4)
+        pose[:2, :2] = [[cos, -sin], [sin, cos]]
+        pose[:3, 3] = 1.2 * k, sideways * k, 0.0
+        distance, label = _cast(pose[:3, 3], rays @ pose[:3, :3].T, boxes)
+        hit = distance < 45
+        scans.append((rays[hit] * (distance[hit] + rng.normal(0, 0.01, hit.sum()))[:, None]).astype(np.float32))
+        ids.append(label[hit])
+        poses.append(pose)
+    return scans, ids, poses
 
 
 def _cast(origin, rays, boxes):

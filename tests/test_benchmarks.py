@@ -20,7 +20,6 @@ SMALL = {
     "end_to_end": ("96x54", "--size 96x54 --frames 3 --runs 1 --noise 0 --backend numpy --depth png"),
     "gpu": ("96x54", "--device CPU:0 --sizes 96x54 --classes 3 --voxels 9000 --rounds 2 --copied-megabytes 1 "
             "--cpu-backends numba"),
-    "rivals": ("semstab numba", "--size 96x54 --frames 3 --voxel-size 0.2"),
     "statistics": ("all statistics", "--frames 4 --size 64x48 --voxel-size 0.2"),
 }  # fmt: skip
 
@@ -91,7 +90,21 @@ def test_the_benchmark_of_rivals_compares_a_program_of_the_user(tmp_path) -> Non
 
 def test_the_benchmark_of_growth_prints_its_exponents_and_draws_them(tmp_path) -> None:
     """In a process of its own, as it starts others."""
-    words = ["--size", "96x54", "--frames", "1", "--voxels", "500", "--classes", "2", "--times", "1", "2"]
+    words = [
+        "--size",
+        "96x54",
+        "--frames",
+        "1",
+        "--voxels",
+        "500",
+        "--classes",
+        "2",
+        "--times",
+        "1",
+        "2",
+        "--growing",
+        "voxels",
+    ]
     command = [sys.executable, str(BENCHMARKS / "bench_growth.py"), *words, "--figure", str(tmp_path / "growth.png")]
     done = subprocess.run(command, capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr

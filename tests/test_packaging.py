@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import os
 import re
 import shutil
@@ -139,21 +140,32 @@ def test_an_installed_wheel_does_its_main_job_in_any_folder(elsewhere, installed
     assert Path(where.strip()).is_relative_to(installed.parent)
 
 
-@pytest.mark.parametrize(
-    ("words", "extra"),
-    [
-        (("export", "run", "--scene", "scene0", "--model", "sim-flicker", "--to", "map.tif"), "geo"),
-        ((*FEW, "--predict", "segformer", "--out", "predicted"), "segformer"),
-        ((*FEW, "--predict", "model.pt", "--out", "predicted"), "torch"),
-        (("--scheduler", "tcp://127.0.0.1:1", "--out", "far"), "cluster"),
-        (("--backend", "torch", "--out", "accelerated"), "torch"),
-    ],
-)
-def test_what_needs_an_extra_says_in_one_line_how_to_install_it(elsewhere, installed, words, extra) -> None:
+IN_TURN = """
+import json, sys
+from semstab.cli import app
+
+for words in json.loads(sys.argv[1]):
+    try:
+        app(words)
+    except SystemExit as end:
+        print(end.code, file=sys.stderr)
+"""
+NEED_AN_EXTRA = [
+    (("export", "run", "--scene", "scene0", "--model", "sim-flicker", "--to", "map.tif"), "geo"),
+    ((*FEW, "--predict", "segformer", "--out", "predicted"), "segformer"),
+    ((*FEW, "--predict", "model.pt", "--out", "predicted"), "torch"),
+    (("--scheduler", "tcp://127.0.0.1:1", "--out", "far"), "cluster"),
+    (("--backend", "torch", "--out", "accelerated"), "torch"),
+]
+
+
+def test_what_needs_an_extra_says_in_one_line_how_to_install_it(elsewhere, installed) -> None:
+    """One process for all: each start imports what the next one does."""
     (elsewhere / "model.pt").write_bytes(b"")
-    done = command(installed, elsewhere, *words)
-    assert done.returncode == 2
-    (line,) = done.stderr.splitlines()
-    assert line.startswith("error: ")
-    assert f"pip install 'semstab[{extra}]'" in line
-    assert not (elsewhere / words[-1]).exists()
+    commands = json.dumps([words for words, _ in NEED_AN_EXTRA])
+    lines = command(installed, elsewhere, "-c", IN_TURN, commands, program="python").stderr.splitlines()
+    assert lines[1::2] == ["2"] * len(NEED_AN_EXTRA), lines
+    for line, (words, extra) in zip(lines[::2], NEED_AN_EXTRA, strict=True):
+        assert line.startswith("error: ")
+        assert f"pip install 'semstab[{extra}]'" in line
+        assert not (elsewhere / words[-1]).exists()

@@ -71,8 +71,8 @@ SIX = ["colour-clusters,clusters=6,name=six", "colour-clusters,clusters=6,seed=2
     ],
 )
 def test_models_with_other_classes_are_named_and_the_rest_is_compared(models, compared, said, tmp_path):
-    city = {"name": "city", "options": {"frames": 24, "width": 160, "height": 90}}
-    given = {"dataset": city, "check": None, "scenes": ["scene0"], "frames": {"count": 12}, "statistics": True}
+    city = {"name": "city", "options": {"frames": 12, "width": 96, "height": 54}}
+    given = {"dataset": city, "check": None, "scenes": ["scene0"], "frames": {"count": 6}, "statistics": True}
     predictors = parse_predictors([*models, "colour-clusters,clusters=5,name=five"])
     result = semstab.run(resolve(predicted_config(predictors, None, given)), out=tmp_path / "run", report=False)
     *answer, last = answers(result)

@@ -7,8 +7,6 @@ import math
 
 import numpy as np
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
 
 torch = pytest.importorskip("torch", reason="pip install 'semstab[torch]'")
 
@@ -18,10 +16,10 @@ from semstab import backends  # noqa: E402
 from semstab.backends import torch_map, torch_operations, torch_storage  # noqa: E402
 from semstab.backends.shared.association import back_project  # noqa: E402
 from semstab.backends.torch_map import TorchMap, TorchMaps  # noqa: E402
-from semstab.backends.torch_storage import EMPTY, DepthView, MapGrid, TensorPrediction, VoxelHash, slots_for  # noqa: E402
+from semstab.backends.torch_storage import DepthView, MapGrid, TensorPrediction  # noqa: E402
 from semstab.data.frames import Frame, Intrinsics  # noqa: E402
 from semstab.errors import ConfigError, DataError  # noqa: E402
-from semstab.testing import EXACT, SUMS, BackendConformance, assert_same_map, checks, random_frames, sight_line, voxels  # noqa: E402
+from semstab.testing import EXACT, SUMS, BackendConformance, assert_same_map, random_frames, sight_line, voxels  # noqa: E402
 
 CPU = torch.device("cpu")
 K = 4
@@ -402,41 +400,6 @@ def test_the_estimate_covers_what_a_map_takes():
     backend = new_map(1.0, 20)
     backend.integrate(column_of(3000))
     assert backend.maps.bytes <= backends.expected_bytes("torch", 3000, 3000, 20) <= 3 * backend.maps.bytes
-
-
-# --- The hash ---------------------------------------------------------------------------------------------------------
-
-
-def splitmix64(x):
-    mask = 2**64 - 1
-    x = (x ^ (x >> 30)) * 0xBF58476D1CE4E5B9 & mask
-    x = (x ^ (x >> 27)) * 0x94D049BB133111EB & mask
-    return x ^ (x >> 31)
-
-
-KEYS = st.sets(st.integers(0, 2**63 - 1) | st.integers(0, 40), max_size=300)
-
-
-@checks
-@given(KEYS)
-def test_keys_are_mixed_as_splitmix64_does(keys):
-    mixed = torch_storage.mix(torch.tensor(sorted(keys), dtype=torch.int64))
-    assert [m % 2**64 for m in mixed.tolist()] == [splitmix64(key) for key in sorted(keys)]
-
-
-@checks
-@given(KEYS, KEYS)
-def test_the_hash_finds_what_was_put_in(known, asked):
-    table = VoxelHash(slots_for(300), CPU)
-    keys = torch.tensor(list(known), dtype=torch.int64)
-    rows = torch.arange(len(known))
-    table.insert(keys[:100], rows[:100])
-    table.insert(keys, rows, first=100)
-    row_of = dict(zip(known, range(len(known)), strict=True))
-    wanted = [*known, *asked]
-    found = table.find(torch.tensor(wanted, dtype=torch.int64)).tolist()
-    assert found == [row_of.get(key, EMPTY) for key in wanted]
-    assert int((table.keys != EMPTY).sum()) == len(known)
 
 
 # --- Options ----------------------------------------------------------------------------------------------------------

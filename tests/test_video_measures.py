@@ -44,7 +44,7 @@ def run(request, tmp_path_factory):
         "--model",
         "sim-flicker",
         "--frames",
-        ":12",
+        ":10",
         "--video-measures",
         request.param,
         "--out",
@@ -60,7 +60,7 @@ def run(request, tmp_path_factory):
 def frames_of(scene, source):
     """The frames with rows of the run's taxonomy."""
     mapping = scene.label_space(source).mapping_to(LabelSpace.load("uavid7"))
-    frames = [scene.frame(k, source) for k in range(12)]
+    frames = [scene.frame(k, source) for k in range(10)]
     return [dataclasses.replace(frame, labels=mapping.labels(frame.labels, source)) for frame in frames]
 
 
@@ -135,7 +135,7 @@ def test_without_the_switch_there_is_no_such_table(tmp_path):
 def test_a_map_in_tiles_has_the_same(run, tmp_path):
     flow, out, _ = run
     options = [word for key, value in CITY.items() for word in ("--option", f"{key}={value}")]
-    words = ("--model", "sim-flicker", "--scene", "scene0", "--frames", ":12", "--check", "none", *options)
+    words = ("--model", "sim-flicker", "--scene", "scene0", "--frames", ":10", "--check", "none", *options)
     bench("run", "--video-measures", flow, *words, "--tile-size", "64", "--out", "tiled", cwd=tmp_path)
     (tiled,) = load_result(tmp_path / "tiled").select()
     assert tiled.in_tiles

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import math
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, field
@@ -77,9 +78,7 @@ class View:
 
     def sampled_camera(self, convention: Convention) -> Intrinsics:
         """Return the intrinsics of every stride-th pixel."""
-        width, height = self.size
-        made_for = (width * convention.ratio[0], height * convention.ratio[1])
-        return self.camera.resized(cast(Any, made_for), self.size).every(self.stride)
+        return _sampled(self.camera, self.size, convention.ratio, self.stride)
 
     def planar(self, u: Int64, v: Int64, convention: Convention, configured: Convention) -> Float64:
         """Return planar depth at pixels of the file as that convention reads it, without its factor."""
@@ -89,6 +88,13 @@ class View:
         if configured.depth == "ray":
             return depth * ray_lengths(self.sampled_camera(configured), u, v)
         return depth / ray_lengths(self.sampled_camera(convention), u, v)
+
+
+@functools.lru_cache(maxsize=1024)
+def _sampled(camera: Intrinsics, size: tuple[int, int], ratio: tuple[float, float], stride: int) -> Intrinsics:
+    """Return the intrinsics of every stride-th pixel, made once: a check asks for them once a pair and convention."""
+    made_for = (size[0] * ratio[0], size[1] * ratio[1])
+    return camera.resized(cast(Any, made_for), size).every(stride)
 
 
 def clusters(length: int, count: int) -> list[list[int]]:
