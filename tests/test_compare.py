@@ -161,6 +161,19 @@ def contrast(value: float, error: float, measure: str = "psa") -> Contrast:
     return Contrast(measure, "", 0.5, 0.5 + value, interval, math.nan, "")
 
 
+def test_without_places_seen_twice_there_is_neither_map_nor_recording(runs, tmp_path):
+    scene = {"name": "posed_folder", "options": {"root": str(runs / "b")}}
+    semstab.run(
+        {"dataset": scene, "frames": "0:1", "voxel_size": 0.125, "statistics": True, "check": None},
+        out=tmp_path / "once",
+        report=False,
+    )
+    semstab.compare([f"{tmp_path}/once:net", f"{tmp_path}/once:same"], tmp_path / "compared")
+    assert {path.name for path in (tmp_path / "compared").iterdir()} == {
+        "columns", "comparison.json", "comparison.md", "report.html", "tables",
+    }  # fmt: skip
+
+
 def test_contrasts_of_scenes_are_averaged_and_corrected_together():
     (mean,) = over_scenes([[contrast(0.1, 0.1)], [contrast(0.3, 0.1)]])
     assert (mean.base, mean.other, mean.difference.value) == pytest.approx((0.5, 0.7, 0.2))

@@ -78,9 +78,14 @@ def _changed(comparison: ComparisonData) -> Iterator[tuple[SceneComparison, Agai
                 yield scene, against, changes
 
 
+def _shown(comparison: ComparisonData) -> Iterator[tuple[SceneComparison, Against, Changes]]:
+    """Yield the same without those of which no voxel can be shown, as no two frames see one place in both runs."""
+    return (each for each in _changed(comparison) if len(each[2].shown.table))
+
+
 def maps(comparison: ComparisonData) -> Iterator[Figure]:
     """Yield a map of each scene and run with known changes."""
-    for scene, against, changes in _changed(comparison):
+    for scene, against, changes in _shown(comparison):
         if scene.scene in comparison.up:
             yield Figure(
                 slug("comparison_map", scene.scene, against.other),
@@ -173,10 +178,10 @@ def write(comparison: ComparisonData, out: str | Path) -> None:
     keep_only([path for figure in drawn for path in figure.save(folder / "figures")], folder / "figures")
     _write_columns(comparison, folder)
     write_text(folder / REPORT, page(comparison.result, made, drawn, folder))
-    if comparison.changes:
+    if recorded := dict(_recorded(comparison)):
         from semstab.recording import record_changes
 
-        record_changes(folder / RECORDING, dict(_recorded(comparison)), comparison.up, sentences(comparison.result))
+        record_changes(folder / RECORDING, recorded, comparison.up, sentences(comparison.result))
 
 
 def markdown(comparison: RunComparison, made: Sequence[Table] | None = None) -> str:
@@ -234,7 +239,7 @@ def _write_columns(comparison: ComparisonData, folder: Path) -> None:
 
 
 def _recorded(comparison: ComparisonData) -> Iterator[tuple[tuple[str, str], tuple[Any, ...]]]:
-    for scene, against, changes in _changed(comparison):
+    for scene, against, changes in _shown(comparison):
         areas = [(area.what, f"{area.number} {area.of}", area.centre) for area in against.areas]
         title, shown = heading(comparison.result, scene.scene, against), changes.shown
         yield (scene.scene, against.other), (title, shown.table, shown.change, shown.right, areas)
