@@ -348,7 +348,8 @@ def _finish(table, table_count, word, count, n, corner, partition, spread, low, 
 @serial
 def _describe(word, count, n, corner, partition, spread, low, high):
     """Leave out entries that do not count; partitions, spread and extent of what is left, whose number is returned."""
-    low[:], high[:] = 1 << 20, -1
+    low_a = low_b = low_c = np.int64(1 << 20)  # numbers, not rows of an array: they stay in registers
+    high_a = high_b = high_c = most = np.int64(-1)
     m = 0
     for e in range(n):
         w = word[e]
@@ -357,11 +358,11 @@ def _describe(word, count, n, corner, partition, spread, low, high):
             p = partition_of(_key_of(a, b, c, corner))
             word[m], count[m], partition[m] = w, count[e], p
             spread[p] += 1
-            low[0], low[1], low[2] = min(low[0], a), min(low[1], b), min(low[2], c)
-            high[0], high[1], high[2], high[3] = (
-                max(high[0], a), max(high[1], b), max(high[2], c), max(high[3], w & 0xFFFF),
-            )  # fmt: skip
+            low_a, low_b, low_c = min(low_a, a), min(low_b, b), min(low_c, c)
+            high_a, high_b, high_c, most = max(high_a, a), max(high_b, b), max(high_c, c), max(most, w & 0xFFFF)
             m += 1
+    low[0], low[1], low[2] = low_a, low_b, low_c
+    high[0], high[1], high[2], high[3] = high_a, high_b, high_c, most
     return m
 
 
