@@ -128,23 +128,28 @@ def _update_rows(
                 classes[r, label[e] // WORD] |= np.int64(1) << np.int64(label[e] % WORD)
             if start[i + 1] - start[i] == 1 and evidence[r, label[start[i]]] == T:  # of one class, as the frame has it
                 evidence[r, label[start[i]]] += 1.0
-                out[0], out[1], out[2], out[5], out[6] = 1.0 if T == 0 else 0.0, 0.0, 0.0, 1.0, 0.0
-                out[3] = out[4] = label[start[i]]
+                self_sum[r] += 1.0
+                vss += 1.0 if T == 0 else 0.0
+                drift_of[i] = 0.0
+                class_before[i] = class_after[i] = label[start[i]]
             else:
                 for e in range(start[i], start[i + 1]):
                     s[label[e]] = weight[e] / seen_pixels[i]
                 _observe_classes(evidence[r], classes[r], s, few, of, np.int64(T), out)
-            vss += out[0]
-            entropy += out[1]
-            drifted += out[2]
-            drift_sum[r] += out[2]
-            self_sum[r] += out[5]
-            frame_entropy_sum[r] += out[6]
-            new += 1 if T == 0 else 0
-            first_frame[r] = min(first_frame[r], frame) if T > 0 else frame
-            last_frame[r] = max(last_frame[r], frame) if T > 0 else frame
-            drift_of[i] = out[2] if T > 0 else np.nan
-            class_before[i], class_after[i] = np.uint16(out[3 if T > 0 else 4]), np.uint16(out[4])
+                vss += out[0]
+                entropy += out[1]
+                drifted += out[2]
+                drift_sum[r] += out[2]
+                self_sum[r] += out[5]
+                frame_entropy_sum[r] += out[6]
+                drift_of[i] = out[2]
+                class_before[i], class_after[i] = np.uint16(out[3]), np.uint16(out[4])
+            if T == 0:
+                new += 1
+                drift_of[i] = np.nan
+                class_before[i] = class_after[i]
+                first_frame[r] = last_frame[r] = frame
+            first_frame[r], last_frame[r] = min(first_frame[r], frame), max(last_frame[r], frame)
             op[r] = T + 1
             pixels[r] += seen_pixels[i]
             recurrent += 1 if T + 1 == RECURRENT else 0
