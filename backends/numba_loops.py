@@ -12,7 +12,7 @@ from typing import Any
 import numba as nb
 import numpy as np
 
-from semstab.backends.shared.beliefs import observe_row, plogp, plogp_unseen
+from semstab.backends.shared.beliefs import observe_few, observe_row, plogp
 from semstab.backends.shared.keys import PARTITIONS, mix
 from semstab.backends.shared.pixel_keys import AHEAD, touch
 from semstab.core.compiled import compiled, parallel, serial
@@ -99,80 +99,52 @@ def _observe_dense(record, evidence, s, label, weight, first, last, pixels, out)
 
 
 @compiled(forceinline=True)
-def _observe_voxel(record, nodes, ranges, s, label, weight, first, last, pixels, op, out):
-    """Add one observation to a voxel that disagrees with itself, or with the frame.
+def _observe_voxel(record, nodes, ranges, s, few, node, label, weight, first, last, pixels, op, out):
+    """Add one observation to a voxel that disagrees with itself, or with the frame; see `observe_row`.
 
-    s is work space with room for K values, all 0. Leaves in `out` the change of VSS, that of the entropy in bits, the
-    drift in bits, and the dominant class before and after.
+    - `s`: work space with room for K values, all 0
+    - `few`, `node`: likewise for the evidence and the shares of the classes, see `observe_few`, and their nodes
     """
+    evidence, shares = few[0], few[1]
     for e in range(first, last):
         s[label[e]] = weight[e] / pixels
-    before, after = 1.0 / max(op, 1), 1.0 / (op + 1)
-    plogp_before = plogp_between = plogp_after = unseen = logarithms = 0.0
-    most_before = most_after = -1.0
-    dominant_before = dominant_after = np.int64(0)
-    at = np.int64(-2)  # the record itself
-    while True:
-        lab = np.int64(record.label if at == -2 else nodes[at].label)
-        value = np.float64(record.value) if at == -2 else np.float64(nodes[at].value)
-        leads = (value > most_before) | ((value == most_before) & (lab < dominant_before))
-        dominant_before = lab if leads else dominant_before
-        most_before = max(most_before, value)
-        was, share = value, s[lab]
-        value += share
-        s[lab] = 0.0
-        leads = (value > most_after) | ((value == most_after) & (lab < dominant_after))
-        dominant_after = lab if leads else dominant_after
-        most_after = max(most_after, value)
-        if at == -2:
-            record.value = value
-            following = np.int64(record.next)
-        else:
-            nodes[at].value = value
-            following = np.int64(nodes[at].next)
-        if share == 0.0:
-            unseen += value
-            logarithms += plogp(value)
-        else:
-            p, q = was * before, value * after
-            plogp_before += plogp(p)
-            plogp_between += plogp(0.5 * (p + q))
-            plogp_after += plogp(q)
-        if following < 0:
-            break
-        at = following
+    evidence[0], shares[0] = record.value, s[record.label]
+    s[record.label] = 0.0
+    most, dominant = evidence[0], np.int64(record.label)
+    n, at = 1, np.int64(record.next)
+    while at >= 0:
+        k, value = np.int64(nodes[at].label), np.float64(nodes[at].value)
+        evidence[n], shares[n], node[n] = value, s[k], at
+        s[k] = 0.0
+        leads = (value > most) | ((value == most) & (k < dominant))
+        most, dominant = value if leads else most, k if leads else dominant
+        n, at = n + 1, np.int64(nodes[at].next)
     for e in range(first, last):
-        share = s[label[e]]
-        if share > 0.0:
-            s[label[e]] = 0.0
+        if s[label[e]] > 0.0:
             if ranges[0] == ranges[1]:
                 ranges[0], ranges[1] = ranges[2], ranges[3]
                 ranges[2] = ranges[3]
-            node = ranges[0]
+            node[n] = ranges[0]
             ranges[0] += 1
-            nodes[node].label = label[e]
-            nodes[node].value = share
-            nodes[node].next = -1
-            if at == -2:
-                record.next = node
+            nodes[node[n]].label, nodes[node[n]].next = label[e], ALONE
+            if n == 1:
+                record.next = node[n]
             else:
-                nodes[at].next = node
-            at = node
-            lab = np.int64(label[e])
-            if share > most_after or (share == most_after and lab < dominant_after):
-                most_after, dominant_after = share, lab
-            q = share * after
-            plogp_between += plogp(0.5 * q)
-            plogp_after += plogp(q)
-    if unseen > 0.0:
-        of_unseen = plogp_unseen(unseen, logarithms, np.int64(op))
-        plogp_before += of_unseen[0]
-        plogp_between += of_unseen[1]
-        plogp_after += of_unseen[2]
-    out[0] = most_after * after - most_before * before
-    out[1] = plogp_before - plogp_after
-    out[2] = min(max(0.5 * (plogp_before + plogp_after) - plogp_between, 0.0), 1.0) if op > 0 else 0.0
-    out[3], out[4] = dominant_before, dominant_after
+                nodes[node[n - 1]].next = node[n]
+            shares[n], s[label[e]] = s[label[e]], 0.0
+            n += 1
+    observe_few(evidence, shares, n, op, most, out)
+    out[3] = dominant
+    record.value = evidence[0]
+    most, dominant = evidence[0], np.int64(record.label)
+    evidence[0] = shares[0] = 0.0
+    for c in range(1, n):
+        k, value = np.int64(nodes[node[c]].label), evidence[c]
+        nodes[node[c]].value = value
+        leads = (value > most) | ((value == most) & (k < dominant))
+        most, dominant = value if leads else most, k if leads else dominant
+        evidence[c] = shares[c] = 0.0
+    out[4] = dominant
 
 
 @compiled(forceinline=True)
@@ -197,7 +169,7 @@ def update(
     row, the last three: see `Changes`.
     """
     for p in nb.prange(PARTITIONS):
-        s = np.zeros(dense.shape[1])
+        s, few, node = np.zeros(dense.shape[1]), np.zeros((2, dense.shape[1])), np.zeros(dense.shape[1], np.int64)
         out = np.zeros(8)
         own = ranges[p]
         vss = entropy = drift = 0.0
@@ -223,17 +195,15 @@ def update(
                 if record.next <= DENSE:
                     _observe_dense(record, dense[DENSE - record.next], s, label, weight, first, last, pixels[v], out)
                 else:
-                    _observe_voxel(record, nodes, own, s, label, weight, first, last, pixels[v], op, out)
+                    _observe_voxel(record, nodes, own, s, few, node, label, weight, first, last, pixels[v], op, out)
                 vss += out[0]
                 entropy += out[1]
                 drift += out[2]
                 record.drift_sum += out[2]
                 drift_of[v] = out[2]
                 dominant_before[v], dominant_after[v] = np.uint16(out[3]), np.uint16(out[4])
-                for e in range(first, last):
-                    share = weight[e] / pixels[v]
-                    record.self_sum += share * share
-                    record.frame_entropy_sum -= plogp(share)
+                record.self_sum += out[5]
+                record.frame_entropy_sum += out[6]
             if op == 0:
                 drift_of[v] = np.nan
                 dominant_before[v] = dominant_after[v]

@@ -154,6 +154,24 @@ def observe_eights(_typing: Any, evidence: Any, _sums: Any, _share: Any, _before
     return RESULT(evidence, _sums, number, number, number), generate
 
 
+@intrinsic
+def plogp_eights(_typing: Any, evidence: Any, _before: Any) -> Any:
+    """Return the sum of p log2 p over p = before * evidence, an array as `observe_eights` takes it."""
+
+    def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+        own = context.make_array(signature.args[0])(context, builder, arguments[0])
+        before = spread(builder, arguments[1], DOUBLES)
+        total = cgutils.alloca_once_value(builder, ZEROS)
+        (length,) = cgutils.unpack_tuple(builder, own.shape, 1)
+        with cgutils.for_range_slice(builder, INT(0), length, INT(LANES), intp=INT) as (k, _):
+            pointer = builder.bitcast(builder.gep(own.data, [k]), DOUBLES.as_pointer())
+            p = builder.fmul(builder.load(pointer, align=8), before)
+            builder.store(builder.fadd(builder.load(total), plogp_of(context, builder, p)), total)
+        return _over_lanes(builder, "fadd", DOUBLE, [DOUBLE(0.0), builder.load(total)], ["reassoc"])
+
+    return types.float64(evidence, types.float64), generate
+
+
 def _over_lanes(builder: Any, what: str, kind: Any, values: list[Any], flags: list[str]) -> Any:
     """Return a sum, or an extreme, of the lanes of a vector."""
     name = f"llvm.vector.reduce.{what}.v{LANES}{'i64' if kind == INT else 'f64'}"
@@ -181,35 +199,6 @@ def js_term(p, q):
     return 0.5 * term
 
 
-WHOLE = np.concatenate([[0.0], np.log2(np.arange(1, 2048))])
-"""The binary logarithms of the first whole numbers, 0 for 0."""
-
-
-@serial
-def _log_of_whole(n):
-    return WHOLE[n] if n < len(WHOLE) else np.log2(np.float64(n))
-
-
-@serial
-def plogp_unseen(evidence, logarithms, op):
-    """Return what classes that a frame does not see add to the sums of p log2 p before the frame, between and after.
-
-    Their evidence v stays, and its share goes from v / op to v / (op + 1): one logarithm a class is enough for all
-    three sums. `op` is 1 at least; between is the mean of both distributions, as for the drift.
-
-    - `evidence`: the sum of v over these classes
-    - `logarithms`: the sum of v log2 v
-    """
-    log_before, log_after = _log_of_whole(op), _log_of_whole(op + 1)
-    before, after = 1.0 / op, 1.0 / (op + 1)
-    mean, log_mean = 0.5 * (before + after), _log_of_whole(2 * op + 1) - log_before - log_after - 1.0
-    return (
-        before * (logarithms - evidence * log_before),
-        mean * (logarithms + evidence * log_mean),
-        after * (logarithms - evidence * log_after),
-    )
-
-
 @compiled(forceinline=True)
 def observe_row(evidence, sums, pixels, op, dominant, plogp_before, out):
     """Add one observation to a voxel's dense evidence, seen `op` times before.
@@ -228,3 +217,23 @@ def observe_row(evidence, sums, pixels, op, dominant, plogp_before, out):
     out[1] = plogp_before - plogp_after
     out[2] = min(max(0.5 * (plogp_before + plogp_after) - plogp_between, 0.0), 1.0) if op > 0 else 0.0
     out[3], out[4], out[5], out[6], out[7] = dominant, then, squares, -plogp_seen, plogp_after
+
+
+@compiled(forceinline=True)
+def observe_few(evidence, shares, n, op, most_before, out):
+    """Add one observation to a voxel's evidence of the n classes that it or the frame has seen, in any order.
+
+    - `evidence`, `shares`: room for a multiple of `LANES` numbers, 0 from n on: of the voxel, and s_bar of the frame
+    - `most_before`: the largest evidence
+
+    Leaves in `out` what `observe_row` does, but for the dominant classes and the last number.
+    """
+    room = -(-n // LANES) * LANES
+    before, after = 1.0 / max(op, 1), 1.0 / (op + 1)
+    plogp_before: Any = plogp_eights(evidence[:room], before)
+    result: Any = observe_eights(evidence[:room], shares[:room], 1.0, before, after)
+    plogp_after, plogp_between, squares, plogp_seen, top, _ = result
+    out[0] = top * after - most_before * before
+    out[1] = plogp_before - plogp_after
+    out[2] = min(max(0.5 * (plogp_before + plogp_after) - plogp_between, 0.0), 1.0) if op > 0 else 0.0
+    out[5], out[6] = squares, -plogp_seen

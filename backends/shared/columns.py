@@ -10,11 +10,12 @@ from llvmlite import ir
 from numba.core import types
 from numba.extending import intrinsic
 
-from semstab.backends.shared.beliefs import plogp, plogp_unseen
+from semstab.backends.shared.beliefs import observe_few
 from semstab.backends.shared.keys import PARTITIONS, mix
 from semstab.backends.shared.observations import BeliefChange, Change, Observed
 from semstab.backends.shared.pixel_keys import AHEAD, touch
-from semstab.core.compiled import parallel, serial
+from semstab.backends.shared.score_loops import LANES
+from semstab.core.compiled import compiled, parallel, serial
 from semstab.core.types import Int32, Int64
 from semstab.data.results import RECURRENT
 
@@ -55,81 +56,100 @@ def update_rows(rows: Int64, seen: Observed, frame: int, **columns: Any) -> tupl
     return Change.of((seen.pixels.sum(), len(rows), new, drift, vss, entropy, recurrent)), changed
 
 
+@compiled(forceinline=True)
+def _touch_evidence(flat, masks, r, K, words, label, first, end):
+    """Ask for the evidence of a row: of the classes that it has seen, and of those that the frame has seen there."""
+    for e in range(first, end):
+        touch(flat, r * K + label[e])
+    for word in range(words):
+        left = masks[r * words + word]
+        while left != 0:
+            touch(flat, r * K + word * WORD + _lowest(left))
+            left &= left - 1
+
+
+@compiled(forceinline=True)
+def _observe_classes(evidence, classes, s, few, of, op, out):
+    """Add one observation to the evidence (K,) of a row; see `observe_row`.
+
+    - `classes`: the bits of the classes that the row or the frame has seen
+    - `s`: s_bar of the frame (K,), which is 0 again in the end
+    - `few`, `of`: work space, all 0, for the evidence and the shares of these classes, see `observe_few`, and which
+    """
+    some, shares = few[0], few[1]
+    n, most, dominant = 0, -1.0, np.int64(0)
+    for word in range(classes.shape[0]):
+        left = classes[word]
+        while left != 0:
+            k = word * WORD + _lowest(left)
+            left &= left - 1
+            some[n], shares[n], of[n] = evidence[k], s[k], k
+            s[k] = 0.0
+            dominant, most = k if some[n] > most else dominant, max(some[n], most)
+            n += 1
+    observe_few(some, shares, n, op, most, out)
+    out[3] = dominant
+    most = -1.0
+    for c in range(n):
+        evidence[of[c]] = some[c]
+        dominant, most = of[c] if some[c] > most else dominant, max(some[c], most)
+        some[c] = shares[c] = 0.0
+    out[4] = dominant
+
+
 @parallel
 def _update_rows(
     rows, chunks, start, label, weight, seen_pixels, frame, sums, evidence, classes, op, drift_sum, pixels,
     first_frame, last_frame, self_sum, frame_entropy_sum, drift_of, class_before, class_after,
 ):  # fmt: skip
     K = evidence.shape[1]
+    room = -(-K // LANES) * LANES
     flat, masks = evidence.reshape(-1), classes.reshape(-1)
     words = classes.shape[1]
     for chunk in nb.prange(PARTITIONS):
-        s = np.zeros(K)
+        s, few, of, out = np.zeros(K), np.zeros((2, room)), np.zeros(room, np.int64), np.zeros(8)
         vss = entropy = drifted = 0.0
         new = recurrent = 0
+        last = chunks[chunk + 1] - 1
         for i in range(chunks[chunk], chunks[chunk + 1]):
-            later = min(i + AHEAD, chunks[chunk + 1] - 1)
+            later = min(i + AHEAD, last)
             ahead = rows[later]
+            touch(masks, rows[min(i + 2 * AHEAD, last)] * words)
+            _touch_evidence(flat, masks, ahead, K, words, label, start[later], start[later + 1])
             touch(op, ahead)
-            touch(flat, ahead * K + label[start[later]])
-            touch(masks, ahead * words)
             touch(drift_sum, ahead)
             touch(pixels, ahead)
             touch(first_frame, ahead)
             touch(last_frame, ahead)
             touch(self_sum, ahead)
             touch(frame_entropy_sum, ahead)
-            r = rows[i]
-            T = op[r]
+            r, T = rows[i], op[rows[i]]
             for e in range(start[i], start[i + 1]):
-                k = np.int64(label[e])
-                share = weight[e] / seen_pixels[i]
-                s[k] = share
-                classes[r, k // WORD] |= np.int64(1) << (k % WORD)
-                self_sum[r] += share * share
-                frame_entropy_sum[r] -= plogp(share) if share != 1.0 else 0.0
-            most_before = most_after = plogp_before = plogp_between = plogp_after = unseen = logarithms = 0.0
-            before = after = np.int64(0)
-            share_before, share_after = 1.0 / max(T, 1), 1.0 / (T + 1)
-            for word in range(words):
-                left = classes[r, word]
-                while left != 0:
-                    k = word * WORD + _lowest(left)
-                    left &= left - 1
-                    was, share = evidence[r, k], s[k]
-                    value = was + share
-                    evidence[r, k] = value
-                    s[k] = 0.0
-                    if was > most_before:
-                        most_before, before = was, k
-                    if value > most_after:
-                        most_after, after = value, k
-                    if share == 0.0:
-                        unseen += value
-                        logarithms += plogp(value)
-                    elif was != T or share != 1.0:  # else a voxel of one class, whose belief stays
-                        p, q = was * share_before, value * share_after
-                        plogp_before += plogp(p)
-                        plogp_between += plogp(0.5 * (p + q))
-                        plogp_after += plogp(q)
-            if unseen > 0.0:
-                of_unseen = plogp_unseen(unseen, logarithms, np.int64(T))
-                plogp_before += of_unseen[0]
-                plogp_between += of_unseen[1]
-                plogp_after += of_unseen[2]
-            entropy += plogp_before - plogp_after
-            drift = 0.0
-            vss += most_after * share_after - most_before * share_before
+                classes[r, label[e] // WORD] |= np.int64(1) << np.int64(label[e] % WORD)
+            if start[i + 1] - start[i] == 1 and evidence[r, label[start[i]]] == T:  # of one class, as the frame has it
+                evidence[r, label[start[i]]] += 1.0
+                self_sum[r] += 1.0
+                vss += 1.0 if T == 0 else 0.0
+                drift_of[i] = 0.0
+                class_before[i] = class_after[i] = label[start[i]]
+            else:
+                for e in range(start[i], start[i + 1]):
+                    s[label[e]] = weight[e] / seen_pixels[i]
+                _observe_classes(evidence[r], classes[r], s, few, of, np.int64(T), out)
+                vss += out[0]
+                entropy += out[1]
+                drifted += out[2]
+                drift_sum[r] += out[2]
+                self_sum[r] += out[5]
+                frame_entropy_sum[r] += out[6]
+                drift_of[i] = out[2]
+                class_before[i], class_after[i] = np.uint16(out[3]), np.uint16(out[4])
             if T == 0:
                 new += 1
-                first_frame[r], last_frame[r] = frame, frame
-            else:
-                drift = min(max(0.5 * (plogp_before + plogp_after) - plogp_between, 0.0), 1.0)
-                drifted += drift
-                drift_sum[r] += drift
-                first_frame[r], last_frame[r] = min(first_frame[r], frame), max(last_frame[r], frame)
-            drift_of[i] = drift if T > 0 else np.nan
-            class_before[i], class_after[i] = before if T > 0 else after, after
+                drift_of[i] = np.nan
+                class_before[i] = class_after[i]
+                first_frame[r] = last_frame[r] = frame
+            first_frame[r], last_frame[r] = min(first_frame[r], frame), max(last_frame[r], frame)
             op[r] = T + 1
             pixels[r] += seen_pixels[i]
             recurrent += 1 if T + 1 == RECURRENT else 0

@@ -89,7 +89,7 @@ class WorkSpace:
 
     def room(self, name: str, *shape: int, dtype: Any = np.int64, gaps: bool = False) -> npt.NDArray[Any]:
         """Return an array of that shape with whatever is in it; with `gaps`, most of it will not be written to."""
-        size = int(np.prod(shape))
+        size = math.prod(shape)
         if name not in self._arrays or len(self._arrays[name]) < size:
             length = max(size, 1) * np.dtype(dtype).itemsize
             room = _in_small_pages(length + LINE) if gaps else np.empty(length + LINE, dtype=np.uint8)

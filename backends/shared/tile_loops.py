@@ -104,7 +104,7 @@ GOLDEN = np.uint64(0x9E3779B97F4A7C15)
 SHIFT = np.uint64(64 - TABLE_BITS)
 
 
-@compiled(fastmath={"contract"})
+@compiled(fastmath={"contract"}, forceinline=True)
 def _words_fused(depth, labels, ignore, ray_a, ray_b, ray_c, a0, b0, c0, ta, tb, tc, face, out):
     """Return the words of pixels; and any doubt, see `keys_fused`.
 
@@ -133,7 +133,7 @@ def _split(points, x, y, z):
         x[u], y[u], z[u] = points[u, 0], points[u, 1], points[u, 2]
 
 
-@compiled(fastmath={"contract"})
+@compiled(fastmath={"contract"}, forceinline=True)
 def _words_of_points_fused(x, y, z, depth, labels, ignore, M, ta, tb, tc, face, out):
     """Return the words of points of a scan, and any doubt, as `_words_fused` of pixels; M (3, 3) is R / r."""
     a0, a1, a2, b0, b1, b2 = M[0, 0], M[0, 1], M[0, 2], M[1, 0], M[1, 1], M[1, 2]
@@ -163,7 +163,7 @@ def face_terms(margin: float) -> tuple[float, int]:
     return 2.0 ** (width - FRACTION), (1 << FRACTION) - (2 << width) if width < FRACTION - 1 else 0
 
 
-@serial
+@compiled(forceinline=True)
 def _words_of_stretch(
     depth, labels, ray_x, ray_y, T, size, origin, corner, ignore, ray_a, ray_b, ray_c, down, start, face, keys, out
 ):  # fmt: skip
@@ -217,7 +217,7 @@ def _key_of(a, b, c, corner):
     return ((a + corner[0]) << 42) | ((b + corner[1]) << 21) | (c + corner[2])
 
 
-@serial
+@compiled(forceinline=True)
 def _enter_runs(word, run_word, run_end, table, table_count, entry, count, n):
     """Put runs of a stretch of words into the table; those that give way become entries, whose number is returned."""
     runs = 0
@@ -348,7 +348,8 @@ def _finish(table, table_count, word, count, n, corner, partition, spread, low, 
 @serial
 def _describe(word, count, n, corner, partition, spread, low, high):
     """Leave out entries that do not count; partitions, spread and extent of what is left, whose number is returned."""
-    low[:], high[:] = 1 << 20, -1
+    low_a = low_b = low_c = np.int64(1 << 20)  # numbers, not rows of an array: they stay in registers
+    high_a = high_b = high_c = most = np.int64(-1)
     m = 0
     for e in range(n):
         w = word[e]
@@ -357,11 +358,11 @@ def _describe(word, count, n, corner, partition, spread, low, high):
             p = partition_of(_key_of(a, b, c, corner))
             word[m], count[m], partition[m] = w, count[e], p
             spread[p] += 1
-            low[0], low[1], low[2] = min(low[0], a), min(low[1], b), min(low[2], c)
-            high[0], high[1], high[2], high[3] = (
-                max(high[0], a), max(high[1], b), max(high[2], c), max(high[3], w & 0xFFFF),
-            )  # fmt: skip
+            low_a, low_b, low_c = min(low_a, a), min(low_b, b), min(low_c, c)
+            high_a, high_b, high_c, most = max(high_a, a), max(high_b, b), max(high_c, c), max(most, w & 0xFFFF)
             m += 1
+    low[0], low[1], low[2] = low_a, low_b, low_c
+    high[0], high[1], high[2], high[3] = high_a, high_b, high_c, most
     return m
 
 
