@@ -1,7 +1,7 @@
 """CPU time of a frame of scenes drawn at random, beside Open3D's own VoxelBlockGrid.integrate on the same frames.
 
     python benchmarks/bench_random_scenes.py [--csv FILE] [--json FILE] [--scenes 20] [--seed 0]
-                                             [--noise 0 0.05 0.3 1] [--backends numba open3d]
+                                             [--noise 0 0.05 0.3 1] [--backends numba open3d] [--rounds 3]
 
 scenes.py draws geometry, height, pitch, field of view, range, resolution, classes, size of the voxels and errors of the
 labels; noise is the standard deviation of depth in per cent of it. As in bench_fusion.py, times are those of later
@@ -57,7 +57,9 @@ def floor_bytes(frame: semstab.Frame, voxels: int) -> int:
     return frame.depth.nbytes + frame.labels.nbytes + voxels * lines * LINE
 
 
-def measured(scene: scenes.Scene, levels: list[float], names: list[str], most_gb: float) -> list[dict[str, Any]]:
+def measured(
+    scene: scenes.Scene, levels: list[float], names: list[str], most_gb: float, rounds: int
+) -> list[dict[str, Any]]:
     """A row for each level of noise."""
     views, voxel_size = scenes.views(scene, FRAMES)
     rows = []
@@ -70,7 +72,7 @@ def measured(scene: scenes.Scene, levels: list[float], names: list[str], most_gb
         voxels, known = reports[-1].voxels, reports[-1].map_voxels
         del counter
         fit = [name for name in names if backends.expected_bytes(name, known, known, scene.K) < most_gb * 1e9]
-        times = bench_fusion.measure(frames, scene.K, voxel_size, (BASELINE, *fit), rounds=1)
+        times = bench_fusion.measure(frames, scene.K, voxel_size, (BASELINE, *fit), rounds)
         own = times[BASELINE]["later_ms"]
         rows.append(
             dataclasses.asdict(scene) | {"voxel_size": voxel_size, "noise": noise, "voxels": voxels}
@@ -133,6 +135,7 @@ def main() -> None:
     parser.add_argument("--sizes", nargs="+", default=[f"{w}x{h}" for w, h in scenes.SIZES])
     parser.add_argument("--backends", nargs="+", default=["numba", "open3d"])
     parser.add_argument("--most-gb", type=float, default=3.0)
+    parser.add_argument("--rounds", type=int, default=3, help="maps of each scene; times are medians over their frames")
     parser.add_argument("--many", type=int, default=1_000_000, help="voxels of a frame from which on the floor is told")
     arguments = parser.parse_args()
     logging.getLogger("semstab").setLevel(logging.ERROR)
@@ -141,7 +144,9 @@ def main() -> None:
     print(f"scene kind        size   K   voxel noise     voxels {'integrate':>9}", end="")
     print("".join(f"{f'{name} ms':>10} {'faster':>8}" for name in names))
     for number in range(arguments.seed, arguments.seed + arguments.scenes):
-        rows += (new := measured(scenes.drawn(number, sizes), arguments.noise, names, arguments.most_gb))
+        rows += (
+            new := measured(scenes.drawn(number, sizes), arguments.noise, names, arguments.most_gb, arguments.rounds)
+        )
         print_scene(new, names)
     print_ratios(rows, arguments.noise, names)
     print_roofline(rows, names[0], arguments.many)
