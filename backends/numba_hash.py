@@ -144,22 +144,28 @@ class NumbaHash:
 
     def integrate(self, frame: Frame) -> FrameReport:
         """Fuse one frame: pixels to observations, then each partition of the map."""
+        if self.threads is None:
+            return self._fuse(frame)
         threads = nb.get_num_threads()
-        nb.set_num_threads(self.threads or threads)
+        nb.set_num_threads(self.threads)
         try:
-            started = time.perf_counter()
-            check_depth(frame)
-            if frame.scores is not None:
-                check_frame(frame, self.num_classes)
-            seen = self._pixels.observe(frame)
-            observed = time.perf_counter()
-            change, row = self._add(seen, frame.index)
-            if self._history is not None:
-                entries = seen.sparse() if isinstance(seen, ObservedScores) else seen
-                self._history.append(entries, row, frame.index)
-            return self._total.add(frame.index, change, started, observed)
+            return self._fuse(frame)
         finally:
             nb.set_num_threads(threads)
+
+    def _fuse(self, frame: Frame) -> FrameReport:
+        """Fuse one frame in the threads that numba may use now."""
+        started = time.perf_counter()
+        check_depth(frame)
+        if frame.scores is not None:
+            check_frame(frame, self.num_classes)
+        seen = self._pixels.observe(frame)
+        observed = time.perf_counter()
+        change, row = self._add(seen, frame.index)
+        if self._history is not None:
+            entries = seen.sparse() if isinstance(seen, ObservedScores) else seen
+            self._history.append(entries, row, frame.index)
+        return self._total.add(frame.index, change, started, observed)
 
     def _add(self, seen: Observed | ObservedScores, frame: int) -> tuple[Change, Int64]:
         """Add a frame's observations; return the change and the rows of its voxels."""
