@@ -489,36 +489,6 @@ def _sort(word, count, word2, count2, bits, histogram):
     return flipped
 
 
-@serial
-def _scatter(word, count, partition, cursor, lowest, shift, out_word, out_count):
-    """Write a band's entries at the cursors of their partitions, words packed as `_layout` has it."""
-    for e in range(word.shape[0]):
-        a, b, c = _coordinates(word[e])
-        at = cursor[partition[e]]
-        cursor[partition[e]] = at + 1
-        out_word[at] = (
-            ((a - lowest[0]) << shift[0]) | ((b - lowest[1]) << shift[1]) | ((c - lowest[2]) << shift[2])
-            | (word[e] & 0xFFFF)
-        )  # fmt: skip
-        out_count[at] = count[e]
-
-
-@serial
-def _add_up(word, count, label_bits):
-    """Add up equal words, which are sorted; return the numbers of voxels and of entries that are left."""
-    n = v = 0
-    voxel = np.int64(-1)
-    for i in range(word.shape[0]):
-        if n > 0 and word[i] == word[n - 1]:
-            count[n - 1] += count[i]
-            continue
-        v += (word[i] >> label_bits) != voxel
-        voxel = word[i] >> label_bits
-        word[n], count[n] = word[i], count[i]
-        n += 1
-    return v, n
-
-
 @parallel
 def merge_words(band_word, band_count, partition, room, entries, spread, low, high, word, count, word2, count2):
     """Order the bands' entries by partition and word, and add up equal ones.
@@ -529,20 +499,34 @@ def merge_words(band_word, band_count, partition, room, entries, spread, low, hi
     offset, edges = offsets_of(spread)
     lowest, shift = _layout(low, high)
     for band in nb.prange(entries.shape[0]):
-        start, end = band * room, band * room + entries[band]
-        _scatter(
-            band_word[start:end], band_count[start:end], partition[start:end], offset[band], lowest, shift, word, count
-        )  # fmt: skip
+        cursor = offset[band]
+        for e in range(band * room, band * room + entries[band]):
+            a, b, c = _coordinates(band_word[e])
+            at = cursor[partition[e]]
+            cursor[partition[e]] = at + 1
+            word[at] = (
+                ((a - lowest[0]) << shift[0]) | ((b - lowest[1]) << shift[1]) | ((c - lowest[2]) << shift[2])
+                | (band_word[e] & 0xFFFF)
+            )  # fmt: skip
+            count[at] = band_count[e]
     flipped = np.empty(PARTITIONS, np.bool_)
     voxels, left = np.empty(PARTITIONS, np.int64), np.empty(PARTITIONS, np.int64)
     for p in nb.prange(PARTITIONS):
-        own = slice(edges[p], edges[p + 1])
+        start, end = edges[p], edges[p + 1]
         histogram = np.empty(1 << DIGIT_BITS, np.int32)
-        flipped[p] = _sort(word[own], count[own], word2[own], count2[own], shift[3], histogram)
-        if flipped[p]:
-            voxels[p], left[p] = _add_up(word2[own], count2[own], shift[2])
-        else:
-            voxels[p], left[p] = _add_up(word[own], count[own], shift[2])
+        flipped[p] = _sort(word[start:end], count[start:end], word2[start:end], count2[start:end], shift[3], histogram)
+        w, c = (word2[start:end], count2[start:end]) if flipped[p] else (word[start:end], count[start:end])
+        n = v = 0
+        voxel = np.int64(-1)
+        for i in range(end - start):
+            if n > 0 and w[i] == w[n - 1]:
+                c[n - 1] += c[i]
+                continue
+            v += (w[i] >> shift[2]) != voxel
+            voxel = w[i] >> shift[2]
+            w[n], c[n] = w[i], c[i]
+            n += 1
+        voxels[p], left[p] = v, n
     return edges, flipped, bounds_of(voxels), bounds_of(left), lowest, shift
 
 
