@@ -79,10 +79,10 @@ def check_frame(frame: Frame, num_classes: int) -> None:
 def check_depth(frame: Frame) -> None:
     """Raise DataError where the frame's depth is finite nowhere, or cannot be metres."""
     depth = frame.depth
-    step = max(1, depth.size // CHECKED if len(depth) == 1 else int(np.sqrt(depth.size / CHECKED)))
+    step = max(1, depth.size // CHECKED if len(depth) == 1 else int(math.sqrt(depth.size / CHECKED)))
     some = depth[::step, ::step]
-    if frame.points is None and _has_fractions(some[len(some) // 2 :][:DISTINCT, : 8 * DISTINCT]):
-        return  # as of nearly all that are metres: a few tell
+    if frame.points is None and _has_fractions(some[len(some) // 2, : 8 * DISTINCT].tolist()):
+        return  # metres: a few of the middle tell of nearly all that are
     if depth.size >= CHECKED and not np.isfinite(some).any() and not np.isfinite(depth).any():
         raise DataError(f"{frame.where('depth')}: depth is finite nowhere (NaN or inf); leave this frame out")
     if frame.points is not None and _whole_millimetres(some := frame.points[::step, ::step]):
@@ -99,22 +99,17 @@ def check_depth(frame: Frame) -> None:
 
 def _whole_millimetres(measured: Float32) -> bool:
     """Return whether what is measured is whole numbers, as nothing in metres is, and too large to be near."""
-    if _has_fractions(measured[:DISTINCT, : 8 * DISTINCT]) or _has_fractions(measured):
-        return False
-    known = np.abs(_known(measured))
+    for some in (measured[:DISTINCT, : 8 * DISTINCT], measured):  # a few tell of nearly all that are none
+        known = np.abs(some[np.isfinite(some) & (some != 0)])
+        if known.size >= DISTINCT and not np.array_equal(known, np.floor(known)):
+            return False
     return known.size >= DISTINCT and bool(np.median(known) >= FAR) and len(np.unique(known)) >= DISTINCT
 
 
-def _has_fractions(measured: Float32) -> bool:
-    """Return whether enough is measured, and not all of it is whole numbers."""
-    known = _known(measured)
-    return known.size >= DISTINCT and bool((known != np.floor(known)).any())
-
-
-def _known(measured: Float32) -> Float32:
-    """Return what is measured: neither 0 nor infinite."""
-    known: Float32 = measured[np.isfinite(measured) & (measured != 0)]
-    return known
+def _has_fractions(few: list[float]) -> bool:
+    """Return whether enough of a few is measured, and not all of it whole numbers: numpy would take longer."""
+    known = [value for value in few if value != 0 and math.isfinite(value)]
+    return len(known) >= DISTINCT and any(value != math.floor(value) for value in known)
 
 
 def observe(frame: Frame, voxel_size: float, num_classes: int, pixels: Mask | None = None) -> Observations:
