@@ -21,6 +21,8 @@ from semstab.backends.numba_loops import (
     SLOT,
     count_chain,
     look_up,
+    make_nodes,
+    most_slots,
     place_observations,
     read_chain,
     record_types,
@@ -144,51 +146,57 @@ class NumbaHash:
 
     def integrate(self, frame: Frame) -> FrameReport:
         """Fuse one frame: pixels to observations, then each partition of the map."""
+        if self.threads is None:
+            return self._fuse(frame)
         threads = nb.get_num_threads()
-        nb.set_num_threads(self.threads or threads)
+        nb.set_num_threads(self.threads)
         try:
-            started = time.perf_counter()
-            check_depth(frame)
-            if frame.scores is not None:
-                check_frame(frame, self.num_classes)
-            seen = self._pixels.observe(frame)
-            observed = time.perf_counter()
-            change, row = self._add(seen, frame.index)
-            if self._history is not None:
-                entries = seen.sparse() if isinstance(seen, ObservedScores) else seen
-                self._history.append(entries, row, frame.index)
-            return self._total.add(frame.index, change, started, observed)
+            return self._fuse(frame)
         finally:
             nb.set_num_threads(threads)
 
+    def _fuse(self, frame: Frame) -> FrameReport:
+        """Fuse one frame in the threads that numba may use now."""
+        started = time.perf_counter()
+        check_depth(frame)
+        if frame.scores is not None:
+            check_frame(frame, self.num_classes)
+        seen = self._pixels.observe(frame)
+        observed = time.perf_counter()
+        change, row = self._add(seen, frame.index)
+        if self._history is not None:
+            entries = seen.sparse() if isinstance(seen, ObservedScores) else seen
+            self._history.append(entries, row, frame.index)
+        return self._total.add(frame.index, change, started, observed)
+
     def _add(self, seen: Observed | ObservedScores, frame: int) -> tuple[Change, Int64]:
         """Add a frame's observations; return the change and the rows of its voxels."""
-        self._make_slots(int((self._used + np.diff(seen.bounds)).max()))
-        row, slot = np.empty_like(seen.key), np.empty_like(seen.key)
-        new = np.zeros(PARTITIONS, dtype=np.int64)
-        look_up(seen.key, seen.bounds, self._slots, row, slot, new)
-        base = len(self) + np.concatenate([[0], np.cumsum(new)])
-        _grow(self._records, int(base[-1]))
+        n, voxels = len(seen.key), len(self)
+        self._make_slots(most_slots(self._used, seen.bounds))
+        row, slot = np.empty(n, np.int64), np.empty(n, np.int64)
+        base = look_up(seen.key, seen.bounds, self._slots, self._used, row, slot)
+        new = int(base[-1])
+        _grow(self._records, voxels + new)
         sums = np.zeros((PARTITIONS, 4))
-        changed = BeliefChange.room(len(row))
+        changed = BeliefChange.room(n)
         self._last = seen.key, changed
         report = sums, *changed
         if isinstance(seen, ObservedScores):
-            dense_base = self._make_dense(seen, row, new)
+            dense_base = self._make_dense(seen, row, base)
             update_dense(
-                seen.key, seen.pixels, seen.row, seen.sums, seen.bounds, frame, row, slot, base, dense_base,
-                self._slots, self._records, self._nodes, self._dense, *report,
+                seen.key, seen.pixels, seen.row, seen.sums, seen.bounds, frame, row, slot, voxels, base,
+                dense_base, self._slots, self._records, self._nodes, self._dense, *report,
             )  # fmt: skip
         else:
-            self._make_nodes(np.diff(seen.start[seen.bounds]))
+            self._nodes_used = make_nodes(self._ranges, seen.bounds, seen.start, self._nodes_used)
+            _grow(self._nodes, self._nodes_used)
             update(
-                seen.key, seen.pixels, seen.start, seen.label, seen.weight, seen.bounds, frame, row, slot, base,
+                seen.key, seen.pixels, seen.start, seen.label, seen.weight, seen.bounds, frame, row, slot, voxels, base,
                 self._slots, self._records, self._nodes, self._dense, self._ranges, *report,
             )  # fmt: skip
-        self._used += new
         vss, entropy, _, recurrent = sums.sum(axis=0)
         drift = sums[:, 2].sum()
-        return Change.of((seen.pixels.sum(), len(seen.key), new.sum(), drift, vss, entropy, recurrent)), row
+        return Change.of((seen.pixels.sum(), n, new, drift, vss, entropy, recurrent)), row
 
     def changes(self) -> Changes | None:
         """Return the changes by the last frame."""
@@ -243,31 +251,17 @@ class NumbaHash:
             rehash(self._slots, slots)
             self._slots = slots
 
-    def _make_dense(self, seen: ObservedScores, row: Int64, new: Int64) -> Int64:
+    def _make_dense(self, seen: ObservedScores, row: Int64, base: Int64) -> Int64:
         """Return the room for a dense row for each of the frame's voxels; where those of each partition begin."""
-        needed = new
         if self._dense_used < len(self):  # else only the frame's new voxels have none
             without = (row < 0) | (self._records["next"][np.maximum(row, 0)] > DENSE)
-            needed = np.diff(np.concatenate([[0], np.cumsum(without)])[seen.bounds])
-        base = self._dense_used + np.concatenate([[0], np.cumsum(needed)])
+            base = np.concatenate([[0], np.cumsum(without)])[seen.bounds]
+        base = self._dense_used + base
         self._dense_used = int(base[-1])
         used, stride = self._dense_used, self._dense.shape[1]
         if used > len(self._dense):
             self._dense.resize((max(used, len(self._dense) + len(self._dense) // 4), stride), refcheck=False)
         return base
-
-    def _make_nodes(self, entries: Int64) -> None:
-        """Give each partition room for a node an entry; the rest of its last stretch is used first."""
-        ranges = self._ranges
-        spent = ranges[:, 0] == ranges[:, 1]
-        ranges[spent, :2] = ranges[spent, 2:]
-        ranges[spent, 2:] = 0
-        free = (ranges[:, 1] - ranges[:, 0]) + (ranges[:, 3] - ranges[:, 2])
-        for p in np.flatnonzero(free < entries):
-            size = max(256, 2 * int(entries[p]))
-            ranges[p, 2:] = self._nodes_used, self._nodes_used + size
-            self._nodes_used += size
-        _grow(self._nodes, self._nodes_used)
 
 
 def _grow(rows: npt.NDArray[Any], needed: int) -> None:

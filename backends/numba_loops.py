@@ -13,7 +13,7 @@ import numba as nb
 import numpy as np
 
 from semstab.backends.shared.beliefs import observe_few, observe_row, plogp
-from semstab.backends.shared.keys import PARTITIONS, mix
+from semstab.backends.shared.keys import PARTITIONS, bounds_of, mix
 from semstab.backends.shared.pixel_keys import AHEAD, touch
 from semstab.core.compiled import compiled, parallel, serial
 from semstab.data.results import RECURRENT
@@ -34,9 +34,22 @@ def record_types(evidence: Any) -> tuple[np.dtype[Any], np.dtype[Any]]:
     return np.dtype(record, align=True), np.dtype(node, align=True)
 
 
+@serial
+def most_slots(used, bounds):
+    """Return the slots of a partition that may be in use once the voxels within these bounds are there, at most."""
+    most = np.int64(0)
+    for p in range(PARTITIONS):
+        most = max(most, used[p] + bounds[p + 1] - bounds[p])
+    return most
+
+
 @parallel
-def look_up(key, bounds, slots, row, slot, new):
-    """Look up the row of each voxel; new ones enter the hash and are numbered -1, -2, ... within their partition."""
+def look_up(key, bounds, slots, used, row, slot):
+    """Look up the row of each voxel; new ones enter the hash and are numbered -1, -2, ... within their partition.
+
+    Returns the first new voxel of each partition (PARTITIONS + 1,).
+    """
+    new = np.empty(PARTITIONS, np.int64)
     mask = np.uint64(slots.shape[1] - 1)
     for p in nb.prange(PARTITIONS):
         n = 0
@@ -55,6 +68,8 @@ def look_up(key, bounds, slots, row, slot, new):
             else:
                 row[v] = mine[at].row
         new[p] = n
+        used[p] += n
+    return bounds_of(new)
 
 
 @parallel
@@ -71,6 +86,24 @@ def rehash(old, new):
                     at = (at + 1) & np.int64(mask)
                 new[p, at].key = old[p, i].key
                 new[p, at].row = old[p, i].row
+
+
+@serial
+def make_nodes(ranges, bounds, start, used):
+    """Give each partition room for a node an entry; the rest of its last stretch is used first.
+
+    Returns how many nodes are given away then; `used` were before.
+    """
+    for p in range(PARTITIONS):
+        own = ranges[p]
+        if own[0] == own[1]:
+            own[0], own[1] = own[2], own[3]
+            own[2] = own[3] = 0
+        entries = start[bounds[p + 1]] - start[bounds[p]]
+        if (own[1] - own[0]) + (own[3] - own[2]) < entries:
+            own[2], own[3] = used, used + max(256, 2 * entries)
+            used = own[3]
+    return used
 
 
 @serial
@@ -161,12 +194,12 @@ def _touch_ahead(v, last, row, records, nodes, dense):
 
 @parallel
 def update(
-    key, pixels, start, label, weight, bounds, frame, row, slot, base, slots, records, nodes, dense, ranges, sums,
-    drift_of, dominant_before, dominant_after,
+    key, pixels, start, label, weight, bounds, frame, row, slot, voxels, base, slots, records, nodes, dense, ranges,
+    sums, drift_of, dominant_before, dominant_after,
 ):  # fmt: skip
     """Add the frame's observations; sums (PARTITIONS, 4): changes of VSS and entropy, drift, recurrent voxels.
 
-    row, the last three: see `Changes`.
+    voxels: of the map before it; base: the first new one of each partition. row, the last three: see `Changes`.
     """
     for p in nb.prange(PARTITIONS):
         s, few, node = np.zeros(dense.shape[1]), np.zeros((2, dense.shape[1])), np.zeros(dense.shape[1], np.int64)
@@ -179,7 +212,7 @@ def update(
             first, last = start[v], start[v + 1]
             r = row[v]
             if r < 0:
-                r = base[p] - r - 1
+                r = voxels + base[p] - r - 1
                 row[v] = r
                 slots[p, slot[v]].row = r
                 begin(records[r], key[v], label[first], frame)
@@ -281,8 +314,8 @@ def place_observations(
 
 @parallel
 def update_dense(
-    key, pixels, seen, seen_sums, bounds, frame, row, slot, base, dense_base, slots, records, nodes, dense, sums,
-    drift_of, dominant_before, dominant_after,
+    key, pixels, seen, seen_sums, bounds, frame, row, slot, voxels, base, dense_base, slots, records, nodes, dense,
+    sums, drift_of, dominant_before, dominant_after,
 ):  # fmt: skip
     """Add the frame's observations, whose voxels get dense rows from `dense_base` of their partition on.
 
@@ -299,7 +332,7 @@ def update_dense(
             _touch_ahead_dense(v, bounds[p + 1] - 1, row, records, flat, stride, seen, seen_sums)
             r = row[v]
             if r < 0:
-                r = base[p] - r - 1
+                r = voxels + base[p] - r - 1
                 row[v] = r
                 slots[p, slot[v]].row = r
                 begin(records[r], key[v], 0, frame)

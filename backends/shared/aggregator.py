@@ -12,9 +12,9 @@ from semstab.backends.shared import score_loops, tile_loops
 from semstab.backends.shared.association import INDEX_LIMIT, back_project, check_frame, voxel_index
 from semstab.backends.shared.keys import HALF, PARTITIONS, index_of_keys, out_of_reach, partitions_of
 from semstab.backends.shared.observations import Observed, ObservedScores, WorkSpace
-from semstab.backends.shared.pixel_keys import columns_of, frame_terms
+from semstab.backends.shared.pixel_keys import columns_of
 from semstab.backends.shared.score_loops import LANES
-from semstab.backends.shared.tile_loops import NEAR, REACH
+from semstab.backends.shared.tile_loops import NEAR
 from semstab.core.types import Float32, Float64, Int32, Int64, UInt8
 from semstab.data.frames import Frame
 from semstab.data.labels import fixed, flat
@@ -33,9 +33,7 @@ class Words(NamedTuple):
     word: Int64
     count: Int32
     partition: UInt8
-    room: int
     entries: Int64
-    lost: Int64
     spread: Int64
     low: Int64
     high: Int64
@@ -91,94 +89,64 @@ class Aggregator:
     def _labels(self, frame: Frame, origin: Int64) -> Observed | None:
         """Return the observations of labels, None where the frame reaches too far or a label is no class."""
         assert frame.labels is not None
-        corner = np.floor(frame.T_wc[:3, 3] / self.voxel_size).astype(np.int64) - origin + (HALF - NEAR)
-        if corner.min() < 0 or corner.max() > 2 * (HALF - NEAR):
+        corner = tile_loops.corner_of(fixed(frame.T_wc), self.voxel_size, origin)
+        if min(corner.tolist()) < 0 or max(corner.tolist()) > 2 * (HALF - NEAR):
             return None
-        seen = self._words_of_points(frame, origin, corner) if frame.is_scan else self._words(frame, origin, corner)
-        word, count, partition, room, entries, lost, spread, low, high = seen
-        if lost.any() or high[:, 3].max() >= self.num_classes:
-            return None
-        extent = low[:, :3].min(axis=0), high.max(axis=0)
-        return self._merged_labels(word, count, partition, room, entries, spread, *extent, corner)
+        find = self._words_of_points if frame.is_scan else self._words
+        total, room, words = find(frame, origin, corner)
+        return self._merged_labels(total, room, words, corner) if total >= 0 else None
 
-    def _words(self, frame: Frame, origin: Int64, corner: Int64) -> Words:
-        """Return the entries of an image, by bands of rows."""
+    def _words(self, frame: Frame, origin: Int64, corner: Int64) -> tuple[int, int, Words]:
+        """Find the entries of an image, by bands of rows; see `find_words` for their number."""
         assert frame.labels is not None
-        space, (H, W) = self._space, frame.shape
-        ray_x, ray_y = frame.rays
-        rays = space.room("rays", 3, W, dtype=np.float64)
-        rays[:], margin = frame_terms(ray_x, frame.T_wc, self.voxel_size, REACH)
-        down = (frame.T_wc[:3, 1] * ray_y[:, None] + frame.T_wc[:3, 2]) / self.voxel_size
-        begin, face = self._begin(frame, origin, corner, margin)
-        work, found = self._room_for_words(-(-H // tile_loops.ROWS), tile_loops.ROWS, W)
-        tile_loops.find_words(
-            fixed(frame.depth), fixed(frame.labels), ray_x, ray_y, fixed(frame.T_wc), self.voxel_size, origin,
-            corner, columns_of(self.within, origin), rays, down, begin, face, frame.ignore_id, found.room, *work,
-            found.word, found.count, found.partition, found.entries, found.lost, found.spread, found.low, found.high,
+        H, W = frame.shape
+        room, work, words = self._room_for_words(-(-H // tile_loops.ROWS), tile_loops.ROWS, W)
+        total = tile_loops.find_words(
+            fixed(frame.depth), fixed(frame.labels), *frame.rays, fixed(frame.T_wc), self.voxel_size, origin, corner,
+            columns_of(self.within, origin), frame.ignore_id, self.num_classes, room,
+            self._space.room("rays", 3, W, dtype=np.float64), *work, *words,
         )  # fmt: skip
-        return found
+        return total, room, words
 
-    def _words_of_points(self, frame: Frame, origin: Int64, corner: Int64) -> Words:
-        """Return the entries of a scan, by bands of points."""
+    def _words_of_points(self, frame: Frame, origin: Int64, corner: Int64) -> tuple[int, int, Words]:
+        """Find the entries of a scan, by bands of points, as `_words` does those of an image."""
         assert frame.labels is not None
         assert frame.points is not None
         points = fixed(frame.points).reshape(-1, 3)
-        _, margin = frame_terms(np.zeros(0), frame.T_wc, self.voxel_size, REACH)
-        begin, face = self._begin(frame, origin, corner, margin)
-        work, found = self._room_for_words(-(-len(points) // tile_loops.POINTS), 1, tile_loops.POINTS)
-        tile_loops.find_words_of_points(
+        room, work, words = self._room_for_words(-(-len(points) // tile_loops.POINTS), 1, tile_loops.POINTS)
+        total = tile_loops.find_words_of_points(
             points, flat(frame.depth), flat(frame.labels), fixed(frame.T_wc), self.voxel_size, origin, corner,
-            columns_of(self.within, origin), fixed(frame.T_wc[:3, :3] / self.voxel_size), begin, face, frame.ignore_id,
-            found.room, *work, found.word, found.count, found.partition, found.entries, found.lost, found.spread,
-            found.low, found.high,
+            columns_of(self.within, origin), fixed(frame.T_wc[:3, :3] / self.voxel_size), frame.ignore_id,
+            self.num_classes, room, *work, *words,
         )  # fmt: skip
-        return found
+        return total, room, words
 
-    def _begin(self, frame: Frame, origin: Int64, corner: Int64, margin: float) -> tuple[Float64, int]:
-        """Return the sensor in voxels, as fused words count from -2^16, and the bits of a face; see `face_terms`."""
-        half, face = tile_loops.face_terms(margin)
-        return frame.T_wc[:3, 3] / self.voxel_size - origin + (REACH + half + HALF - corner), face
-
-    def _room_for_words(self, bands: int, rows: int, width: int) -> tuple[tuple[Any, Any, Any], Words]:
-        """Return work space for the threads, and room for the entries of bands of so many rows."""
+    def _room_for_words(self, bands: int, rows: int, width: int) -> tuple[int, tuple[Any, Any, Any], Words]:
+        """Return the room of a band of so many rows, work space for the threads, and the room of all bands."""
         space, threads = self._space, nb.get_num_threads()
         columns, table = tile_loops.COLUMNS, 1 << tile_loops.TABLE_BITS
         tables = space.room("table", threads, table)
         tables[:] = -1
         room = rows * width + (columns + 1) * rows + 2 * table  # memory that is not written to is not taken
         stretches = space.room("stretches", threads, 4, columns + 2 * tile_loops.LANES)
-        found = Words(
+        words = Words(
             space.room("word", bands * room, gaps=True),
             space.room("count", bands * room, dtype=np.int32, gaps=True),
             space.room("partition", bands * room, dtype=np.uint8, gaps=True),
-            room,
-            entries=np.zeros(bands, dtype=np.int64),
-            lost=np.zeros(bands, dtype=np.int64),
-            spread=np.zeros((bands, PARTITIONS), dtype=np.int64),
-            low=np.zeros((bands, 4), dtype=np.int64),
-            high=np.full((bands, 4), -1),
+            entries=space.room("entries", bands),
+            spread=space.room("spread", bands, PARTITIONS),
+            low=space.room("low", bands, 4),
+            high=space.room("high", bands, 4),
         )
-        return (stretches, tables, space.room("table_count", threads, table, dtype=np.int32)), found
+        return room, (stretches, tables, space.room("table_count", threads, table, dtype=np.int32)), words
 
-    def _merged_labels(
-        self, word: Int64, count: Int32, partition: UInt8, room: int, entries: Int64, spread: Int64,
-        low: Int64, high: Int64, corner: Int64,
-    ) -> Observed:  # fmt: skip
-        """Sort the entries of the bands by partition and word, and add up equal ones."""
-        space, total = self._space, int(entries.sum())
-        offset, edges = _offsets(spread)
-        widths = [max(1, int(extent).bit_length()) for extent in (*(high[:3] - low), high[3])]
-        shift = np.cumsum(widths[::-1])[-2::-1]  # of a, b and c, above the label's bits
-        words = [space.room(f"words {i}", total) for i in range(2)]
-        counts = [space.room(f"counts {i}", total, dtype=np.int32) for i in range(2)]
-        tile_loops.scatter_words(
-            word, count, partition, room, entries, offset, low, shift, words[0], counts[0]
-        )  # fmt: skip
-        both = words[0], counts[0], words[1], counts[1], edges
-        flipped = np.zeros(PARTITIONS, dtype=np.bool_)
-        voxels, left = np.zeros(PARTITIONS, dtype=np.int64), np.zeros(PARTITIONS, dtype=np.int64)
-        tile_loops.merge_words(*both, int(sum(widths)), widths[-1], flipped, voxels, left)
-        bounds, entry_bounds = (np.concatenate([[0], np.cumsum(number)]) for number in (voxels, left))
+    def _merged_labels(self, total: int, room: int, words: Words, corner: Int64) -> Observed:
+        """Sort the entries of the bands, of which there are so many, by partition and word, and add up equal ones."""
+        space = self._space
+        pairs = [(space.room(f"words {i}", total), space.room(f"counts {i}", total, dtype=np.int32)) for i in (0, 1)]
+        word, count, partition, *bands = words
+        merged = tile_loops.merge_words(word, count, partition, room, *bands, *pairs[0], *pairs[1])
+        _, _, bounds, entry_bounds, _, _ = merged
         n, m = int(bounds[-1]), int(entry_bounds[-1])
         seen = Observed(
             key=space.room("key", n),
@@ -189,8 +157,7 @@ class Aggregator:
             bounds=bounds,
         )
         tile_loops.emit_voxels(
-            *both, flipped, bounds, entry_bounds, low, shift, corner,
-            seen.key, seen.pixels, seen.start, seen.label, seen.weight,
+            *pairs[0], *pairs[1], *merged, corner, seen.key, seen.pixels, seen.start, seen.label, seen.weight
         )  # fmt: skip
         return seen
 
@@ -274,7 +241,7 @@ class Aggregator:
     ) -> ObservedScores:
         """Add up the entries of each voxel, band after band."""
         space, total, K = self._space, int(entries.sum()), self.num_classes
-        offset, edges = _offsets(spread)
+        offset, edges = tile_loops.offsets_of(spread)
         merged = [space.room(f"merged {name}", total) for name in ("key", "pixels", "row")]
         score_loops.scatter_rows(key, count, room, -(-K // LANES) * LANES, entries, offset, *merged)
         voxels = np.zeros(PARTITIONS, dtype=np.int64)
@@ -301,13 +268,6 @@ def _by_rows(frame: Frame, columns: int) -> tuple[Float32, Float32, tuple[Float6
     points[: frame.depth.size] = frame.points.reshape(-1, 3)
     rows = fixed(depth.reshape(H, columns)), fixed(points.reshape(H, columns, 3))
     return *rows, (np.zeros(columns), np.zeros(H))
-
-
-def _offsets(spread: Int64) -> tuple[Int64, Int64]:
-    """Return the start of each band's entries in each partition (PARTITIONS, bands), and of each partition."""
-    ends = np.cumsum(spread.T.reshape(-1))
-    offset = np.concatenate([[0], ends[:-1]]).reshape(PARTITIONS, -1)
-    return offset, np.append(offset[:, 0], ends[-1])
 
 
 def _flat(scores: Any) -> Any:

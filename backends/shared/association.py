@@ -79,8 +79,10 @@ def check_frame(frame: Frame, num_classes: int) -> None:
 def check_depth(frame: Frame) -> None:
     """Raise DataError where the frame's depth is finite nowhere, or cannot be metres."""
     depth = frame.depth
-    step = max(1, depth.size // CHECKED if len(depth) == 1 else int(np.sqrt(depth.size / CHECKED)))
+    step = max(1, depth.size // CHECKED if len(depth) == 1 else int(math.sqrt(depth.size / CHECKED)))
     some = depth[::step, ::step]
+    if frame.points is None and _has_fractions(some[len(some) // 2, : 8 * DISTINCT].tolist()):
+        return  # metres: a few of the middle tell of nearly all that are
     if depth.size >= CHECKED and not np.isfinite(some).any() and not np.isfinite(depth).any():
         raise DataError(f"{frame.where('depth')}: depth is finite nowhere (NaN or inf); leave this frame out")
     if frame.points is not None and _whole_millimetres(some := frame.points[::step, ::step]):
@@ -102,6 +104,12 @@ def _whole_millimetres(measured: Float32) -> bool:
         if known.size >= DISTINCT and not np.array_equal(known, np.floor(known)):
             return False
     return known.size >= DISTINCT and bool(np.median(known) >= FAR) and len(np.unique(known)) >= DISTINCT
+
+
+def _has_fractions(few: list[float]) -> bool:
+    """Return whether enough of a few is measured, and not all of it whole numbers: numpy would take longer."""
+    known = [value for value in few if value != 0 and math.isfinite(value)]
+    return len(known) >= DISTINCT and any(value != math.floor(value) for value in known)
 
 
 def observe(frame: Frame, voxel_size: float, num_classes: int, pixels: Mask | None = None) -> Observations:

@@ -67,6 +67,15 @@ def partition_of(key):
     return np.int64(mix(key) >> np.uint64(58))
 
 
+@serial
+def bounds_of(number):
+    """Return the first of each part (n + 1,) of what comes part after part, so many in each (n,); and the end."""
+    bounds = np.zeros(number.shape[0] + 1, np.int64)
+    for part in range(number.shape[0]):
+        bounds[part + 1] = bounds[part] + number[part]
+    return bounds
+
+
 def partitions_of(keys: Int64) -> Int64:
     """Return the partition of each key (n,)."""
     partition: Int64 = (mix.py_func(keys) >> np.uint64(58)).astype(np.int64)

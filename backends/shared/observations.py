@@ -86,16 +86,21 @@ class WorkSpace:
 
     def __init__(self) -> None:
         self._arrays: dict[str, npt.NDArray[Any]] = {}
+        self._last: dict[str, npt.NDArray[Any]] = {}
+        """The part of each that was asked for last."""
 
     def room(self, name: str, *shape: int, dtype: Any = np.int64, gaps: bool = False) -> npt.NDArray[Any]:
         """Return an array of that shape with whatever is in it; with `gaps`, most of it will not be written to."""
+        if (last := self._last.get(name)) is not None and last.shape == shape:
+            return last
         size = math.prod(shape)
         if name not in self._arrays or len(self._arrays[name]) < size:
             length = max(size, 1) * np.dtype(dtype).itemsize
             room = _in_small_pages(length + LINE) if gaps else np.empty(length + LINE, dtype=np.uint8)
             start = -room.ctypes.data % LINE
             self._arrays[name] = room[start : start + length].view(dtype)
-        return self._arrays[name][:size].reshape(shape)
+        self._last[name] = room = self._arrays[name][:size].reshape(shape)
+        return room
 
 
 def _in_small_pages(length: int) -> npt.NDArray[np.uint8]:

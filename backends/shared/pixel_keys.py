@@ -5,17 +5,14 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 from llvmlite import ir
 from numba.core import cgutils, types
 from numba.extending import intrinsic
 
 from semstab.backends.shared.keys import HALF
 from semstab.core.compiled import serial
-from semstab.core.types import Float64, Int64, Mask
+from semstab.core.types import Int64, Mask
 from semstab.data.frames import Frame
-
-Floats = npt.NDArray[np.floating]
 
 FACE = 2.0**30
 """Index from which on rounding may move a point across a face by more than the margin of one millionth."""
@@ -150,16 +147,6 @@ def columns_of(within, origin):
     (x0, y0), (x1, y1) = within.low, within.high
     edges = np.array([x0, x1, y0, y1]) - np.repeat(origin[:2], 2) + HALF
     return np.clip(edges, 0, 2 * HALF).astype(np.int64)
-
-
-def frame_terms(ray_x: Floats, T: Float64, size: float, reach: int) -> tuple[Float64, float]:
-    """Return the columns' rays (3, W) along the world's axes, voxels a metre of depth, and the margin of a face.
-
-    The margin bounds the voxels by which rounding can move a point. Of a point within reach no term is above
-    8 reach + |t| / r voxels, and each of a dozen operations rounds its result by 2^-53 of that at most.
-    """
-    rays = T[:3, :1] * ray_x / size
-    return rays, 2.0**-49 * (8.0 * reach + float(np.abs(T[:3, 3]).max()) / size)
 
 
 # Asking for memory before it is needed, in compiled loops.

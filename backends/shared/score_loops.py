@@ -284,7 +284,7 @@ def _add_stretch(scores, at, K, stride, words, scale, run_word, run_end, table, 
 def scatter_rows(key, count, room, stride, entries, offset, out_key, out_pixels, out_row):
     """Order entries by partition, within one by band and appearance; `out_row` is the index of their sums."""
     for band in nb.prange(entries.shape[0]):
-        cursor = offset[:, band].copy()
+        cursor = offset[band].copy()
         for e in range(band * room, band * room + entries[band]):
             p = partition_of(key[e])
             at = cursor[p]

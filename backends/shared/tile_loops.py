@@ -8,7 +8,6 @@ order in which they are made does not show.
 
 from __future__ import annotations
 
-import math
 from typing import Any
 
 import numba as nb
@@ -17,7 +16,7 @@ from llvmlite import ir
 from numba.core import cgutils, types
 from numba.extending import intrinsic
 
-from semstab.backends.shared.keys import HALF, PARTITIONS, partition_of
+from semstab.backends.shared.keys import HALF, PARTITIONS, bounds_of, partition_of
 from semstab.backends.shared.pixel_keys import bits_of, exact_keys_of_points, exact_keys_of_row, touch
 from semstab.core.compiled import compiled, parallel, serial
 
@@ -154,13 +153,51 @@ def _words_of_points_fused(x, y, z, depth, labels, ignore, M, ta, tb, tc, face, 
     return doubt | ((outside >> 52) != 0)
 
 
-def face_terms(margin: float) -> tuple[float, int]:
+@serial
+def corner_of(T, size, origin):
+    """Return the voxel from which words count (3,), as packed keys count."""
+    corner = np.empty(3, np.int64)
+    for axis in range(3):
+        corner[axis] = np.int64(np.floor(T[axis, 3] / size)) - origin[axis] + (HALF - NEAR)
+    return corner
+
+
+@serial
+def face_terms(margin):
     """Return half a voxel's face's width, within which a pixel is in doubt, and which bits of a fraction are 0 there.
 
-    The margin is that of rounding (`frame_terms`); two more roundings are to 2^-36, and the width is a power of two.
+    The margin is that of rounding (`_begin`); two more roundings are to 2^-36, and the width is a power of two.
     """
-    width = min(FRACTION, math.ceil(math.log2(margin * 2.0**FRACTION + 2)))
+    width: Any = min(FRACTION, np.int64(np.ceil(np.log2(margin * 2.0**FRACTION + 2))))
     return 2.0 ** (width - FRACTION), (1 << FRACTION) - (2 << width) if width < FRACTION - 1 else 0
+
+
+@serial
+def _begin(T, size, origin, corner):
+    """Return the sensor in voxels (3,), as fused words count from -2^16, and the bits of a face; see `face_terms`.
+
+    The margin of a face bounds the voxels by which rounding can move a point. Of a point within reach no term is above
+    8 reach + |t| / r voxels, and each of a dozen operations rounds its result by 2^-53 of that at most.
+    """
+    begin, farthest = np.empty(3), 0.0
+    for axis in range(3):
+        farthest = max(farthest, abs(T[axis, 3]))
+    half, face = face_terms(2.0**-49 * (8.0 * REACH + farthest / size))
+    for axis in range(3):
+        begin[axis] = (T[axis, 3] / size - origin[axis]) + (REACH + half + HALF - corner[axis])
+    return begin, face
+
+
+@serial
+def _rays(ray_x, ray_y, T, size, across):
+    """Write the columns' rays (3, W), and return those of the rows (H, 3), in voxels a metre of depth."""
+    down = np.empty((ray_y.shape[0], 3))
+    for axis in range(3):
+        for u in range(ray_x.shape[0]):
+            across[axis, u] = T[axis, 0] * ray_x[u] / size
+        for v in range(ray_y.shape[0]):
+            down[v, axis] = (T[axis, 1] * ray_y[v] + T[axis, 2]) / size
+    return down
 
 
 @compiled(forceinline=True)
@@ -248,15 +285,18 @@ def _flush(table, table_count, word, count, n):
 
 @parallel
 def find_words(
-    depth, labels, ray_x, ray_y, T, size, origin, corner, columns, rays, down, begin, face, ignore, room, stretches,
-    tables, table_counts, word, count, partition, entries, lost, spread, low, high,
+    depth, labels, ray_x, ray_y, T, size, origin, corner, columns, ignore, num_classes, room, rays, stretches, tables,
+    table_counts, word, count, partition, entries, spread, low, high,
 ):  # fmt: skip
     """Find each band's entries: words with counts, some of them twice; their extent and spread by partition.
 
-    Each band has `room` for them. `lost`: a pixel is out of reach of the words. low, high (bands, 4): of the
-    coordinates, and of the label.
+    Each band has `room` for them. low, high (bands, 4): of the coordinates, and of the label.
+
+    Returns how many there are; -1 where a pixel is out of reach of the words, or its label is no class.
     """
     H, W = depth.shape
+    begin, face = _begin(T, size, origin, corner)
+    down = _rays(ray_x, ray_y, T, size, rays)
     for band in nb.prange(entries.shape[0]):
         thread = nb.get_thread_id()
         table, table_count = tables[thread], table_counts[thread]
@@ -264,7 +304,7 @@ def find_words(
         run_word, run_end = stretches[thread, 2], stretches[thread, 3]
         own_word = word[band * room : (band + 1) * room]
         own_count = count[band * room : (band + 1) * room]
-        n = np.int64(0)
+        n = lost = np.int64(0)
         for first in range(0, W, COLUMNS):
             to = min(first + COLUMNS, W)
             own = words[: -(-(to - first) // LANES) * LANES + 1]
@@ -274,7 +314,7 @@ def find_words(
                 touch(labels[y], min(W - 1, to))
                 touch(labels[y], min(W - 1, to + 64))
                 own[to - first :] = -1
-                lost[band] |= _words_of_stretch(
+                lost |= _words_of_stretch(
                     depth[y, first:to], labels[y, first:to], ray_x[first:to], ray_y[y], T, size, origin, corner,
                     ignore, rays[0, first:to], rays[1, first:to], rays[2, first:to], down[y], begin, face, keys, own,
                 )  # fmt: skip
@@ -282,9 +322,10 @@ def find_words(
                     _keep_columns(own, columns, corner)
                 n = _enter_runs(own, run_word, run_end, table, table_count, own_word, own_count, n)
         entries[band] = _finish(
-            table, table_count, own_word, own_count, n, corner, partition[band * room : (band + 1) * room],
-            spread[band], low[band], high[band],
+            table, table_count, own_word, own_count, n, lost, corner,
+            partition[band * room : (band + 1) * room], spread[band], low[band], high[band],
         )  # fmt: skip
+    return _total(entries, high, num_classes)
 
 
 @serial
@@ -302,10 +343,11 @@ def _touch_points(points, depth, labels, first, end):
 
 @parallel
 def find_words_of_points(
-    points, depth, labels, T, size, origin, corner, columns, M, begin, face, ignore, room, stretches, tables,
-    table_counts, word, count, partition, entries, lost, spread, low, high,
+    points, depth, labels, T, size, origin, corner, columns, M, ignore, num_classes, room, stretches, tables,
+    table_counts, word, count, partition, entries, spread, low, high,
 ):  # fmt: skip
     """Find the entries of bands of `POINTS` points of a scan (N, 3), as `find_words` finds those of a band of rows."""
+    begin, face = _begin(T, size, origin, corner)
     ox, oy, oz = float(origin[0]), float(origin[1]), float(origin[2])
     for band in nb.prange(entries.shape[0]):
         thread = nb.get_thread_id()
@@ -315,7 +357,7 @@ def find_words_of_points(
         own_word = word[band * room : (band + 1) * room]
         own_count = count[band * room : (band + 1) * room]
         x, y, z = np.empty(COLUMNS, np.float32), np.empty(COLUMNS, np.float32), np.empty(COLUMNS, np.float32)
-        n = np.int64(0)
+        n = lost = np.int64(0)
         end = min(depth.shape[0], (band + 1) * POINTS)
         for first in range(band * POINTS, end, COLUMNS):
             to = min(first + COLUMNS, end)
@@ -327,22 +369,38 @@ def find_words_of_points(
             if _words_of_points_fused(
                 x, y, z, seen, named, ignore, M, begin[0], begin[1], begin[2], face, own
             ):  # fmt: skip
-                lost[band] |= exact_keys_of_points(some, seen, named, T, size, ox, oy, oz, ignore, keys)
-                lost[band] |= _words_of_keys(keys, named, corner, own)
+                lost |= exact_keys_of_points(some, seen, named, T, size, ox, oy, oz, ignore, keys)
+                lost |= _words_of_keys(keys, named, corner, own)
             if columns.shape[0]:
                 _keep_columns(own, columns, corner)
             n = _enter_runs(own, run_word, run_end, table, table_count, own_word, own_count, n)
         entries[band] = _finish(
-            table, table_count, own_word, own_count, n, corner, partition[band * room : (band + 1) * room],
-            spread[band], low[band], high[band],
+            table, table_count, own_word, own_count, n, lost, corner,
+            partition[band * room : (band + 1) * room], spread[band], low[band], high[band],
         )  # fmt: skip
+    return _total(entries, high, num_classes)
 
 
 @serial
-def _finish(table, table_count, word, count, n, corner, partition, spread, low, high):
-    """Empty the table into a band's entries, of which there are n; return how many are left, see `_describe`."""
+def _finish(table, table_count, word, count, n, lost, corner, partition, spread, low, high):
+    """Empty the table into a band's entries, of which there are n; return how many are left, see `_describe`.
+
+    Returns -1 where a pixel is `lost`.
+    """
     n = _flush(table, table_count, word, count, n)
-    return _describe(word, count, n, corner, partition, spread, low, high)
+    n = _describe(word, count, n, corner, partition, spread, low, high)
+    return -1 if lost else n
+
+
+@serial
+def _total(entries, high, num_classes):
+    """Return the number of entries of all bands; -1 where one has lost a pixel, or has a label that is no class."""
+    total = np.int64(0)
+    for band in range(entries.shape[0]):
+        if entries[band] < 0 or high[band, 3] >= num_classes:
+            return np.int64(-1)
+        total += entries[band]
+    return total
 
 
 @serial
@@ -350,6 +408,7 @@ def _describe(word, count, n, corner, partition, spread, low, high):
     """Leave out entries that do not count; partitions, spread and extent of what is left, whose number is returned."""
     low_a = low_b = low_c = np.int64(1 << 20)  # numbers, not rows of an array: they stay in registers
     high_a = high_b = high_c = most = np.int64(-1)
+    spread[:] = 0
     m = 0
     for e in range(n):
         w = word[e]
@@ -361,25 +420,46 @@ def _describe(word, count, n, corner, partition, spread, low, high):
             low_a, low_b, low_c = min(low_a, a), min(low_b, b), min(low_c, c)
             high_a, high_b, high_c, most = max(high_a, a), max(high_b, b), max(high_c, c), max(most, w & 0xFFFF)
             m += 1
-    low[0], low[1], low[2] = low_a, low_b, low_c
+    low[0], low[1], low[2], low[3] = low_a, low_b, low_c, 0
     high[0], high[1], high[2], high[3] = high_a, high_b, high_c, most
     return m
 
 
-@parallel
-def scatter_words(word, count, partition, room, entries, offset, low, shift, out_word, out_count):
-    """Order entries by partition, words packed to the frame's extent: bits `shift` upwards hold a, b, c, then label."""
-    for band in nb.prange(entries.shape[0]):
-        cursor = offset[:, band].copy()
-        for e in range(band * room, band * room + entries[band]):
-            a, b, c = _coordinates(word[e])
-            at = cursor[partition[e]]
-            cursor[partition[e]] = at + 1
-            out_word[at] = (
-                ((a - low[0]) << shift[0]) | ((b - low[1]) << shift[1]) | ((c - low[2]) << shift[2])
-                | (word[e] & 0xFFFF)
-            )  # fmt: skip
-            out_count[at] = count[e]
+@serial
+def offsets_of(spread):
+    """Return where entries go that are ordered by partition, then by band, of so many (bands, PARTITIONS).
+
+    Returns the first of each band in each partition (bands, PARTITIONS), and of each partition, and the end.
+    """
+    offset, edges = np.empty_like(spread), np.empty(PARTITIONS + 1, np.int64)
+    so_far = np.int64(0)
+    for p in range(PARTITIONS):
+        edges[p] = so_far
+        for band in range(spread.shape[0]):
+            offset[band, p] = so_far
+            so_far += spread[band, p]
+    edges[PARTITIONS] = so_far
+    return offset, edges
+
+
+@serial
+def _layout(low, high):
+    """Return how words are packed to the extent of all bands (bands, 4): lowest a, b, c and 0, and positions (4,).
+
+    Label, c, b and a take as many bits as they need, upwards; the positions are those of a, b and c, and of the end.
+    """
+    lowest, shift, bits = np.empty(4, np.int64), np.empty(4, np.int64), 0
+    for part in range(3, -1, -1):
+        least, most = low[0, part], high[0, part]
+        for band in range(low.shape[0]):
+            least, most = min(least, low[band, part]), max(most, high[band, part])
+        lowest[part], shift[part] = least, bits
+        width = 1
+        while (most - least) >> width > 0:
+            width += 1
+        bits += width
+    shift[3] = bits
+    return lowest, shift
 
 
 @serial
@@ -410,29 +490,49 @@ def _sort(word, count, word2, count2, bits, histogram):
 
 
 @parallel
-def merge_words(word, count, word2, count2, edges, bits, label_bits, flipped, voxels, left):
-    """Sort each partition and add up equal words; numbers of voxels and of entries that are left."""
+def merge_words(band_word, band_count, partition, room, entries, spread, low, high, word, count, word2, count2):
+    """Order the bands' entries by partition and word, and add up equal ones.
+
+    Returns the first entry of each partition, and whether it is in the second pair; the first of its voxels and of its
+    entries when the gaps are closed; and how words are packed, see `_layout`.
+    """
+    offset, edges = offsets_of(spread)
+    lowest, shift = _layout(low, high)
+    for band in nb.prange(entries.shape[0]):
+        cursor = offset[band]
+        for e in range(band * room, band * room + entries[band]):
+            a, b, c = _coordinates(band_word[e])
+            at = cursor[partition[e]]
+            cursor[partition[e]] = at + 1
+            word[at] = (
+                ((a - lowest[0]) << shift[0]) | ((b - lowest[1]) << shift[1]) | ((c - lowest[2]) << shift[2])
+                | (band_word[e] & 0xFFFF)
+            )  # fmt: skip
+            count[at] = band_count[e]
+    flipped = np.empty(PARTITIONS, np.bool_)
+    voxels, left = np.empty(PARTITIONS, np.int64), np.empty(PARTITIONS, np.int64)
     for p in nb.prange(PARTITIONS):
-        low, high = edges[p], edges[p + 1]
+        start, end = edges[p], edges[p + 1]
         histogram = np.empty(1 << DIGIT_BITS, np.int32)
-        flipped[p] = _sort(word[low:high], count[low:high], word2[low:high], count2[low:high], bits, histogram)
-        w, c = (word2[low:high], count2[low:high]) if flipped[p] else (word[low:high], count[low:high])
+        flipped[p] = _sort(word[start:end], count[start:end], word2[start:end], count2[start:end], shift[3], histogram)
+        w, c = (word2[start:end], count2[start:end]) if flipped[p] else (word[start:end], count[start:end])
         n = v = 0
         voxel = np.int64(-1)
-        for i in range(high - low):
+        for i in range(end - start):
             if n > 0 and w[i] == w[n - 1]:
                 c[n - 1] += c[i]
                 continue
-            v += (w[i] >> label_bits) != voxel
-            voxel = w[i] >> label_bits
+            v += (w[i] >> shift[2]) != voxel
+            voxel = w[i] >> shift[2]
             w[n], c[n] = w[i], c[i]
             n += 1
         voxels[p], left[p] = v, n
+    return edges, flipped, bounds_of(voxels), bounds_of(left), lowest, shift
 
 
 @parallel
 def emit_voxels(
-    word, count, word2, count2, edges, flipped, bounds, entry_bounds, low, shift, corner, key, pixels, start, label,
+    word, count, word2, count2, edges, flipped, bounds, entry_bounds, lowest, shift, corner, key, pixels, start, label,
     weight,
 ):  # fmt: skip
     """Write the observations: close the gaps between partitions, and unpack the words."""
@@ -448,8 +548,8 @@ def emit_voxels(
                 voxel = packed >> shift[2]
                 v += 1
                 key[v] = _key_of(
-                    (packed >> shift[0]) + low[0], ((packed >> shift[1]) & b_mask) + low[1],
-                    ((packed >> shift[2]) & c_mask) + low[2], corner,
+                    (packed >> shift[0]) + lowest[0], ((packed >> shift[1]) & b_mask) + lowest[1],
+                    ((packed >> shift[2]) & c_mask) + lowest[2], corner,
                 )  # fmt: skip
                 pixels[v] = 0
                 start[v] = e
