@@ -40,7 +40,7 @@ def test_it_says_what_the_command_says(flights):
     run = semstab.run({
         "dataset": {"name": "city", "options": FLIGHT}, "frames": {"stop": FRAMES}, "scenes": ["scene0", "scene3"],
         "models": ["sim-flicker"],
-        "voxel_size": SIZE, "taxonomy": None, "check": None,
+        "voxel_size": SIZE, "taxonomy": None, "check": None, "check_geometry": False,
     })  # fmt: skip
     rows = [
         Summary.of(r.summary.frames, r.summary.table, r.statistics, r.image_space.compensated_flicker_percent)
