@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import functools
 import itertools
 import json
 import math
@@ -37,6 +38,7 @@ WORDS = (
     "--model", "sim-flicker", "--frames", ":10", "--check", "none", "--no-geometry-check", "--voxel-size", "1",
     *(word for key, value in CITY.items() for word in ("--option", f"{key}={value}")),
 )  # fmt: skip
+DATASET = datasets.open_dataset("city", CITY)
 FORMS = ("vspw", "etc", "ssp")
 
 
@@ -48,13 +50,10 @@ def run(request, tmp_path_factory):
     return request.param, folder / "out", done.stdout
 
 
-@pytest.fixture(scope="module")
-def dataset():
-    return datasets.open_dataset("city", CITY)
-
-
-def frames_of(scene, source):
-    """The frames with rows of the run's taxonomy."""
+@functools.cache
+def frames_of(name, source):
+    """The frames of a scene with rows of the run's taxonomy."""
+    scene = DATASET.scene(name)
     mapping = scene.label_space(source).mapping_to(LabelSpace.load("uavid7"))
     frames = [scene.frame(k, source) for k in range(10)]
     return [dataclasses.replace(frame, labels=mapping.labels(frame.labels, source)) for frame in frames]
@@ -78,12 +77,12 @@ def by_hand(flow, frames):
     return [metric.value for metric in every], [metric.value for metric in seen]
 
 
-def test_a_run_says_what_the_metrics_say_of_its_frames(run, dataset):
+def test_a_run_says_what_the_metrics_say_of_its_frames(run):
     flow, out, _ = run
     records = json.loads((out / "summary.json").read_text())["runs"]
     for record in records:
-        scene, found = dataset.scene(record["scene"]), record["video_measures"]
-        frames, truths = frames_of(scene, "sim-flicker"), frames_of(scene, "gt")
+        name, found = record["scene"], record["video_measures"]
+        frames, truths = frames_of(name, "sim-flicker"), frames_of(name, "gt")
         published, own, alone = VideoConsistency(8), VideoConsistency(8), SelfConsistency(8)
         for frame, truth in zip(frames, truths, strict=True):
             labelled = frame.predicted != 255
@@ -100,7 +99,7 @@ def test_a_run_says_what_the_metrics_say_of_its_frames(run, dataset):
         assert found["tc"] != found["tc_seen"]
 
 
-def test_the_table_has_each_scene_and_all_of_them_as_one_set_of_videos(run, dataset):
+def test_the_table_has_each_scene_and_all_of_them_as_one_set_of_videos(run):
     flow, out, said = run
     (table,) = (table for table in tables(load_result(out)) if table.name == "video_measures")
     first, second, total = to_json(table)["rows"]
@@ -109,7 +108,7 @@ def test_the_table_has_each_scene_and_all_of_them_as_one_set_of_videos(run, data
     together = TemporalConsistency(7, "etc")
     if flow == "depth":
         for name in ("scene0", "scene3"):
-            for a, b in itertools.pairwise(frames_of(dataset.scene(name), "sim-flicker")):
+            for a, b in itertools.pairwise(frames_of(name, "sim-flicker")):
                 motion, seen = flow_by_depth(a, b)
                 together.add(a.predicted, warp_labels(b.predicted, motion), seen)
         assert total["tc_seen_etc"] == pytest.approx(together.value)
