@@ -11,7 +11,7 @@ from scan_writers import Scan, predict_semantickitti, rigid, write_semantickitti
 IDS = np.array([10, 40, 50, 70])
 """Stored ids: car, road, building, vegetation."""
 
-SCANS, ROWS, COLUMNS = 10, 24, 360
+SCANS, ROWS, COLUMNS = 10, 24, 240
 
 TO_CAMERA = rigid((90.5, -89.6, 0.3), (-0.01, -0.06, -0.33))
 """Tr, nearly as KITTI's: a camera that looks where the LiDAR's x points."""

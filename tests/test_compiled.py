@@ -14,7 +14,6 @@ import pytest
 import semstab
 
 IMPORT = """
-import semstab.recording, semstab.statistics.loops.orders  # whatever is compiled is imported without an error
 from semstab.backends.numba_hash import NumbaHash
 from semstab.core.compiled import serial
 
@@ -23,6 +22,10 @@ def twice(x):
     return 2 * x
 
 assert twice(4) == 8
+"""
+
+ALL = """
+import semstab.recording, semstab.statistics.loops.orders  # whatever is compiled is imported without an error
 """
 
 RUN = """
@@ -39,7 +42,7 @@ def installed(tmp_path_factory) -> Path:
     shutil.copytree(Path(semstab.__file__).parent, site / "semstab", ignore=shutil.ignore_patterns("__pycache__"))
     for folder in [site, *(path for path in site.rglob("*") if path.is_dir())]:
         (folder / "__pycache__").write_text("")
-    (site / "program.py").write_text(IMPORT)
+    (site / "program.py").write_text(ALL + IMPORT)
     (site / "program_that_runs.py").write_text(IMPORT + RUN)
     return site
 

@@ -162,7 +162,8 @@ def test_filters_over_one_model_share_its_maps(scene, monkeypatch, shown):
     chains = [["ema:0.6"], ["vote:3"], ["guided:4", "threshold:0.6"]]
     models = [parse_predictor(file)] * shown + [parse_predictor(file, filters=chain) for chain in chains]
     out = scene.parent / "run"
-    found = run(predicted_config(models, None, {"dataset": dataset_of(scene), "voxel_size": 0.25}), out=out)
+    config = predicted_config(models, None, {"dataset": dataset_of(scene), "voxel_size": 0.25})
+    found = run(config, out=out, report=False)
     assert (scene.parent / "count").read_text() == "x" * 6
     base = "net" if shown else "net-ema-0.6-unfiltered"
     assert {path.name for path in (out / "predictions/flight/scores").iterdir()} == {base}

@@ -21,7 +21,7 @@ def result(tmp_path_factory):
 
 def labelled(folder, models, **settings):
     city = {"name": "city", "options": {"frames": 10, "width": 192, "height": 108}}
-    fixed = {"dataset": city, "scenes": ["scene0"], "check": None, "voxel_size": 0.4, "backends": ["numba"]}
+    fixed = {"dataset": city, "scenes": ["scene0"], "check": None, "voxel_size": 0.4, "check_geometry": False}
     semstab.run(semstab.load_config(overrides={**fixed, "models": models, **settings}), out=folder, report=False)
     return semstab.load_result(folder)
 

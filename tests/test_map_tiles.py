@@ -150,7 +150,7 @@ def series_of(folder):
         return [{key: row[key] for key in row if not key.endswith("_ms")} for row in csv.DictReader(file)]
 
 
-SETTINGS = {"check": "sample", "backends": ["numba"]}
+SETTINGS = {"check": "sample", "backends": ["numba"], "check_geometry": False}
 
 
 @pytest.fixture(scope="module")

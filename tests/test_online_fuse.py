@@ -50,7 +50,7 @@ def steady(city, classes):
 def test_a_generator_gives_what_a_run_gives(steady, city):
     run = semstab.run({
         "dataset": {"name": "city", "options": OPTIONS}, "scenes": ["scene0"], "models": ["sim-steady"],
-        "voxel_size": SIZE, "taxonomy": None, "exclude": {},
+        "voxel_size": SIZE, "taxonomy": None, "exclude": {}, "check": None, "check_geometry": False,
     })  # fmt: skip
     own, other = steady.record(), run.record()
     assert own.summary.table == other.summary.table

@@ -51,8 +51,7 @@ def test_it_is_called_by_the_name_of_its_class_and_checked(folder) -> None:
 
 
 def test_conform_takes_it_by_its_file(folder) -> None:
-    only = "--only", "pinhole", "--only", "gaps"
-    assert bench("conform", "fusion.py:Mine", *only, cwd=folder).stdout == "pinhole: the same\ngaps: the same\n"
+    assert bench("conform", "fusion.py:Mine", "--only", "pinhole", cwd=folder).stdout == "pinhole: the same\n"
     (folder / "fusion.py").write_text(ALIKE + TWICE, encoding="utf-8")
     assert "evidence" in bench("conform", "fusion.py:Mine", "--only", "pinhole", cwd=folder, code=3).stderr
 

@@ -731,7 +731,7 @@ def test_original_labels_need_the_cameras_of_the_photographs(tmp_path) -> None:
 # --- the real flight --------------------------------------------------------------------------------------------------
 
 
-@pytest.fixture
+@pytest.fixture(scope="module")
 def brighton() -> Path:
     data = Path(os.environ.get("SEMSTAB_DATA", Path(__file__).parents[1] / "../shared/data"))
     if not (data / "brighton").is_dir():
@@ -739,9 +739,24 @@ def brighton() -> Path:
     return data / "brighton"
 
 
-def test_the_project_of_a_real_flight_is_its_posed_folder(brighton) -> None:
-    casts = {"casts": False, "images": brighton / "color"}
-    project = open_dataset("odm", {"root": brighton / "odm"} | casts).scene("odm")
+@pytest.fixture(scope="module")
+def project(brighton):
+    return open_dataset("odm", {"root": brighton / "odm", "casts": False, "images": brighton / "color"}).scene("odm")
+
+
+@pytest.fixture(scope="module")
+def project_map(project):
+    return map_of(project)
+
+
+def map_of(scene):
+    backend = create("numba", voxel_size=1.0, num_classes=2)
+    for k in (0, 3, 5, 11):
+        backend.integrate(scene.geometry(k).every(3))
+    return backend.table()
+
+
+def test_the_project_of_a_real_flight_is_its_posed_folder(brighton, project) -> None:
     folder = open_dataset("posed_folder", {"root": brighton}).scene("brighton")
     assert project.georeference.offset == down.OFFSET
     assert [project.image_name(k) for k in range(18)] == [folder.image_name(k) for k in range(18)]
@@ -756,7 +771,7 @@ def test_the_project_of_a_real_flight_is_its_posed_folder(brighton) -> None:
 
 
 @pytest.mark.parametrize("known", ["matrix", "poses in the projection"])
-def test_the_real_flight_in_a_turned_frame_lies_where_it_lay(brighton, tmp_path, known, caplog) -> None:
+def test_the_real_flight_in_a_turned_frame_lies_where_it_lay(brighton, project, tmp_path, known, caplog) -> None:
     """Poses and mesh turned by 0.73 degrees and shifted by 24 m: what is exported is the same to a millimetre."""
     folder = tmp_path / "flight"
     shutil.copytree(brighton / "odm", folder)
@@ -767,7 +782,7 @@ def test_the_real_flight_in_a_turned_frame_lies_where_it_lay(brighton, tmp_path,
     if known == "matrix":
         bring_into(folder, T)
     images = {"casts": False, "images": brighton / "color"}
-    there = open_dataset("odm", {"root": brighton / "odm"} | images).scene("odm")
+    there = project
     here = open_dataset("odm", {"root": folder} | images).scene("flight")
     assert here.georeference.turned is (known == "matrix")
     assert ("left from another version" in caplog.text) is (known != "matrix")
@@ -781,9 +796,10 @@ def test_the_real_flight_in_a_turned_frame_lies_where_it_lay(brighton, tmp_path,
 
 
 @pytest.mark.parametrize("write", [ds.write_nvm, ds.write_bundle])
-def test_the_real_flight_exported_by_opensfm_has_the_voxels_of_its_project(brighton, tmp_path, write) -> None:
+def test_the_real_flight_exported_by_opensfm_has_the_voxels_of_its_project(
+    brighton, project, project_map, tmp_path, write
+) -> None:
     casts = {"casts": False, "images": brighton / "color"}
-    project = open_dataset("odm", {"root": brighton / "odm"} | casts).scene("odm")
     folder = tmp_path / "flight"
     shutil.copytree(brighton / "odm", folder)
     for path in (folder, *folder.rglob("*")):
@@ -793,13 +809,7 @@ def test_the_real_flight_exported_by_opensfm_has_the_voxels_of_its_project(brigh
     poses = {f"{project.frame_name(k)}.JPG.tif": np.linalg.inv(project.T_wc(k)) for k in range(len(project))}
     write(folder / "opensfm", poses, first.intrinsics.fx)
     exported = open_dataset("odm", {"root": folder} | casts).scene("flight")
-    tables = []
-    for scene in (project, exported):
-        backend = create("numba", voxel_size=1.0, num_classes=2)
-        for k in (0, 3, 5, 11):
-            backend.integrate(scene.geometry(k).every(3))
-        tables.append(backend.table())
-    theirs, ours = tables
+    theirs, ours = project_map, map_of(exported)
     assert len(theirs) > 1000
     np.testing.assert_array_equal(ours.index, theirs.index)
     np.testing.assert_array_equal(ours.op, theirs.op)

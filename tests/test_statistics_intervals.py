@@ -184,7 +184,7 @@ def test_a_worse_map_differs_and_what_pairs_share_does_not_blur_it():
 
 
 @pytest.mark.parametrize(("flight", "scope"), [
-    (Flight(side=64, reach=2.0), THESE_FRAMES), (Flight(24, 1.5, 1.0, 40, 40, "lasting"), THIS_SCENE),
+    (Flight(side=64, reach=2.0), THESE_FRAMES), (Flight(24, 1.5, 1.0, 24, 24, "lasting"), THIS_SCENE),
     (Flight(32, 2.0, 1.0, 40, 5, "lasting"), OTHER_SCENES),
 ])  # fmt: skip
 def test_intervals_hold_their_target(flight, scope):

@@ -6,6 +6,7 @@ import re
 import runpy
 import shlex
 import shutil
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -108,9 +109,13 @@ def test_the_recipes_for_trackers_log_scalars_report_and_map(tmp_path, monkeypat
     assert artifacts == {"report.html", "stability.png"}
 
 
-def test_training_with_the_metric_tells_stability_from_miou(tmp_path, monkeypatch):
+def test_training_with_the_metric_tells_stability_from_miou(tmp_path, monkeypatch, request):
     """The page's blocks, and its example with smaller images: alpha rises by much while mIoU rises little."""
+    import torch
+
     monkeypatch.chdir(tmp_path)
+    request.addfinalizer(partial(torch.set_num_threads, torch.get_num_threads()))
+    torch.set_num_threads(1)  # so small are the images that further ones wait most of their time
     for text in python_blocks("training-loop.md"):
         exec(compile(text, "training-loop.md", "exec"), {})
     assert (tmp_path / "flicker.html").stat().st_size > 100_000

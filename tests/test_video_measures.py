@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import functools
 import itertools
 import json
 import math
@@ -31,7 +32,13 @@ from semstab.metrics import (
 )
 from semstab.report.tables import tables, to_json
 
-CITY = {"frames": 200, "width": 160, "height": 90}
+WIDTH, HEIGHT = 128, 72
+CITY = {"frames": 200, "width": WIDTH, "height": HEIGHT}
+WORDS = (
+    "--model", "sim-flicker", "--frames", ":10", "--check", "none", "--no-geometry-check", "--voxel-size", "1",
+    *(word for key, value in CITY.items() for word in ("--option", f"{key}={value}")),
+)  # fmt: skip
+DATASET = datasets.open_dataset("city", CITY)
 FORMS = ("vspw", "etc", "ssp")
 
 
@@ -39,26 +46,14 @@ FORMS = ("vspw", "etc", "ssp")
 def run(request, tmp_path_factory):
     """Both scenes of the city, by the command line."""
     folder = tmp_path_factory.mktemp(request.param)
-    options = [word for key, value in CITY.items() for word in ("--option", f"{key}={value}")]
-    words = (
-        "--model",
-        "sim-flicker",
-        "--frames",
-        ":10",
-        "--video-measures",
-        request.param,
-        "--out",
-        "out",
-        "--check",
-        "none",
-        *options,
-    )
-    done = bench("run", "--video-measures", request.param, *words, cwd=folder)
+    done = bench("run", "--video-measures", request.param, *WORDS, "--out", "out", cwd=folder)
     return request.param, folder / "out", done.stdout
 
 
-def frames_of(scene, source):
-    """The frames with rows of the run's taxonomy."""
+@functools.cache
+def frames_of(name, source):
+    """The frames of a scene with rows of the run's taxonomy."""
+    scene = DATASET.scene(name)
     mapping = scene.label_space(source).mapping_to(LabelSpace.load("uavid7"))
     frames = [scene.frame(k, source) for k in range(10)]
     return [dataclasses.replace(frame, labels=mapping.labels(frame.labels, source)) for frame in frames]
@@ -73,8 +68,8 @@ def by_hand(flow, frames):
         else:
             motion = image_flow(a.color, b.color)
             visible = ~occluded(motion, image_flow(b.color, a.color))
-        x, y = np.rint(np.arange(160) + motion[..., 0]), np.rint(np.arange(90)[:, None] + motion[..., 1])
-        inside = (x >= 0) & (x < 160) & (y >= 0) & (y < 90)
+        x, y = np.rint(np.arange(WIDTH) + motion[..., 0]), np.rint(np.arange(HEIGHT)[:, None] + motion[..., 1])
+        inside = (x >= 0) & (x < WIDTH) & (y >= 0) & (y < HEIGHT)
         warped = warp_labels(b.predicted, motion)
         for all_pixels, not_hidden in zip(every, seen, strict=True):
             all_pixels.add(a.predicted, warped, inside)
@@ -85,14 +80,13 @@ def by_hand(flow, frames):
 def test_a_run_says_what_the_metrics_say_of_its_frames(run):
     flow, out, _ = run
     records = json.loads((out / "summary.json").read_text())["runs"]
-    dataset = datasets.open_dataset("city", CITY)
     for record in records:
-        scene, found = dataset.scene(record["scene"]), record["video_measures"]
-        frames, truths = frames_of(scene, "sim-flicker"), frames_of(scene, "gt")
+        name, found = record["scene"], record["video_measures"]
+        frames, truths = frames_of(name, "sim-flicker"), frames_of(name, "gt")
         published, own, alone = VideoConsistency(8), VideoConsistency(8), SelfConsistency(8)
         for frame, truth in zip(frames, truths, strict=True):
             labelled = frame.predicted != 255
-            published.add(frame.predicted, np.ones((90, 160), bool), truth.predicted)
+            published.add(frame.predicted, np.ones((HEIGHT, WIDTH), bool), truth.predicted)
             own.add(frame.predicted, labelled & (truth.predicted != 255), truth.predicted)
             alone.add(frame.predicted, labelled)
         pairs = (("vc8_published", published.published), ("vc8", own.value), ("self_vc8", alone.value))
@@ -111,10 +105,10 @@ def test_the_table_has_each_scene_and_all_of_them_as_one_set_of_videos(run):
     first, second, total = to_json(table)["rows"]
     assert (first["scene"], second["scene"], total["scene"]) == ("scene0", "scene3", "All videos")
     assert ("by depth and pose" if flow == "depth" else "by optical flow between the images") in table.caption
-    together, dataset = TemporalConsistency(7, "etc"), datasets.open_dataset("city", CITY)
+    together = TemporalConsistency(7, "etc")
     if flow == "depth":
         for name in ("scene0", "scene3"):
-            for a, b in itertools.pairwise(frames_of(dataset.scene(name), "sim-flicker")):
+            for a, b in itertools.pairwise(frames_of(name, "sim-flicker")):
                 motion, seen = flow_by_depth(a, b)
                 together.add(a.predicted, warp_labels(b.predicted, motion), seen)
         assert total["tc_seen_etc"] == pytest.approx(together.value)
@@ -125,8 +119,7 @@ def test_the_table_has_each_scene_and_all_of_them_as_one_set_of_videos(run):
 
 
 def test_without_the_switch_there_is_no_such_table(tmp_path):
-    bench("--model", "sim-flicker", "--frames", ":2", "--scene", "scene0", "--out", "out", "--check", "none",
-          *(word for key, value in CITY.items() for word in ("--option", f"{key}={value}")), cwd=tmp_path)  # fmt: skip
+    bench("run", *WORDS, "--frames", ":2", "--scene", "scene0", "--out", "out", cwd=tmp_path)
     (record,) = load_result(tmp_path / "out").select()
     assert record.video_measures is None
     assert "video_measures" not in [table.name for table in tables(load_result(tmp_path / "out"))]
@@ -134,9 +127,8 @@ def test_without_the_switch_there_is_no_such_table(tmp_path):
 
 def test_a_map_in_tiles_has_the_same(run, tmp_path):
     flow, out, _ = run
-    options = [word for key, value in CITY.items() for word in ("--option", f"{key}={value}")]
-    words = ("--model", "sim-flicker", "--scene", "scene0", "--frames", ":10", "--check", "none", *options)
-    bench("run", "--video-measures", flow, *words, "--tile-size", "64", "--out", "tiled", cwd=tmp_path)
+    words = (*WORDS, "--scene", "scene0", "--tile-size", "64", "--out", "tiled")
+    bench("run", "--video-measures", flow, *words, cwd=tmp_path)
     (tiled,) = load_result(tmp_path / "tiled").select()
     assert tiled.in_tiles
     assert repr(tiled.video_measures) == repr(load_result(out).select(scene="scene0")[0].video_measures)
