@@ -2,6 +2,10 @@
 
 from __future__ import annotations
 
+import argparse
+import contextlib
+import importlib
+import io
 import json
 import logging
 import runpy
@@ -14,10 +18,10 @@ import pytest
 BENCHMARKS = Path(__file__).parents[1] / "benchmarks"
 SMALL = {
     "fusion": ("96x54", "--sizes 96x54 --rounds 1 --conditions", "noise 0.3 %"),
-    "random_scenes": ("worst", "--sizes 96x54 --scenes 2 --noise 0.3 --many 1"),
+    "random_scenes": ("worst", "--sizes 96x54 --scenes 1 --noise 0.3 --many 1 --rounds 1"),
     "scaling": ("96x54", "--size 96x54 --voxels 1000 5000"),
     "casting": ("96x54", "--size 96x54 --triangles 200 --rounds 1"),
-    "end_to_end": ("96x54", "--size 96x54 --frames 3 --runs 1 --noise 0 --backend numpy --depth png"),
+    "end_to_end": ("96x54", "--size 96x54 --frames 2 --runs 1 --noise 0 --voxel-size 1 --backend numpy --depth png"),
     "gpu": ("96x54", "--device CPU:0 --sizes 96x54 --classes 3 --voxels 9000 --rounds 2 --copied-megabytes 1 "
             "--cpu-backends numba"),
     "statistics": ("all statistics", "--frames 4 --size 64x48 --voxel-size 0.2"),
@@ -39,7 +43,7 @@ def test_a_benchmark_prints_its_table_and_writes_it(name, tmp_path, capsys, monk
 
 def test_the_benchmark_of_whole_runs_prints_its_tables() -> None:
     """In a process of its own, as it sets the threads of numba, which can be done but once."""
-    words = ["--frames", "3", "--size", "32x24", "--voxel-size", "0.4", "--runs", "1"]
+    words = ["--frames", "2", "--size", "32x24", "--voxel-size", "0.8", "--runs", "1"]
     command = [sys.executable, str(BENCHMARKS / "bench_run.py"), *words]
     done = subprocess.run(command, capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr
@@ -70,16 +74,39 @@ print(json.dumps({"ms": [1.0] * int(frames), "bytes": 0, "peak_bytes": 0}))
 """A program that fuses by truncation towards zero, and keeps the last label."""
 
 
-def test_the_benchmark_of_rivals_compares_a_program_of_the_user(tmp_path) -> None:
+def called(name: str, words: list[str], monkeypatch) -> None:
+    """Call a script's main in this process."""
+    monkeypatch.setattr(logging.getLogger("semstab"), "setLevel", lambda level: None)  # it would stay for other tests
+    monkeypatch.setattr(sys, "argv", [name, *words])
+    imported(name, monkeypatch).main()
+
+
+def imported(name: str, monkeypatch):
+    monkeypatch.syspath_prepend(str(BENCHMARKS))
+    return importlib.import_module(name)
+
+
+def test_the_benchmark_of_rivals_compares_a_program_of_the_user(tmp_path, capsys, monkeypatch) -> None:
+    """Two of our own programs, which import most, run in this process; the third one and the rival are processes."""
+    rivals = imported("bench_rivals", monkeypatch)
+    start = rivals.run
+
+    def run(command, files):
+        if command[-1] not in ("open3d", "images"):
+            return start(command, files)
+        size = argparse.Namespace(size="64x48", frames=2, classes=7, voxel_size=0.2)
+        with contextlib.redirect_stdout(io.StringIO()) as said:
+            rivals.fuse(command[-1], *files, size)
+        return json.loads(said.getvalue())
+
+    monkeypatch.setattr(rivals, "run", run)
     program, file = tmp_path / "truncating.py", tmp_path / "figures.json"
     program.write_text(TRUNCATING)
     (tmp_path / "COMMIT").write_text("abc123\n")
     words = ["--size", "64x48", "--frames", "2", "--voxel-size", "0.2", "--json", str(file)]
     words += ["--rival", f"last={sys.executable} {program}", "--commit", f"last={tmp_path}"]
-    command = [sys.executable, str(BENCHMARKS / "bench_rivals.py"), *words]
-    done = subprocess.run(command, capture_output=True, text=True, check=False)
-    assert done.returncode == 0, done.stderr
-    assert "last: abc123" in done.stdout
+    called("bench_rivals", words, monkeypatch)
+    assert "last: abc123" in capsys.readouterr().out
     rows = {row["name"]: row for row in json.loads(file.read_text())["rows"]}
     ours, images, last = rows["semstab numba"], rows["semstab numba, depth images"], rows["last"]
     assert ours["missing"] == ours["extra"] == ours["label_differs"] == 0
@@ -88,15 +115,14 @@ def test_the_benchmark_of_rivals_compares_a_program_of_the_user(tmp_path) -> Non
     assert 0 < last["label_differs"] < 0.5
 
 
-def test_the_benchmark_of_growth_prints_its_exponents_and_draws_them(tmp_path) -> None:
-    """In a process of its own, as it starts others."""
+def test_the_benchmark_of_growth_prints_its_exponents_and_draws_them(tmp_path, capsys, monkeypatch) -> None:
     words = [
         "--size",
         "96x54",
         "--frames",
         "1",
         "--voxels",
-        "500",
+        "4000",
         "--classes",
         "2",
         "--times",
@@ -105,8 +131,6 @@ def test_the_benchmark_of_growth_prints_its_exponents_and_draws_them(tmp_path) -
         "--growing",
         "voxels",
     ]
-    command = [sys.executable, str(BENCHMARKS / "bench_growth.py"), *words, "--figure", str(tmp_path / "growth.png")]
-    done = subprocess.run(command, capture_output=True, text=True, check=False)
-    assert done.returncode == 0, done.stderr
-    assert "exponent" in done.stdout
+    called("bench_growth", [*words, "--figure", str(tmp_path / "growth.png")], monkeypatch)
+    assert "exponent" in capsys.readouterr().out
     assert (tmp_path / "growth.png").stat().st_size

@@ -48,6 +48,12 @@ def folder(tmp_path_factory):
 
 
 @pytest.fixture(scope="module")
+def short(tmp_path_factory):
+    """The scene's first five frames."""
+    return write(tmp_path_factory.mktemp("data") / "room", Room(walk(5)))
+
+
+@pytest.fixture(scope="module")
 def sound(folder):
     (checked,) = check(configure(folder, voxel_size=0.1))
     return checked
@@ -118,11 +124,11 @@ def test_a_plane_has_no_residual():
     assert residuals.max() < 1e-5
 
 
-def test_suggestions_follow_from_the_data():
+def test_suggestions_follow_from_the_data(sound):
     def thick(frames):
         return of_memory(Room([walk(12)[k // 5] for k in range(frames)])).suggestion
 
-    fine, noisy = of_memory(Room()).suggestion, of_memory(Room(noise=0.03)).suggestion
+    fine, noisy = sound.suggestion, of_memory(Room(noise=0.03)).suggestion
     assert fine.voxel_size in SIZES
     assert fine.voxel_size < noisy.voxel_size
     assert noisy.pixel_stride >= fine.pixel_stride >= 1
@@ -132,10 +138,11 @@ def test_suggestions_follow_from_the_data():
     assert "share" in slow.suggestion.frame_stride_reason
 
 
-def test_voxels_too_small_to_count_are_left_out(folder):
-    (checked,) = check(configure(folder, voxel_size=1e-9))
+def test_voxels_too_small_to_count_are_left_out(short):
+    (checked,) = check(configure(short, voxel_size=1e-9))
     assert (checked.verdict.state, checked.persistence) == ("sound", ())
-    result = bench("check", "--data", folder, "--voxel-size", 1e-9)
+    result = bench("check", "--data", short, "--voxel-size", 1e-9)
+    assert "SOUND" in result.stdout
     assert "observation persistence" not in result.stdout
 
 
@@ -219,7 +226,7 @@ def test_labels_that_were_begun_only_stop_nobody_else(tmp_path):
 
 
 def test_unknown_classes_are_a_problem_beside_the_geometry(tmp_path):
-    folder = write(tmp_path / "room")
+    folder = write(tmp_path / "room", Room(walk(5)))
     (folder / "scene.yaml").write_text("")
     (checked,) = check(configure(folder))
     assert checked.verdict.state == "sound"
@@ -259,14 +266,14 @@ def test_a_selection_that_does_not_fit_is_refused(folder):
 # --- the command
 
 
-def test_the_tables_fit_80_columns_and_the_numbers_go_to_a_file(folder, tmp_path):
+def test_the_tables_fit_80_columns_and_the_numbers_go_to_a_file(folder, short, tmp_path):
     file = tmp_path / "check.json"
     result = bench("check", "--data", folder, "--json", file, "--voxel-size", 0.1, "--verbose")
     assert result.exit_code == 0, result.stderr
     assert max(map(len, result.stdout.splitlines())) <= 80
     for word in ("as configured", "frames apart", "OP=1", "labels, % of the pixels", "--voxel-size", "SOUND"):
         assert word in result.stdout
-    plain = bench("check", "--data", folder, "--voxel-size", 0.1).stdout
+    plain = bench("check", "--data", short, "--voxel-size", 0.1).stdout
     assert "SOUND" in "".join(plain.splitlines()[:3])
     assert len(plain.splitlines()) <= 24
     content = json.loads(file.read_text(), parse_constant=lambda text: pytest.fail(f"{text} in JSON"))
@@ -275,11 +282,11 @@ def test_the_tables_fit_80_columns_and_the_numbers_go_to_a_file(folder, tmp_path
     assert {row["name"] for row in scene["verdict"]["fits"]} >= {"as configured", "camera_axes: opengl"}
     assert scene["persistence"][1]["voxel_size"] == 0.1
     assert scene["overlaps"][0]["error"] < 0.01
-    assert bench("check", "--data", folder, "--quiet").output == ""
+    assert bench("check", "--data", short, "--quiet").output == ""
 
 
 def test_unsound_data_are_exit_2_with_one_line_that_says_what_mends_it(tmp_path):
-    folder = write(tmp_path / "room", Room(told_pose=lambda T: T @ AXES["opengl"]))
+    folder = write(tmp_path / "room", Room(walk(6), told_pose=lambda T: T @ AXES["opengl"]))
     result = bench("check", "--data", folder)
     assert result.exit_code == 2
     (line,) = result.stderr.strip().splitlines()
@@ -364,9 +371,9 @@ def test_wrong_options_are_one_line(arguments, message):
     assert len(result.stderr.strip().splitlines()) == 1
 
 
-def test_a_file_that_cannot_be_written_is_one_line(folder, tmp_path):
+def test_a_file_that_cannot_be_written_is_one_line(short, tmp_path):
     (tmp_path / "file").write_text("")
-    result = bench("check", "--data", folder, "--json", tmp_path / "file/check.json", "-q")
+    result = bench("check", "--data", short, "--json", tmp_path / "file/check.json", "-q")
     assert result.exit_code == 2
     assert len(result.stderr.strip().splitlines()) == 1
 
@@ -376,7 +383,7 @@ def test_a_file_that_cannot_be_written_is_one_line(folder, tmp_path):
 
 def test_a_run_refuses_unsound_data_unless_told_otherwise(tmp_path):
     folder = write(tmp_path / "room", Room(walk(5), told_pose=np.linalg.inv))
-    config = configure(folder, models=["net"], check=None)
+    config = configure(folder, models=["net"], check=None, voxel_size=0.2)
     with pytest.raises(DataError, match=r"room: depth reprojects .* pose_convention: world_to_camera"):
         semstab.run(config, out=tmp_path / "run", report=False)
     assert not list((tmp_path / "run").rglob("*.parquet"))
@@ -386,7 +393,7 @@ def test_a_run_refuses_unsound_data_unless_told_otherwise(tmp_path):
     ).runs  # the same folder: the numbers do not depend on it
     assert run.table.voxels > 0
     assert "check" not in json.loads((tmp_path / "run/manifest.json").read_text())["seconds"]
-    arguments = ("--data", folder, "-b", "numpy", "--rerun", "off", "-q", "--out")
+    arguments = ("--data", folder, "-b", "numpy", "--rerun", "off", "--report", "off", "-q", "--out")
     refused = bench("run", *arguments, tmp_path / "other")
     assert refused.exit_code == 2
     assert len(refused.stderr.strip().splitlines()) == 1
@@ -395,7 +402,7 @@ def test_a_run_refuses_unsound_data_unless_told_otherwise(tmp_path):
 
 def test_a_study_refuses_unsound_data_unless_told_otherwise(tmp_path):
     folder = write(tmp_path / "room", Room(walk(5), told_pose=np.linalg.inv))
-    content = {"dataset": dataset_of(folder), "backends": ["numpy"]}
+    content = {"dataset": dataset_of(folder), "backends": ["numba"], "voxel_size": 0.2}
     file = tmp_path / "room.yaml"
     file.write_text(yaml.safe_dump(content | {"models": ["net"]}))
     refused = bench("study", file, "--out", tmp_path / "study", "-q")
@@ -403,7 +410,9 @@ def test_a_study_refuses_unsound_data_unless_told_otherwise(tmp_path):
     assert "pose_convention: world_to_camera" in refused.stderr
     assert len(refused.stderr.strip().splitlines()) == 1
     assert not list((tmp_path / "study/units").glob("*.json"))
-    assert bench("study", file, "--out", tmp_path / "study", "-q", "--no-geometry-check").exit_code == 0
+    assert (
+        bench("study", file, "--out", tmp_path / "study", "-q", "--no-geometry-check", "--report", "off").exit_code == 0
+    )
     assert json.loads((tmp_path / "study/manifest.json").read_text())["geometry"] == {}
 
 
@@ -414,7 +423,7 @@ def test_the_manifest_says_what_was_found_and_what_it_cost(folder, tmp_path):
         def geometry_checked(self, task, verdict):
             seen.append((task.scene.name, verdict.state))
 
-    config = configure(folder, models=["net", "gt"])
+    config = configure(folder, models=["net", "gt"], check=None, voxel_size=0.2)
     semstab.run(config, out=tmp_path / "run", observers=[Watching()], report=False)
     manifest = json.loads((tmp_path / "run/manifest.json").read_text())
     assert manifest["geometry"]["room"]["state"] == "sound"
@@ -427,7 +436,8 @@ def test_the_manifest_says_what_was_found_and_what_it_cost(folder, tmp_path):
 
 def test_what_cannot_be_told_does_not_stop_a_run(tmp_path):
     folder = write(tmp_path / "room", Room(walk(1)))
-    result = bench("run", "--data", folder, "-b", "numpy", "--rerun", "off", "--out", tmp_path / "run", width=200)
+    words = ("--data", folder, "-b", "numpy", "--rerun", "off", "--report", "off", "--out", tmp_path / "run")
+    result = bench("run", *words, width=200)
     assert result.exit_code == 0
     assert "room: it takes two frames to tell whether depth and poses agree" in result.stderr
     state = json.loads((tmp_path / "run/manifest.json").read_text())["geometry"]["room"]

@@ -26,14 +26,21 @@ def words(result) -> str:
 
 
 @pytest.mark.parametrize(("by", "side", "mend"), [(1, "early", -1), (-1, "late", 1)])
-def test_whole_frames_are_named_refused_and_mended(by, side, mend, frames, tmp_path):
-    poses = doctor.poses_of(by)(frames)
+def test_whole_frames_are_named_with_what_mends_them(by, side, mend, frames):
+    verdict = quick_check(doctor.Made(doctor.poses_of(by)(frames)), range(len(frames)))
+    assert verdict.state == "unsound"
+    assert f"poses are one frame {side}" in verdict.text
+    assert f"pose_shift: {mend}" in verdict.text
+
+
+def test_they_are_refused_by_check_and_run_and_mended(frames, tmp_path):
+    poses = doctor.poses_of(-1)(frames)
     folder = write_posed(tmp_path / "room", NAMES, {"net": poses}, scale=None, classes=list(doctor.SPACE.classes))
     for name in ("check", "run"):
         result = bench(name, "--data", folder, cwd=tmp_path, code=2)
-        assert f"poses are one frame {side}" in words(result)
-        assert f"pose_shift: {mend}" in words(result)
-    mended = bench("check", "--data", folder, "--option", f"pose_shift={mend}", cwd=tmp_path)
+        assert "poses are one frame late" in words(result)
+        assert "pose_shift: 1" in words(result)
+    mended = bench("check", "--data", folder, "--option", "pose_shift=1", cwd=tmp_path)
     assert "poses are" not in words(mended)
 
 
@@ -83,11 +90,10 @@ def test_a_part_of_a_frame_is_measured_to_a_tenth(late, frames, tmp_path):
     assert not any(text.startswith("poses are") for text in (*mended.remarks, mended.text))
 
 
-def test_clean_poses_are_silent(tmp_path):
-    for seed in range(3):
-        made = doctor.Made(doctor.scene(seed))
-        verdict = quick_check(made, range(len(made)))
-        assert (verdict.state, verdict.remarks) == ("sound", ())
+def test_clean_poses_are_silent(frames):
+    """Those of two more scenes are so in test_check_mistakes.py."""
+    verdict = quick_check(doctor.Made(frames), range(len(frames)))
+    assert (verdict.state, verdict.remarks) == ("sound", ())
 
 
 @pytest.mark.parametrize(

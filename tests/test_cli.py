@@ -74,7 +74,7 @@ def test_list_names_what_there_is(tmp_path) -> None:
 
 def test_a_run_on_a_folder(wall, tmp_path) -> None:
     arguments = ("--backend", "open3d", "--data", wall, "--model", "a", "--voxel-size", "0.25", "--out", "run")
-    text = bench(*arguments, cwd=tmp_path, report=True, recording=True, process=True).stdout
+    text = bench(*arguments, cwd=tmp_path, report=True, recording=True).stdout
     for words in (
         "wall", "no verdict", "checked open3d against numpy on", "semstab-bench view run", "semstab-bench show run",
         "report  run/report.html",
@@ -204,7 +204,7 @@ def test_disagreement_is_exit_3_after_everything_is_written(wall, tmp_path) -> N
 
 
 def test_ctrl_c_is_exit_130_and_the_same_command_goes_on(tmp_path) -> None:
-    wall = tiny_scene.write(tmp_path / "wall", models=("a", "b"), frames=200)
+    wall = tiny_scene.write(tmp_path / "wall", models=("a", "b"), frames=100)
     arguments = ("--data", wall, "--backend", "numpy", "--voxel-size", "0.05", "--rerun", "off", "--out", "run")
     process = started(*arguments, cwd=tmp_path)
     units = tmp_path / "run" / "units"

@@ -84,7 +84,7 @@ def test_frames_are_fused_in_rounds() -> None:
 
 
 def test_random_cases_run_by_seed() -> None:
-    done = CliRunner().invoke(app, ["conform", f"{FUSE} numba", "--only", "random:17", "--random", "1"])
+    done = CliRunner().invoke(app, ["conform", f"{FUSE} numpy", "--only", "random:17", "--random", "1"])
     assert (done.exit_code, done.stdout) == (0, "random:17: the same\nrandom:0: the same\n")
 
 
@@ -93,8 +93,12 @@ def test_the_names_are_those_of_stored_cases_then_of_formulas() -> None:
     assert case_names()[-len(FORMULAS) :] == tuple(FORMULAS)
 
 
-def test_a_program_runs_through_the_command() -> None:
-    done = CliRunner().invoke(app, ["conform", f"{FUSE} numpy", "--only", "drift"])
+def test_a_program_runs_through_the_command(tmp_path) -> None:
+    (tmp_path / "program.py").write_text(
+        f"import pathlib, shutil, sys\nshutil.copy(pathlib.Path(sys.argv[1], {EXPECTED!r}), sys.argv[2])\n"
+    )
+    command = shlex.join([sys.executable, "-S", str(tmp_path / "program.py")])
+    done = CliRunner().invoke(app, ["conform", command, "--only", "drift"])
     assert (done.exit_code, done.stdout) == (0, "drift: the same\n")
 
 

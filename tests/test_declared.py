@@ -9,12 +9,12 @@ import sys
 from pathlib import Path
 
 STUDY = """
-dataset: {name: city}
+dataset: {name: city, options: {width: 96, height: 54}}
 scenes: [scene0]
 models: [sim-flicker]
 frames: {spacing: even, count: 5}
-voxel_size: 0.4
-sweeps: {voxel_size: [0.4, 0.8]}
+voxel_size: 0.8
+sweeps: {voxel_size: [0.8, 1.6]}
 backends: [numba]
 """
 PYTHON = """
@@ -40,12 +40,13 @@ else:
 
 
 def test_every_command_runs_with_the_declared_packages_alone(tmp_path: Path) -> None:
-    few = ["--frames", "::3", "--scene", "scene0", "--voxel-size", "0.4"]
+    small = ["--option", "width=96", "--option", "height=54"]
+    few = ["--frames", "::3", "--scene", "scene0", *small, "--voxel-size", "0.8"]
     (tmp_path / "study.yaml").write_text(STUDY)
     commands = [
         ["list"],
         ["run", "--backend", "open3d", *few, "--out", "a"],
-        ["check", *few[:4]],
+        ["check", *few[:-2]],
         ["compare", "a:sim-steady", "a:sim-flicker", "--out", "compared"],
         ["gate", "a:sim-steady", "--against", "a:sim-flicker", "--rule", "alpha > 0", "--undecided", "pass"],
         ["show", "a"],

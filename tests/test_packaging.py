@@ -25,7 +25,8 @@ PACKAGES = {
     **{folder: f"semstab/{folder}" for folder in ("backends", "models", "datasets", "configs", "conformance")},
 }
 Done = subprocess.CompletedProcess[str]
-FEW = ("--scene", "scene0", "--frames", "::8", "--voxel-size", "0.4")
+SMALL = ("--option", "width=96", "--option", "height=54")
+FEW = ("--scene", "scene0", "--frames", "::8", *SMALL, "--voxel-size", "0.8")
 BUILD = "import sys; from setuptools import build_meta; print(getattr(build_meta, sys.argv[1])(sys.argv[2]))"
 
 
@@ -119,7 +120,7 @@ def take_compiled(site: Path) -> None:
 def elsewhere(installed, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The folder in which the installed command has done its main job."""
     folder = tmp_path_factory.mktemp("elsewhere")
-    done = command(installed, folder, "--backend", "open3d", *FEW, "--out", "run")
+    done = command(installed, folder, "--backend", "open3d", "-m", "sim-flicker", *FEW, "--out", "run")
     assert done.returncode == 0, done.stderr
     return folder
 
