@@ -53,7 +53,9 @@ IGNORED = re.compile(
 )
 """Keys and columns of times, memory, versions and dates, and of paths and hashes, which hold the folder of a case."""
 
-SKIPPED = re.compile(r"(.*/)?((units|figures)/.*|(manifest|digests)\.json|.*\.(html|svg|rrd|zip|xml|log))")
+SKIPPED = re.compile(
+    r"(.*/)?((units|figures)/.*|(manifest|digests)\.json|fusion\.(md|tex)|.*\.(html|svg|rrd|zip|xml|log))"
+)
 """Files of pictures, which the tables beside them hold the numbers of, of hashes and times, and of units."""
 
 EXACT = ("voxels", "truth", "observations", "frames")
