@@ -494,7 +494,7 @@ def test_what_goes_wrong_beside_the_loop_is_said_and_the_file_is_closed(tmp_path
 def test_jobs_run_in_order_and_few_are_pending() -> None:
     done: list[int] = []
     stream = rr.RecordingStream("test")
-    thread = timeline.Background(stream, Clock())
+    thread = timeline.FrameJobs(stream, Clock())
     for number in range(20):
         thread.submit(number, None, functools.partial(done.append, number))
         assert number - len(done) <= timeline.MOST_PENDING

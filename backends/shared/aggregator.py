@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 import numba as nb
 import numpy as np
 
-from semstab.backends.shared import score_loops, tile_loops
+from semstab.backends.shared import merge_loops, score_loops, tile_loops
 from semstab.backends.shared.association import INDEX_LIMIT, back_project, check_frame, voxel_index
 from semstab.backends.shared.keys import HALF, PARTITIONS, index_of_keys, out_of_reach, partitions_of
 from semstab.backends.shared.observations import Observed, ObservedScores, WorkSpace
@@ -145,7 +145,7 @@ class Aggregator:
         space = self._space
         pairs = [(space.room(f"words {i}", total), space.room(f"counts {i}", total, dtype=np.int32)) for i in (0, 1)]
         word, count, partition, *bands = words
-        merged = tile_loops.merge_words(word, count, partition, room, *bands, *pairs[0], *pairs[1])
+        merged = merge_loops.merge_words(word, count, partition, room, *bands, *pairs[0], *pairs[1])
         _, _, bounds, entry_bounds, _, _ = merged
         n, m = int(bounds[-1]), int(entry_bounds[-1])
         seen = Observed(
@@ -156,7 +156,7 @@ class Aggregator:
             weight=space.room("weight", m, dtype=np.float64),
             bounds=bounds,
         )
-        tile_loops.emit_voxels(
+        merge_loops.emit_voxels(
             *pairs[0], *pairs[1], *merged, corner, seen.key, seen.pixels, seen.start, seen.label, seen.weight
         )  # fmt: skip
         return seen
@@ -241,7 +241,7 @@ class Aggregator:
     ) -> ObservedScores:
         """Add up the entries of each voxel, band after band."""
         space, total, K = self._space, int(entries.sum()), self.num_classes
-        offset, edges = tile_loops.offsets_of(spread)
+        offset, edges = merge_loops.offsets_of(spread)
         merged = [space.room(f"merged {name}", total) for name in ("key", "pixels", "row")]
         score_loops.scatter_rows(key, count, room, -(-K // LANES) * LANES, entries, offset, *merged)
         voxels = np.zeros(PARTITIONS, dtype=np.int64)

@@ -1,9 +1,8 @@
-"""Compiled loops from the labels of a frame to its observations, by tiles of the image, or stretches of a scan.
+"""Compiled loops from the labels of a frame to entries, by tiles of the image, or stretches of a scan.
 
 A pixel is one word: its voxel, counted from 2^15 below the camera's along each axis, and its label, 16 bits each; -1
 where it does not count. Pixels become runs of equal words along rows, runs of a tile entries in a small table that
-gives way on a collision, and entries are sorted and added up by partition of the map. All sums are of integers: the
-order in which they are made does not show.
+gives way on a collision; `merge_loops` sorts entries and adds them up.
 """
 
 from __future__ import annotations
@@ -16,7 +15,7 @@ from llvmlite import ir
 from numba.core import cgutils, types
 from numba.extending import intrinsic
 
-from semstab.backends.shared.keys import HALF, PARTITIONS, bounds_of, partition_of
+from semstab.backends.shared.keys import HALF, partition_of
 from semstab.backends.shared.pixel_keys import bits_of, exact_keys_of_points, exact_keys_of_row, touch
 from semstab.core.compiled import compiled, parallel, serial
 
@@ -97,7 +96,6 @@ POINTS = 1 << 14
 """Points of a band of a scan."""
 
 TABLE_BITS = 11
-DIGIT_BITS = 10
 
 GOLDEN = np.uint64(0x9E3779B97F4A7C15)
 SHIFT = np.uint64(64 - TABLE_BITS)
@@ -245,12 +243,14 @@ def _from_corner(key, corner):
 
 
 @serial
-def _coordinates(word):
+def coordinates(word):
+    """Return the coordinates of a word, 16 bits each."""
     return (word >> 48) & 0xFFFF, (word >> 32) & 0xFFFF, (word >> 16) & 0xFFFF
 
 
 @serial
-def _key_of(a, b, c, corner):
+def key_of(a, b, c, corner):
+    """Return the packed key of a word's coordinates."""
     return ((a + corner[0]) << 42) | ((b + corner[1]) << 21) | (c + corner[2])
 
 
@@ -413,8 +413,8 @@ def _describe(word, count, n, corner, partition, spread, low, high):
     for e in range(n):
         w = word[e]
         if w != -1:
-            a, b, c = _coordinates(w)
-            p = partition_of(_key_of(a, b, c, corner))
+            a, b, c = coordinates(w)
+            p = partition_of(key_of(a, b, c, corner))
             word[m], count[m], partition[m] = w, count[e], p
             spread[p] += 1
             low_a, low_b, low_c = min(low_a, a), min(low_b, b), min(low_c, c)
@@ -423,137 +423,3 @@ def _describe(word, count, n, corner, partition, spread, low, high):
     low[0], low[1], low[2], low[3] = low_a, low_b, low_c, 0
     high[0], high[1], high[2], high[3] = high_a, high_b, high_c, most
     return m
-
-
-@serial
-def offsets_of(spread):
-    """Return where entries go that are ordered by partition, then by band, of so many (bands, PARTITIONS).
-
-    Returns the first of each band in each partition (bands, PARTITIONS), and of each partition, and the end.
-    """
-    offset, edges = np.empty_like(spread), np.empty(PARTITIONS + 1, np.int64)
-    so_far = np.int64(0)
-    for p in range(PARTITIONS):
-        edges[p] = so_far
-        for band in range(spread.shape[0]):
-            offset[band, p] = so_far
-            so_far += spread[band, p]
-    edges[PARTITIONS] = so_far
-    return offset, edges
-
-
-@serial
-def _layout(low, high):
-    """Return how words are packed to the extent of all bands (bands, 4): lowest a, b, c and 0, and positions (4,).
-
-    Label, c, b and a take as many bits as they need, upwards; the positions are those of a, b and c, and of the end.
-    """
-    lowest, shift, bits = np.empty(4, np.int64), np.empty(4, np.int64), 0
-    for part in range(3, -1, -1):
-        least, most = low[0, part], high[0, part]
-        for band in range(low.shape[0]):
-            least, most = min(least, low[band, part]), max(most, high[band, part])
-        lowest[part], shift[part] = least, bits
-        width = 1
-        while (most - least) >> width > 0:
-            width += 1
-        bits += width
-    shift[3] = bits
-    return lowest, shift
-
-
-@serial
-def _sort(word, count, word2, count2, bits, histogram):
-    """Sort by the lowest `bits` bits, as many at a time as the histogram has room for; whether into the second pair."""
-    flipped = False
-    passes = -(-bits // DIGIT_BITS)
-    width = -(-bits // passes)
-    digits = 1 << width
-    for shift in range(0, bits, width):
-        if flipped:
-            source, source_count, target, target_count = word2, count2, word, count
-        else:
-            source, source_count, target, target_count = word, count, word2, count2
-        histogram[:digits] = 0
-        for i in range(source.shape[0]):
-            histogram[(source[i] >> shift) & (digits - 1)] += 1
-        total = 0
-        for digit in range(digits):
-            total, histogram[digit] = total + histogram[digit], total
-        for i in range(source.shape[0]):
-            digit = (source[i] >> shift) & (digits - 1)
-            at = histogram[digit]
-            histogram[digit] = at + 1
-            target[at], target_count[at] = source[i], source_count[i]
-        flipped = not flipped
-    return flipped
-
-
-@parallel
-def merge_words(band_word, band_count, partition, room, entries, spread, low, high, word, count, word2, count2):
-    """Order the bands' entries by partition and word, and add up equal ones.
-
-    Returns the first entry of each partition, and whether it is in the second pair; the first of its voxels and of its
-    entries when the gaps are closed; and how words are packed, see `_layout`.
-    """
-    offset, edges = offsets_of(spread)
-    lowest, shift = _layout(low, high)
-    for band in nb.prange(entries.shape[0]):
-        cursor = offset[band]
-        for e in range(band * room, band * room + entries[band]):
-            a, b, c = _coordinates(band_word[e])
-            at = cursor[partition[e]]
-            cursor[partition[e]] = at + 1
-            word[at] = (
-                ((a - lowest[0]) << shift[0]) | ((b - lowest[1]) << shift[1]) | ((c - lowest[2]) << shift[2])
-                | (band_word[e] & 0xFFFF)
-            )  # fmt: skip
-            count[at] = band_count[e]
-    flipped = np.empty(PARTITIONS, np.bool_)
-    voxels, left = np.empty(PARTITIONS, np.int64), np.empty(PARTITIONS, np.int64)
-    for p in nb.prange(PARTITIONS):
-        start, end = edges[p], edges[p + 1]
-        histogram = np.empty(1 << DIGIT_BITS, np.int32)
-        flipped[p] = _sort(word[start:end], count[start:end], word2[start:end], count2[start:end], shift[3], histogram)
-        w, c = (word2[start:end], count2[start:end]) if flipped[p] else (word[start:end], count[start:end])
-        n = v = 0
-        voxel = np.int64(-1)
-        for i in range(end - start):
-            if n > 0 and w[i] == w[n - 1]:
-                c[n - 1] += c[i]
-                continue
-            v += (w[i] >> shift[2]) != voxel
-            voxel = w[i] >> shift[2]
-            w[n], c[n] = w[i], c[i]
-            n += 1
-        voxels[p], left[p] = v, n
-    return edges, flipped, bounds_of(voxels), bounds_of(left), lowest, shift
-
-
-@parallel
-def emit_voxels(
-    word, count, word2, count2, edges, flipped, bounds, entry_bounds, lowest, shift, corner, key, pixels, start, label,
-    weight,
-):  # fmt: skip
-    """Write the observations: close the gaps between partitions, and unpack the words."""
-    label_mask = (np.int64(1) << shift[2]) - 1
-    b_mask, c_mask = (np.int64(1) << (shift[0] - shift[1])) - 1, (np.int64(1) << (shift[1] - shift[2])) - 1
-    for p in nb.prange(PARTITIONS):
-        w, c = (word2[edges[p] :], count2[edges[p] :]) if flipped[p] else (word[edges[p] :], count[edges[p] :])
-        v = bounds[p] - 1
-        voxel = np.int64(-1)
-        for e in range(entry_bounds[p], entry_bounds[p + 1]):
-            packed, number = w[e - entry_bounds[p]], c[e - entry_bounds[p]]
-            if packed >> shift[2] != voxel:
-                voxel = packed >> shift[2]
-                v += 1
-                key[v] = _key_of(
-                    (packed >> shift[0]) + lowest[0], ((packed >> shift[1]) & b_mask) + lowest[1],
-                    ((packed >> shift[2]) & c_mask) + lowest[2], corner,
-                )  # fmt: skip
-                pixels[v] = 0
-                start[v] = e
-            pixels[v] += number
-            label[e] = packed & label_mask
-            weight[e] = number
-    start[bounds[PARTITIONS]] = entry_bounds[PARTITIONS]

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import functools
 import math
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, field
@@ -78,7 +77,9 @@ class View:
 
     def sampled_camera(self, convention: Convention) -> Intrinsics:
         """Return the intrinsics of every stride-th pixel."""
-        return _sampled(self.camera, self.size, convention.ratio, self.stride)
+        width, height = self.size
+        made_for = (width * convention.ratio[0], height * convention.ratio[1])
+        return self.camera.resized(cast(Any, made_for), self.size).every(self.stride)
 
     def planar(self, u: Int64, v: Int64, convention: Convention, configured: Convention) -> Float64:
         """Return planar depth at pixels of the file as that convention reads it, without its factor."""
@@ -88,13 +89,6 @@ class View:
         if configured.depth == "ray":
             return depth * ray_lengths(self.sampled_camera(configured), u, v)
         return depth / ray_lengths(self.sampled_camera(convention), u, v)
-
-
-@functools.lru_cache(maxsize=1024)
-def _sampled(camera: Intrinsics, size: tuple[int, int], ratio: tuple[float, float], stride: int) -> Intrinsics:
-    """Return the intrinsics of every stride-th pixel, made once: a check asks for them once a pair and convention."""
-    made_for = (size[0] * ratio[0], size[1] * ratio[1])
-    return camera.resized(cast(Any, made_for), size).every(stride)
 
 
 def clusters(length: int, count: int) -> list[list[int]]:

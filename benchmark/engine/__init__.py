@@ -1,7 +1,7 @@
 """The engine of runs and studies: scenes x models x backends x variations, each unit is stored when it is finished.
 
 Examples:
-    >>> result = semstab.run(config, out="jobs", executor=semstab.engine.LocalProcesses(1), report=False)
+    >>> result = semstab.run(config, out="jobs", executor=semstab.engine.LocalProcesses(2), report=False)
     >>> len(result.records)
     2
 """

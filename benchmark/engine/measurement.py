@@ -120,8 +120,8 @@ def _fused_map(live: LiveMap, watch: Stopwatch) -> FusedMap:
         truth = None if live.truth is None else replace(live.truth.table(), classes=classes)
         reduced = np.zeros(0) if live.hard is None else reduced_sums(_left(live, live.hard.table())[0])
         live.backend = live.truth = live.hard = None
+    live.background.close()
     with watch("reference"):
-        live.background.close()
         checked = None if live.reference is None else _checked(live, table, live.reference)
         trim_malloc(least=SMALL)
     events = None if events is None else replace(events, classes=classes)

@@ -21,7 +21,7 @@ from semstab.errors import DataError
 from semstab.metrics import dominant
 from semstab.recording import drift
 from semstab.recording.layout import Legend, SceneBounds, log_categories
-from semstab.recording.timeline import Background, path
+from semstab.recording.timeline import FrameJobs, path
 from semstab.task import Task
 
 IMAGE_SIDE, COARSE_SIDE = 640, 320
@@ -109,7 +109,7 @@ class SceneLog:
             points = ((some + 0.5) * table.voxel_size - self._translation).astype(np.float64)
             self.bounds = SceneBounds(points, np.array([*self._poses.values()]).reshape(-1, 4, 4), task.scene.up)
 
-    def log(self, stream: rr.RecordingStream, frame: Frame, background: Background) -> None:
+    def log(self, stream: rr.RecordingStream, frame: Frame, background: FrameJobs) -> None:
         """Log the frame's pose, camera, colour and depth once, and the track up to it."""
         if frame.index in self._poses:
             return

@@ -38,7 +38,7 @@ from semstab.recording.camera import COARSE_SIDE, SceneLog, over_camera, stride_
 from semstab.recording.drift import DriftLog, FrameChanges, log_points
 from semstab.recording.layout import VERDICT, blueprint, drawn
 from semstab.recording.target import DEFAULT_URL, Target, flush, is_whole
-from semstab.recording.timeline import Background, Clock, path
+from semstab.recording.timeline import Clock, FrameJobs, path
 from semstab.recording.voxel_maps import (
     PENDING,
     VoxelLogger,
@@ -73,7 +73,7 @@ class GroupLog:
         self.last: tuple[int, float | None] = (task.indices[-1], None)
         """The number and timestamp of the last frame."""
 
-    def log(self, stream: rr.RecordingStream, frame: Frame, voxels: int, background: Background) -> None:
+    def log(self, stream: rr.RecordingStream, frame: Frame, voxels: int, background: FrameJobs) -> None:
         """Log the labels of a fused frame, the changes that it made to the map, and the map of so many voxels."""
         self.last = frame.index, frame.timestamp
         drift, jobs = None, list[Callable[[], None]]()
@@ -174,7 +174,7 @@ class Recording(Observer):
         self._plan: Plan
         self._scenes: dict[str, SceneLog] = {}
         self._stream: rr.RecordingStream | None = None
-        self._background: Background | None = None
+        self._background: FrameJobs | None = None
         self._clock = Clock()
         self._fused: FusionBackend | None = None  # the map that is drawn
         self._group: GroupLog | None = None  # the model on a scene that is being fused
@@ -304,10 +304,10 @@ class Recording(Observer):
             else:
                 stream.disconnect()
 
-    def _opened(self) -> tuple[rr.RecordingStream, Background]:
+    def _opened(self) -> tuple[rr.RecordingStream, FrameJobs]:
         if self._stream is None or self._background is None:
             self._stream = self.target.open()
-            self._background = Background(self._stream, self._clock)
+            self._background = FrameJobs(self._stream, self._clock)
             for scene in self._scenes.values():
                 scene.log_static(self._stream)
                 self._stream.log(path(scene.name, VERDICT), rr.TextDocument(PENDING), static=True)

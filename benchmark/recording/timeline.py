@@ -9,7 +9,7 @@ from typing import Any
 
 import rerun as rr
 
-from semstab.core import background
+from semstab.core.background import Background
 from semstab.core.palette import model_color
 from semstab.data.digests import require_unchanged
 from semstab.data.results import UnitName
@@ -52,13 +52,13 @@ MOST_PENDING = 4
 """The most jobs that may wait; they hold their frames in memory."""
 
 
-class Background:
+class FrameJobs:
     """A thread that runs jobs one after the other, each at the time of its frame."""
 
     def __init__(self, stream: rr.RecordingStream, clock: Clock) -> None:
         self._stream = stream
         self._clock = clock
-        self._jobs = background.Background("semstab-recording", MOST_PENDING)
+        self._jobs = Background("semstab-recording", MOST_PENDING)
 
     def submit(self, frame: int, timestamp: float | None, job: Callable[[], None]) -> None:
         """Submit a job, and wait while too many are pending; an error of an earlier job is raised here."""

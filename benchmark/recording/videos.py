@@ -15,7 +15,7 @@ from semstab.data.videos import VideoResult
 from semstab.engine.videos import VideoObserver
 from semstab.recording.camera import JPEG_QUALITY, label_context, over_camera, stride_of
 from semstab.recording.target import Target, flush
-from semstab.recording.timeline import Background, Clock, path
+from semstab.recording.timeline import Clock, FrameJobs, path
 from semstab.task import Task
 
 SERIES = {
@@ -35,7 +35,7 @@ class VideoRecording(VideoObserver):
 
     def __init__(self, target: Target) -> None:
         self._target, self._clock = target, Clock()
-        self._background: Background | None = None
+        self._background: FrameJobs | None = None
         self._models: dict[str, list[str]] = {}
         self._shown: set[tuple[str, int]] = set()
 
@@ -46,7 +46,7 @@ class VideoRecording(VideoObserver):
 
     def frame_measured(self, task: Task, frame: Frame, numbers: Mapping[str, float]) -> None:
         """Log a frame of a model, and its numbers."""
-        self._background = self._background or Background(self._stream, self._clock)
+        self._background = self._background or FrameJobs(self._stream, self._clock)
         scene = task.scene.name
         models = self._models.setdefault(scene, [])
         if task.model not in models:
