@@ -1,8 +1,8 @@
 """CPU time, memory, voxels and labels of semstab's fusion beside other programs that fuse the same points.
 
-    python benchmarks/bench_rivals.py [--rival "NAME=PROGRAM WORDS" ...] [--commit NAME=FOLDER_OR_HASH ...]
-                                      [--size 640x480] [--frames 20] [--classes 7] [--voxel-size 0.02] [--rounds 1]
-                                      [--json FILE]
+    python benchmarks/bench_rivals.py [--pyslam FOLDER] [--rival "NAME=PROGRAM WORDS" ...]
+                                      [--commit NAME=FOLDER_OR_HASH ...] [--size 640x480] [--frames 20] [--classes 7]
+                                      [--voxel-size 0.02] [--rounds 1] [--json FILE]
 
 A camera walks round a noisy room; 12 % of the patches of its label maps err. Each implementation runs as a program of
 its own on one core, and they take turns. The columns:
@@ -14,7 +14,12 @@ its own on one core, and they take turns. The columns:
 - label differs: share of their common voxels with another most likely class; without ties: of those where the largest
   evidence of numba's map is one class's
 
-A rival is a program that you have built from your own checkout; nothing of it is part of semstab. It is called as
+`--pyslam` names your checkout of pySLAM (luigifreda/pyslam). Its semantic voxel blocks (cpp/volumetric) are compiled
+with the driver rivals/pyslam.cpp and pySLAM's own flags; this needs g++ and headers, on Debian and Ubuntu
+
+    apt install g++ libtbb-dev libeigen3-dev libopencv-dev pybind11-dev
+
+Any other rival is a program that you have built. Nothing of another project is part of semstab. A rival is called as
 PROGRAM WORDS IN OUT. All numbers are little-endian:
 
 - IN: float64 voxel size, int64 K, int64 frames; then of each frame int64 n, three float64 of the camera's position,
@@ -39,6 +44,7 @@ import shlex
 import shutil
 import subprocess
 import sys
+import sysconfig
 import tempfile
 import time
 from collections import defaultdict
@@ -195,6 +201,27 @@ def commit(given: str) -> str:
     return subprocess.run(words, capture_output=True, text=True, check=True).stdout.strip()
 
 
+def build_pyslam(checkout: Path, folder: Path) -> dict[str, str]:
+    """Compile the driver with the headers of a checkout of pySLAM; return the words that call it, by name."""
+    program, libraries = folder / "pyslam", sysconfig.get_config_var("LIBDIR")
+    words = [
+        "g++", "-std=c++20", "-O3", "-march=native", "-DNDEBUG", "-DTBB_FOUND", "-w",
+        *(f"-I{headers}" for headers in (
+            checkout / "cpp/volumetric", "/usr/include/eigen3", "/usr/include/opencv4", sysconfig.get_path("include"),
+        )),
+        str(Path(__file__).with_name("rivals") / "pyslam.cpp"), "-o", str(program), "-ltbb",
+        f"-L{libraries}", f"-Wl,-rpath,{libraries}", f"-lpython{sysconfig.get_config_var('LDVERSION')}",
+    ]  # fmt: skip
+    try:
+        done = subprocess.run(words, capture_output=True, text=True, check=False)
+    except FileNotFoundError:
+        raise SystemExit("--pyslam: there is no g++; --help says what it needs") from None
+    if done.returncode:
+        first = next((text for text in done.stderr.splitlines() if "error" in text), done.stderr)
+        raise SystemExit(f"--pyslam {checkout} does not compile; --help says what it needs: {first}")
+    return {f"pySLAM, {kind}": f"{shlex.quote(str(program))} {kind}" for kind in ("votes", "probabilities")}
+
+
 def named(given: Sequence[str]) -> dict[str, str]:
     """NAME=VALUE as a dictionary."""
     return {name: value for name, _, value in (one.partition("=") for one in given)}
@@ -241,6 +268,7 @@ def measure(arguments: argparse.Namespace, rivals: dict[str, str], folder: Path)
 def main() -> None:
     """Print the table."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--pyslam", type=Path, metavar="FOLDER", help="a checkout of pySLAM, to be compiled")
     parser.add_argument("--rival", action="append", default=[], help="NAME=PROGRAM WORDS, again for each")
     parser.add_argument("--commit", action="append", default=[], help="NAME=FOLDER of its checkout, or =HASH")
     parser.add_argument("--size", default="640x480")
@@ -258,7 +286,11 @@ def main() -> None:
         return
     commits = {name: commit(given) for name, given in named(arguments.commit).items()}
     with tempfile.TemporaryDirectory() as folder:
-        rows = measure(arguments, named(arguments.rival), Path(folder))
+        rivals = named(arguments.rival)
+        if arguments.pyslam:
+            rivals = build_pyslam(arguments.pyslam, Path(folder)) | rivals
+            commits = {"pySLAM": commit(str(arguments.pyslam))} | commits
+        rows = measure(arguments, rivals, Path(folder))
     print(
         f"{arguments.frames} frames of {arguments.size}, K = {arguments.classes}, {arguments.voxel_size:g} m, one core"
     )
