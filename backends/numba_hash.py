@@ -20,6 +20,7 @@ from semstab.backends.numba_loops import (
     DENSE,
     SLOT,
     count_chain,
+    enter,
     look_up,
     make_nodes,
     most_slots,
@@ -87,6 +88,9 @@ class History:
 FULL = 0.7
 """Largest share of a partition's slots in use."""
 
+FIRST_SLOTS = 64
+"""Of a partition."""
+
 
 class NumbaHash:
     """Incremental fusion in compiled code; the same numbers for any number of threads.
@@ -131,8 +135,7 @@ class NumbaHash:
         self._nodes_used = 0
         self._dense = np.zeros((1, -(-num_classes // LANES) * LANES), dtype=evidence)
         self._dense_used = 0
-        self._slots = np.zeros((PARTITIONS, 64), dtype=SLOT)
-        self._slots["row"] = -1
+        self._slots = np.empty((PARTITIONS, 0), dtype=SLOT)
         self._used = np.zeros(PARTITIONS, dtype=np.int64)
         self._ranges = np.zeros((PARTITIONS, 4), dtype=np.int64)  # two free stretches of nodes: start, end, start, end
         self._last: tuple[Int64, BeliefChange] | None = None
@@ -210,7 +213,12 @@ class NumbaHash:
         return self._total.voxels
 
     def table(self) -> VoxelTable:
-        """Return the map so far."""
+        """Return the map so far.
+
+        The hash, and what records have been given room for, make room for it; a further frame makes them anew.
+        """
+        self._slots = np.empty((PARTITIONS, 0), dtype=SLOT)
+        self._records.resize(max(len(self), 1), refcheck=False)
         order = self._order()
         index = columns_of_keys(self._records["key"][order], self.origin)
         columns = ("op", "drift_sum", "pixels", "first_frame", "last_frame", "self_sum", "frame_entropy_sum")
@@ -243,12 +251,18 @@ class NumbaHash:
         return self._history.events(order, columns_of_keys(self._records["key"][order], self.origin))
 
     def _make_slots(self, needed: int) -> None:
-        size = self._slots.shape[1]
+        """Make room in the hash for so many voxels of a partition; it is made of the records where there is none."""
+        now = self._slots.shape[1]
+        size = max(now, FIRST_SLOTS)
         while needed > FULL * size:
             size *= 2
-        if size > self._slots.shape[1]:
+        if size > now:
             slots = np.empty((PARTITIONS, size), dtype=SLOT)
-            rehash(self._slots, slots)
+            slots["row"] = -1
+            if now > 0:
+                rehash(self._slots, slots)
+            else:
+                enter(self._records[: len(self)], slots)
             self._slots = slots
 
     def _make_dense(self, seen: ObservedScores, row: Int64, base: Int64) -> Int64:

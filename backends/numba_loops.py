@@ -13,7 +13,7 @@ import numba as nb
 import numpy as np
 
 from semstab.backends.shared.beliefs import observe_few, observe_row, plogp
-from semstab.backends.shared.keys import PARTITIONS, bounds_of, mix
+from semstab.backends.shared.keys import PARTITIONS, bounds_of, mix, partition_of
 from semstab.backends.shared.pixel_keys import AHEAD, touch
 from semstab.core.compiled import compiled, parallel, serial
 from semstab.data.results import RECURRENT
@@ -74,18 +74,27 @@ def look_up(key, bounds, slots, used, row, slot):
 
 @parallel
 def rehash(old, new):
-    """Enter the voxels of the slots into new ones, of which there are more."""
-    mask = np.uint64(new.shape[1] - 1)
+    """Enter the voxels of the slots into new ones, empty and more."""
     for p in nb.prange(PARTITIONS):
-        for at in range(new.shape[1]):
-            new[p, at].row = -1
         for i in range(old.shape[1]):
             if old[p, i].row >= 0:
-                at = np.int64(mix(old[p, i].key) & mask)
-                while new[p, at].row != -1:
-                    at = (at + 1) & np.int64(mask)
-                new[p, at].key = old[p, i].key
-                new[p, at].row = old[p, i].row
+                _enter_one(old[p, i].key, old[p, i].row, new[p])
+
+
+@serial
+def enter(records, slots):
+    """Enter the voxels of the records into empty slots."""
+    for row in range(records.shape[0]):
+        _enter_one(records[row].key, row, slots[partition_of(records[row].key)])
+
+
+@compiled(forceinline=True)
+def _enter_one(key, row, slots):
+    mask = np.uint64(slots.shape[0] - 1)
+    at = np.int64(mix(key) & mask)
+    while slots[at].row != -1:
+        at = (at + 1) & np.int64(mask)
+    slots[at].key, slots[at].row = key, row
 
 
 @serial

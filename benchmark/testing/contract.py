@@ -82,6 +82,15 @@ class ContractTests(BackendTests):
         assert (len(table), table.op[0], table.drift_sum[0]) == (1, 1, 0)
         assert table.evidence[0] == self.near([1, 0, 0])
 
+    def test_tables_in_between_change_nothing(self) -> None:
+        """A map is the same whether or not tables were taken on the way."""
+        hits = [[(0.2, 0), (1.5, 1)], [(0.4, 1), (2.5, 2)], [(1.5, 1), (3.5, 0)], [(0.2, 0), (3.5, 2)]]
+        backend = self.create(1.0, 3)
+        for frame in as_frames(hits):
+            backend.integrate(frame)
+            backend.table()
+        assert_same_map(backend.table(), self.fuse(*as_frames(hits)), 0)
+
     def test_two_maps_share_nothing(self) -> None:
         """Frames of one map do not show in another."""
         a, b = self.create(1.0, 3), self.create(1.0, 3)
