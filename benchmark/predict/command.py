@@ -15,9 +15,10 @@ from pathlib import Path
 from typing import Any
 
 from rich.console import Console
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn
+from rich.progress import TextColumn
 
 from semstab.config import DatasetConfig, FrameSelection, validated
+from semstab.core.progress import frame_progress
 from semstab.data.frames import Frame
 from semstab.datasets import Scene, open_dataset, options_model
 from semstab.datasets.formats.disk import natural
@@ -170,13 +171,7 @@ class PredictionBar(PredictionObserver):
     """One bar a sequence. Speed and time left count frames that the model saw, not those of an earlier start."""
 
     def __init__(self, console: Console) -> None:
-        columns = (
-            TextColumn("{task.description}", markup=False),
-            BarColumn(),
-            MofNCompleteColumn(),
-            TextColumn("frames"),
-        )
-        self._bar = Progress(*columns, TextColumn("{task.fields[speed]}"), console=console, transient=True)
+        self._bar = frame_progress(console, TextColumn("{task.fields[speed]}"))
         self._work = self._bar.add_task("starting", total=None, speed="")
         self._left = self._predicted = 0
         self._started = time.monotonic()
