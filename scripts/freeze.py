@@ -231,7 +231,9 @@ def compare_case(case: Case, kept: Path, out: Path) -> tuple[bool, str]:
         first, second = (listing(out / run) for run in case.same)
         tables = [name for name in first if name.startswith(("voxels/", "truth/"))]
         for name in tables:
-            comparison.columns(of_parquet(first[name]), of_parquet(second[name]), f"{' and '.join(case.same)}: {name}", 0.0)
+            comparison.columns(
+                of_parquet(first[name]), of_parquet(second[name]), f"{' and '.join(case.same)}: {name}", 0.0
+            )
         if not tables:
             comparison.differ(" and ".join(case.same), "voxel tables", "missing")
     text = f", {comparison.files} files"
