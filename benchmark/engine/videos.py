@@ -284,13 +284,13 @@ class _Meter:
     def _outlying(self) -> OutlyingFrames:
         known = [own for own in self._meter.lone if own.pixels]
         share = np.array([own.share for own in known], np.float64)
-        found = LoneDisagreement(
+        disagreement = LoneDisagreement(
             np.array([own.frame for own in known], np.int64),
             np.array([own.pixels for own in known], np.int64),
             share,
             np.full(len(share), share.mean() if len(share) else math.nan),
         )
-        return outlying_frames(found, len(known), name=self.task.scene.frame_name)
+        return outlying_frames(disagreement, len(known), name=self.task.scene.frame_name)
 
 
 def _pictures(task: Task, outlying: OutlyingFrames, stride: int) -> Iterator[LonePicture]:

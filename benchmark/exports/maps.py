@@ -359,16 +359,16 @@ def write_mesh(chosen: Chosen, path: Path) -> int:
     import trimesh
 
     corners = {tile: chosen[tile].table.index.min(axis=0).astype(np.int64) for tile in chosen.tiles()}
-    some, low = chosen.first, np.min([*corners.values()], axis=0)
+    first, low = chosen.first, np.min([*corners.values()], axis=0)
     extras = {
-        "origin": (some.linear @ (low * some.table.voxel_size) + some.offset).tolist(),
-        "coordinates": "the scene" if some.georeference is None else crs_name(some.georeference),
-        "voxel_size": some.table.voxel_size,
-        "classes": list(some.classes),
-        "benchmark": some.benchmark,
+        "origin": (first.linear @ (low * first.table.voxel_size) + first.offset).tolist(),
+        "coordinates": "the scene" if first.georeference is None else crs_name(first.georeference),
+        "voxel_size": first.table.voxel_size,
+        "classes": list(first.classes),
+        "benchmark": first.benchmark,
     }
     scene: Any = trimesh.Scene(metadata=extras)
-    voxels, size, to_gltf = 0, 0, some.table.voxel_size * (_to_gltf(some.up) @ some.linear).T
+    voxels, size, to_gltf = 0, 0, first.table.voxel_size * (_to_gltf(first.up) @ first.linear).T
     for tile in corners:
         part = chosen[tile]
         voxels += len(part.table)
@@ -384,7 +384,7 @@ def write_mesh(chosen: Chosen, path: Path) -> int:
             trimesh.Trimesh(
                 (corner @ to_gltf).astype(np.float32),
                 np.concatenate([quads[:, [0, 1, 2]], quads[:, [0, 2, 3]]]).astype(np.uint32),
-                vertex_colors=some.colors[label],
+                vertex_colors=first.colors[label],
                 process=False,
             )
         )

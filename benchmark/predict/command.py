@@ -119,7 +119,7 @@ def file_job(pattern: str, frames: FrameSelection, out: Path | None) -> Job:
     if out is None:
         raise ConfigError("--images: predictions of single images need a folder; name it with --out")
     files = ImageFiles(pattern)
-    return Job(files, _some(frames.indices(len(files)), files), out)
+    return Job(files, _require_some(frames.indices(len(files)), files), out)
 
 
 def scene_jobs(
@@ -144,7 +144,7 @@ def scene_jobs(
     jobs = []
     for name in names:
         scene = opened.scene(name)
-        indices = _some(select_frames(scene, frames, **looks_at).indices, scene)
+        indices = _require_some(select_frames(scene, frames, **looks_at).indices, scene)
         jobs.append(Job(scene, indices, _folder_for(scene, out if out is None or len(names) == 1 else out / name)))
     return jobs
 
@@ -156,7 +156,7 @@ def _folder_for(scene: Scene, out: Path | None) -> Path:
     return folder
 
 
-def _some(indices: list[int], sequence: ImageSequence) -> list[int]:
+def _require_some(indices: list[int], sequence: ImageSequence) -> list[int]:
     if not indices:
         raise ConfigError(
             f"{sequence.name}: the selection of frames leaves none of its {len(sequence)}; change --frames"
