@@ -240,7 +240,7 @@ class Neighbours:
             return set()
         poses = [self._pose(index) for index in self.indices]
         steps = np.array([_step(a, b) for a, b in itertools.pairwise(poses)])
-        ratios = np.nan_to_num([_beside(steps, k) for k in range(len(steps))])
+        ratios = np.nan_to_num([_ratio_to_those_around(steps, k) for k in range(len(steps))])
         largest = [int(k) for k in np.argsort(-ratios)[:MOST_STEPS] if ratios[k] >= STRIKING_STEP]
         return {p for k in largest for p in range(k - 1, k + 3) if 0 <= p < len(self.indices)}
 
@@ -358,7 +358,7 @@ def _step(first: Float64, second: Float64) -> float:
     return float(np.linalg.norm(t) + np.linalg.norm(R - np.eye(3)))
 
 
-def _beside(steps: Float64, k: int) -> float:
+def _ratio_to_those_around(steps: Float64, k: int) -> float:
     """Return a step's ratio to the median of those on both sides of it."""
     near = np.concatenate([steps[max(0, k - AROUND) : k], steps[k + 1 : k + 1 + AROUND]])
     return float(steps[k] / max(1e-9, np.nanmedian(near)))

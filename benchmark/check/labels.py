@@ -268,7 +268,7 @@ class Comparison:
     agreement: Contrast
 
     @property
-    def is_found(self) -> bool:
+    def is_better(self) -> bool:
         """Return whether one measure is clearly better, and the other is not worse."""
         edges, agreement = self.edges, self.agreement
         by_edges = edges.is_clear and edges.other >= max(LEAST_FIT, BETTER * edges.given)
@@ -366,7 +366,7 @@ def check_labels(
     if (same := _identical(read_runs)) is not None:
         return LabelFindings(model, (f"labels of {model} {same}",), remarks)
     comparisons = compare(read_runs)
-    better = sorted((each for each in comparisons if each.is_found), key=lambda each: -each.edges.other)
+    better = sorted((each for each in comparisons if each.is_better), key=lambda each: -each.edges.other)
     wrong = tuple(f"labels of {model} {each}" for each in better[:1])
     return LabelFindings(model, wrong, remarks, None if wrong else _open(comparisons))
 
