@@ -13,7 +13,7 @@ import numpy as np
 import numpy.typing as npt
 import yaml
 from rich.console import Console
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+from rich.progress import TimeRemainingColumn
 
 from semstab.check.conventions import KNOWN_SCALES
 from semstab.check.reprojection import reader
@@ -30,6 +30,7 @@ from semstab.core.files import (
     write_text,
 )
 from semstab.core.prefetch import prefetch
+from semstab.core.progress import frame_progress
 from semstab.core.types import Float32, Float64, UInt16
 from semstab.data.frames import Frame, Intrinsics
 from semstab.data.labels import LabelSpace
@@ -436,8 +437,7 @@ def _up_axis(scene: Scene) -> str | None:
 @contextmanager
 def frame_bar(console: Console) -> Iterator[Callable[[str, int, int], None]]:
     """Show a progress bar of the frames of one label source; call it with task, frames done, all frames."""
-    columns = (TextColumn("{task.description}", markup=False), BarColumn(), MofNCompleteColumn(), TextColumn("frames"))
-    with Progress(*columns, TimeRemainingColumn(), console=console, transient=True) as bar:
+    with frame_progress(console, TimeRemainingColumn()) as bar:
         work = bar.add_task("starting", total=None)
         yield lambda what, done, total: bar.update(work, description=what, completed=done, total=total)
 

@@ -76,8 +76,8 @@ def _warpable(grid: Sequence[str], scene: Scene, frames: Sequence[int], *, named
     warping = [text for text in grid if any(parse(part).kind.warps for part in text.split("+"))]
     if not warping:
         return list(grid), []
-    found = [density(scene.depth(frames[at])) for at in evenly(len(frames), DENSITY_FRAMES)]
-    reason = too_sparse([parse(part) for text in warping for part in text.split("+")], mean(np.array(found)))
+    densities = [density(scene.depth(frames[at])) for at in evenly(len(frames), DENSITY_FRAMES)]
+    reason = too_sparse([parse(part) for text in warping for part in text.split("+")], mean(np.array(densities)))
     if reason is None:
         return list(grid), []
     if named:

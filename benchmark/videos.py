@@ -53,6 +53,7 @@ def run_videos(
     """Measure flicker of the label maps of videos, without depth and poses.
 
     A folder `out` gets the summary, the series of each model and, unless `report` is False, tables and report.html.
+    Each video that is measured is kept there: the same call goes on after it.
 
     Args:
         config: Settings whose dataset is `video`, or a YAML file with them.
@@ -92,7 +93,7 @@ def run_videos(
             raise ConfigError(f"{other}: has depth and poses; use semstab.run")
         _claim(folder, config, overwrite=overwrite)
         stack.callback(FolderLock(folder).release)
-        records = tuple(measured_videos(config, scenes, observers))
+        records = tuple(measured_videos(config, scenes, observers, None if out is None else folder))
         inputs = {f"{record.scene}/{record.model}": record.input for record in records}
         seconds = {"all": time.perf_counter() - began}
         result = VideoResult(records, origin(config, command) | {"inputs": inputs, "seconds": seconds})

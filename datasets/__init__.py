@@ -216,8 +216,8 @@ def _refuse_points(root: Path, nearest: str) -> None:
     """Raise DataError where a folder holds points in a layout that no reader has."""
     for what, pattern in POINTS.items():
         for depth in range(4):
-            if (found := next(root.glob("*/" * depth + pattern), None)) is not None:
-                where = found.parent.relative_to(root.parent)
+            if (file := next(root.glob("*/" * depth + pattern), None)) is not None:
+                where = file.parent.relative_to(root.parent)
                 raise DataError(
                     f"{root}: holds {what} ({where}), in no layout of scans that is read"
                     f"{f', the nearest is {nearest}' if nearest else ''}; lay them out as one, with poses"

@@ -168,19 +168,19 @@ def _lens(sensor: Element, where: str) -> tuple[Camera, Lens | None]:
     the first one.
     """
     calibrations = sensor.findall("calibration")
-    found = next((own for own in calibrations if own.get("class") == "adjusted"), next(iter(calibrations), None))
-    if found is None:
+    calibration = next((own for own in calibrations if own.get("class") == "adjusted"), next(iter(calibrations), None))
+    if calibration is None:
         raise DataError(f"{where}: has no calibration; align the photographs, and export the cameras again")
-    kind = found.get("type") or sensor.get("type") or "frame"
+    kind = calibration.get("type") or sensor.get("type") or "frame"
     if kind not in ("frame", "fisheye"):
         raise DataError(f"{where}: the camera model {kind[:30]!r} is not read; there is frame, fisheye")
-    resolution = found.find("resolution")
+    resolution = calibration.find("resolution")
     resolution = sensor.find("resolution") if resolution is None else resolution
     try:
         width, height = (int(resolution.get(key, "")) for key in ("width", "height"))  # type: ignore[union-attr]
     except (AttributeError, ValueError) as error:
         raise DataError(f"{where}: has no resolution; export the cameras again") from error
-    value = dict(_coefficients(found, where))
+    value = dict(_coefficients(calibration, where))
     f, b1, b2 = (value.get(key, 0.0) for key in ("f", "b1", "b2"))
     k1, k2, k3, k4, p1, p2, p3, p4 = (value.get(key, 0.0) for key in ("k1", "k2", "k3", "k4", "p1", "p2", "p3", "p4"))
     beyond = p3 or p4 or (k4 and kind == "frame") or ((p1 or p2) and kind == "fisheye")

@@ -93,18 +93,18 @@ class MidAir(FileDataset[MidAirOptions]):
 
     def _frames(self, folder: Path, flight: str) -> Iterable[FrameSource]:
         images = files_named(folder / f"color_left/{flight}", "", ".JPEG")
-        found = self.depth_files(folder / f"depth/{flight}", "", ".PNG", instead=images)
+        files = self.depth_files(folder / f"depth/{flight}", "", ".PNG", instead=images)
         path = folder / RECORDS
-        rows = ROWS * np.array([_number(name, folder / "depth" / flight) for name in found], dtype=np.int64)
+        rows = ROWS * np.array([_number(name, folder / "depth" / flight) for name in files], dtype=np.int64)
         positions, attitudes = read_flight(path, flight)
         if len(rows) and rows.max() >= len(positions):
             raise DataError(
-                f"{path}: {flight} has {len(positions)} rows, but image {max(found, key=natural)} goes with row"
+                f"{path}: {flight} has {len(positions)} rows, but image {max(files, key=natural)} goes with row"
                 f" {rows.max()}, counted from 0; download it again"
             )
         poses = from_quaternions(positions[rows], attitudes[rows][:, [1, 2, 3, 0]], path)
         camera = camera_of(self.options.intrinsics, USUAL, SIZE)
-        depth = {f"{flight}/{name}": file for name, file in found.items()}
+        depth = {f"{flight}/{name}": file for name, file in files.items()}
         frames = frames_of(folder, depth, camera, pose=RECORDS, color="color_left/{name}.JPEG", poses=poses)
         return [
             replace(frame, depth_reader=read_half_floats, timestamp=float(row / (25 * ROWS)))

@@ -80,16 +80,16 @@ class NuScenes(ScanDataset[NuScenesOptions]):
             ConfigError: If one folder has several versions and none is chosen.
         """
         entries = []
-        for found in find_scenes(root, self.is_scene, self.contents):
-            tables = found.folder / self._version(found.folder)
+        for entry in find_scenes(root, self.is_scene, self.contents):
+            tables = entry.folder / self._version(entry.folder)
             for row in _rows(tables / "scene.json"):
                 scene, where = _text(row, "name", tables / "scene.json"), str(tables / "scene.json")
-                inside(found.folder, found.folder, scene, where)
-                name = scene if found.folder == root else f"{found.name}-{scene}"
+                inside(entry.folder, entry.folder, scene, where)
+                name = scene if entry.folder == root else f"{entry.name}-{scene}"
                 if name in self._tokens:
                     raise DataError(f"{where}: two scenes are called '{scene}'; rename one")
                 self._tokens[name] = (tables, _text(row, "token", tables / "scene.json"))
-                entries.append(SceneEntry(name, found.folder, scene))
+                entries.append(SceneEntry(name, entry.folder, scene))
         return sorted(entries, key=lambda entry: natural(entry.name))
 
     def is_scene(self, folder: Path) -> bool:

@@ -85,8 +85,8 @@ def find_project(folder: Path, wanted: int | None = None) -> Project | None:
 
 def find_bundles(opensfm: Path) -> list[Path]:
     """Return the bundles of a folder of OpenSfM, one a reconstruction, in their order."""
-    found = (sorted(opensfm.glob(pattern)) for pattern in BUNDLES)
-    return next((paths for paths in found if paths), [])
+    matches = (sorted(opensfm.glob(pattern)) for pattern in BUNDLES)
+    return next((paths for paths in matches if paths), [])
 
 
 def _of_undistorted(bundle: Path, opensfm: Path) -> bool:
@@ -147,11 +147,11 @@ def depth_files(project: Project, kind: Kind | None, names: Mapping[str, str], t
     folders = Folders()
     if kind == "opensfm":
         maps_of = project.opensfm / NPZ_MAPS
-        found = {
+        candidates = {
             shot: [maps_of / f"{name}{suffix}" for suffix in NPZ_SUFFIXES for name in written_names(shot)]
             for shot in names
         }
-        return {shot: next(filter(folders.has, paths), paths[0]) for shot, paths in found.items()}
+        return {shot: next(filter(folders.has, paths), paths[0]) for shot, paths in candidates.items()}
     wanted = {shot: project.folder / template.filled(name=name) for shot, name in names.items()}
     return {shot: folders.one_of(path, DEPTH_SUFFIXES) or path for shot, path in wanted.items()}
 

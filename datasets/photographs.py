@@ -156,10 +156,10 @@ class Photographs(FileDataset[Options], Generic[Options]):
         there = sorted(path for path in folder.glob("*") if path.suffix.lower() in SURFACES)
         meshes = [path for path in there if path.suffix.lower() not in SEEN_FROM_ABOVE]
         if len(meshes) != 1:
-            found = f" (here are {', '.join(path.name for path in there[:5])})" if there else ""
+            listed = f" (here are {', '.join(path.name for path in there[:5])})" if there else ""
             raise DataError(
                 f"{folder}: has no depth images; set surface to the mesh, cloud or height model that was"
-                f" exported: --option surface=FILE{found}"
+                f" exported: --option surface=FILE{listed}"
             )
         return options.model_copy(update={"surface": meshes[0]})
 
@@ -208,11 +208,11 @@ class Photographs(FileDataset[Options], Generic[Options]):
         if self.options.cameras is not None:
             path = inside(self.options.root, folder, self.options.cameras, "option cameras")
             return path if path.is_file() else None
-        found = [path for pattern in self.patterns for path in sorted(folder.glob(pattern)) if self.has_cameras(path)]
-        if len(found) > 1:
-            listed = ", ".join(path.name for path in found[:5])
+        matches = [path for pattern in self.patterns for path in sorted(folder.glob(pattern)) if self.has_cameras(path)]
+        if len(matches) > 1:
+            listed = ", ".join(path.name for path in matches[:5])
             raise DataError(f"{folder}: several files hold cameras ({listed}); name one: --option cameras=FILE")
-        return found[0] if found else None
+        return matches[0] if matches else None
 
 
 # Coordinates that count from the Earth's centre, brought into a projection.

@@ -105,9 +105,9 @@ class PointsFolder(ScanDataset[PointsOptions]):
 
     def _truth_in(self, folder: Path, files: dict[str, str]) -> str | None:
         """Return the template of clouds that hold classes; of PLY files the first one tells."""
-        kept = (suffix for suffix in LAS if _ends(files, suffix))
+        suffixes = (suffix for suffix in LAS if _ends(files, suffix))
         clouds = [file for file in files.values() if file.lower().endswith(PLY)]
-        suffix = next(kept, PLY if clouds and self._has_classes(folder / clouds[0]) else None)
+        suffix = next(suffixes, PLY if clouds and self._has_classes(folder / clouds[0]) else None)
         return None if suffix is None else f"points/{{name}}{suffix}"
 
     def _has_classes(self, path: Path) -> bool:
@@ -115,13 +115,13 @@ class PointsFolder(ScanDataset[PointsOptions]):
             return self.options.label_field != ""
         try:
             with path.open("rb") as file:
-                return _found(Header.read(file, path).dtype.names or ()) is not None
+                return _class_property(Header.read(file, path).dtype.names or ()) is not None
         except (OSError, DataError):  # said with the scan, when it is read
             return False
 
     def _property(self, names: Sequence[str], path: Path) -> str:
         """Return the property of classes."""
-        name = self.options.label_field or _found(names)
+        name = self.options.label_field or _class_property(names)
         if name is None:
             raise DataError(f"{path}: no property is one of classes ({', '.join(PROPERTIES)}); name it by label_field")
         if name not in names:
@@ -145,7 +145,7 @@ def _ends(files: dict[str, str], suffix: str) -> bool:
     return any(file.lower().endswith(suffix) for file in files.values())
 
 
-def _found(names: Sequence[str]) -> str | None:
+def _class_property(names: Sequence[str]) -> str | None:
     """Return which of a PLY file's properties is that of classes, by its name."""
     bare = {name.lower().removeprefix("scalar_"): name for name in names}
     return next((bare[known] for known in PROPERTIES if known in bare), None)

@@ -112,16 +112,16 @@ def _named(entry: SceneEntry) -> SceneEntry:
 def _map_of(folder: Path) -> Path | None:
     """Return the mesh of the place that a flight is over, None where it is not there."""
     flight = FLIGHT.fullmatch(folder.name)
-    found = [] if flight is None else _above(folder, MAPS, f"{flight['place']}/Mesh.ply")
-    return next((path for path in found if path.is_file()), None)
+    candidates = [] if flight is None else _above(folder, MAPS, f"{flight['place']}/Mesh.ply")
+    return next((path for path in candidates if path.is_file()), None)
 
 
 def _truth_of(folder: Path) -> Path | None:
     """Return the folder of a flight's label maps, None where they are not there."""
     flight = FLIGHT.fullmatch(folder.name)
     archive = "" if flight is None else f"interval{flight['step']}_CAM_label"
-    found = _above(folder, archive, f"{folder.name}/{archive}_id") if archive else []
-    return next((path for path in found if path.is_dir()), None)
+    candidates = _above(folder, archive, f"{folder.name}/{archive}_id") if archive else []
+    return next((path for path in candidates if path.is_dir()), None)
 
 
 def _above(folder: Path, archive: str, inner: str) -> list[Path]:

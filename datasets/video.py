@@ -123,8 +123,8 @@ def find_videos(root: Path) -> Iterable[tuple[SceneEntry, Path]]:
         return [(SceneEntry(root.stem, root.with_suffix(""), root.stem), root)]
     if (images := _images_of(root)) is not None:
         return [(SceneEntry(name, root, ""), images)]
-    found = [(root / folder, _images_of(root / folder)) for folder in subfolders(root)]
-    scenes = {folder.name: (folder, images) for folder, images in found if images is not None}
+    folders = [(root / folder, _images_of(root / folder)) for folder in subfolders(root)]
+    scenes = {folder.name: (folder, images) for folder, images in folders if images is not None}
     for file in sorted(path for path in root.iterdir() if path.suffix.lower() in VIDEOS):
         if file.stem in scenes:
             raise DataError(f"{file}: {scenes[file.stem][1].name} would be a scene of the same name; rename one")

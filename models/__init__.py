@@ -243,8 +243,8 @@ def narrowed(ids: npt.NDArray[Any], classes: int) -> Labels:
 
 def sides(value: Any) -> Any:
     """Return the text HEIGHTxWIDTH as two numbers, and all else as it is; for options of sizes."""
-    found = re.fullmatch(r"\s*(\d{1,9})\s*x\s*(\d{1,9})\s*", value, re.IGNORECASE) if isinstance(value, str) else None
-    return value if found is None else [int(side) for side in found.groups()]
+    match = re.fullmatch(r"\s*(\d{1,9})\s*x\s*(\d{1,9})\s*", value, re.IGNORECASE) if isinstance(value, str) else None
+    return value if match is None else [int(side) for side in match.groups()]
 
 
 def maker(name: str) -> tuple[type[BaseModel], Callable[[Any], Model]]:

@@ -56,6 +56,16 @@ def test_a_run_says_the_same_and_goes_on(frames, tmp_path):
     assert any("mirrored" in text for text in kept)
 
 
+def test_labels_of_another_frame_fail_a_check_and_are_noted_by_a_run(frames, tmp_path):
+    """docs/check.md says why: a run measures the labels as they are."""
+    early = next(each for each in LABELS if each.name == "labels of the next frame")
+    folder = write(tmp_path / "room", early.plant(frames))
+    refused = bench("check", "--quiet", "--data", folder, cwd=tmp_path, code=2)
+    assert "error: room: labels of net are one frame early" in words(refused)
+    noted = bench("run", "--data", folder, "--voxel-size", "0.2", "--check", "none", cwd=tmp_path)
+    assert "note: labels of net are one frame early" in words(noted)
+
+
 def test_a_scene_without_mistakes_is_silent(frames):
     assert [*doctor.said(frames)] == []
 

@@ -239,3 +239,50 @@ def test_truth_gives_consistency_where_it_stays_the_same(tmp_path) -> None:
     (record,) = semstab.run_videos(options(folder, ground_truth="truth/{name}")).records
     assert record.model == "flips"
     assert 0 < record.image_space.vc8 < 1
+
+
+def _numbers(out):
+    """What a run leaves, without times and the command line."""
+    summary = json.loads((out / "summary.json").read_text())
+    files = {file.name: file.read_bytes() for file in sorted(out.glob("frames/*.csv")) + sorted(out.glob("tables/*"))}
+    return summary, files
+
+
+def test_a_killed_run_goes_on_with_the_next_video(tmp_path, monkeypatch) -> None:
+    for name in ("a", "b"):
+        write(tmp_path / "clips" / name, wrong=(5,))
+    words = "--dataset", "video", "--data", tmp_path / "clips", "--option", f"classes=[{','.join(CLASSES)}]"
+    bench("run", *words, "--out", "whole", cwd=tmp_path, report=True)
+    measured, add = [], VideoFlickerMeter.add
+
+    def killed(meter, frame, truth):
+        measured.append(frame.index)
+        if len(measured) > 3 * COUNT:
+            raise KeyboardInterrupt
+        return add(meter, frame, truth)
+
+    monkeypatch.setattr(VideoFlickerMeter, "add", killed)
+    bench("run", *words, "--out", "out", cwd=tmp_path, code=130)
+    measured.clear()
+    again = bench("run", *words, "--out", "out", cwd=tmp_path, report=True, recording=True)
+    assert len(measured) == 2 * COUNT
+    assert "measured earlier: 2 of 4" in again.stderr
+    assert _numbers(tmp_path / "out") == _numbers(tmp_path / "whole")
+    pages = [(tmp_path / folder / "report.html").read_text().split("manifest")[0] for folder in ("out", "whole")]
+    assert pages[0] == pages[1]
+    assert "0005: alone at" in pages[0]
+    assert (tmp_path / "out/recording.rrd").stat().st_size > 20_000
+
+    measured.clear()
+    changed = tmp_path / "clips/a/labels/flips/0007.png"
+    assert cv2.imwrite(str(changed), np.zeros((H, W), np.uint8))
+    bench("run", *words, "--out", "out", cwd=tmp_path)
+    assert len(measured) == 2 * COUNT
+
+    measured.clear()
+    (tmp_path / "out/units/b__flips.json").write_text("{")
+    told = bench("run", *words, "--out", "out", cwd=tmp_path)
+    assert "b__flips.json: damaged; the video is measured again" in told.stderr
+    assert len(measured) == 2 * COUNT
+    bench("run", *words, "--out", "out", cwd=tmp_path)
+    assert len(measured) == 2 * COUNT

@@ -77,33 +77,32 @@ def check_frame(frame: Frame, num_classes: int) -> None:
 
 
 def check_depth(frame: Frame) -> None:
-    """Raise DataError where the frame's depth is finite nowhere, or cannot be metres."""
-    depth = frame.depth
+    """Raise DataError where the frame's depth is finite nowhere, or cannot be metres; of a scan its points cannot."""
+    depth, measured = frame.depth, frame.depth if frame.points is None else frame.points
     step = max(1, depth.size // CHECKED if len(depth) == 1 else int(math.sqrt(depth.size / CHECKED)))
-    some = depth[::step, ::step]
-    if frame.points is None and _has_fractions(some[len(some) // 2, : 8 * DISTINCT].tolist()):
+    sample = measured[::step, ::step]
+    has_fractions = _has_fractions(sample[len(sample) // 2, : 8 * DISTINCT].ravel().tolist())
+    if has_fractions and frame.points is None:
         return  # metres: a few of the middle tell of nearly all that are
-    if depth.size >= CHECKED and not np.isfinite(some).any() and not np.isfinite(depth).any():
+    if depth.size >= CHECKED and not np.isfinite(depth[::step, ::step]).any() and not np.isfinite(depth).any():
         raise DataError(f"{frame.where('depth')}: depth is finite nowhere (NaN or inf); leave this frame out")
-    if frame.points is not None and _whole_millimetres(some := frame.points[::step, ::step]):
+    if not has_fractions and _whole_millimetres(sample):
+        largest = np.max(np.abs(sample), initial=0, where=np.isfinite(sample))
         raise DataError(
-            f"{frame.where('points')}: points look like millimetres, whole numbers up to"
-            f" {np.max(np.abs(some), initial=0, where=np.isfinite(some)):.0f}; divide them by 1000"
-        )
-    if frame.points is None and _whole_millimetres(some):
-        raise DataError(
-            f"{frame.where('depth')}: depth looks like millimetres, whole numbers up to {np.nanmax(some):.0f};"
-            " divide it by 1000, or set depth_scale"
+            f"{frame.where('depth')}: depth looks like millimetres, whole numbers up to {largest:.0f}; divide it by"
+            " 1000, or set depth_scale"
+            if frame.points is None
+            else f"{frame.where('points')}: points look like millimetres, whole numbers up to {largest:.0f}; divide"
+            " them by 1000"
         )
 
 
 def _whole_millimetres(measured: Float32) -> bool:
     """Return whether what is measured is whole numbers, as nothing in metres is, and too large to be near."""
-    for some in (measured[:DISTINCT, : 8 * DISTINCT], measured):  # a few tell of nearly all that are none
-        known = np.abs(some[np.isfinite(some) & (some != 0)])
-        if known.size >= DISTINCT and not np.array_equal(known, np.floor(known)):
-            return False
-    return known.size >= DISTINCT and bool(np.median(known) >= FAR) and len(np.unique(known)) >= DISTINCT
+    known = np.abs(measured[np.isfinite(measured) & (measured != 0)])
+    if known.size < DISTINCT or not np.array_equal(known, np.floor(known)):
+        return False
+    return bool(np.median(known) >= FAR) and len(np.unique(known)) >= DISTINCT
 
 
 def _has_fractions(few: list[float]) -> bool:

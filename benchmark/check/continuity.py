@@ -104,11 +104,11 @@ class Chain:
         """Return whether two frames fit each other."""
         return self.error(a, b) <= min(FITS, max(CONTRADICTS, APART * self.usual))
 
-    def contradicts(self, pair: Pair, *beside: Pair) -> bool:
+    def contradicts(self, pair: Pair, *neighbours: Pair) -> bool:
         """Return whether two frames contradict each other, and those beside them do not."""
-        if not all(self.fits(*one) for one in beside):
+        if not all(self.fits(*one) for one in neighbours):
             return False
-        least = max(CONTRADICTS, *(APART * error for error in (self.usual, *(self.error(*one) for one in beside))))
+        least = max(CONTRADICTS, *(APART * error for error in (self.usual, *(self.error(*one) for one in neighbours))))
         return self.error(*pair) >= least
 
     def misfits(self) -> list[int]:
@@ -116,12 +116,12 @@ class Chain:
         triples = zip(self.positions, self.positions[1:], self.positions[2:], strict=False)
         return [b for a, b, c in triples if self._strange((a, b), (a, c)) and self._strange((b, c), (a, c))]
 
-    def _strange(self, pair: Pair, beside: Pair) -> bool:
+    def _strange(self, pair: Pair, neighbour: Pair) -> bool:
         """Return whether two frames contradict each other, or see nothing of each other where those beside them do."""
-        if self.contradicts(pair, beside):
+        if self.contradicts(pair, neighbour):
             return True
         share = self.links[pair].share if pair in self.links else 1.0
-        return self.fits(*beside) and share < UNSEEN <= SEEN <= self.links[beside].share
+        return self.fits(*neighbour) and share < UNSEEN <= SEEN <= self.links[neighbour].share
 
     def breaks(self) -> list[Pair]:
         """Return two successive frames between which poses jump: those before fit each other, as do those after."""
@@ -240,7 +240,7 @@ class Neighbours:
             return set()
         poses = [self._pose(index) for index in self.indices]
         steps = np.array([_step(a, b) for a, b in itertools.pairwise(poses)])
-        ratios = np.nan_to_num([_beside(steps, k) for k in range(len(steps))])
+        ratios = np.nan_to_num([_ratio_to_those_around(steps, k) for k in range(len(steps))])
         largest = [int(k) for k in np.argsort(-ratios)[:MOST_STEPS] if ratios[k] >= STRIKING_STEP]
         return {p for k in largest for p in range(k - 1, k + 3) if 0 <= p < len(self.indices)}
 
@@ -293,22 +293,23 @@ class Neighbours:
         first, chain = broken
         index, before = self.indices[first], self.indices[first - 1]
         across = chain.error(first - 1, first)
-        beside = max(chain.error(first - 2, first - 1), chain.error(first, first + 1))
+        around = max(chain.error(first - 2, first - 1), chain.error(first, first + 1))
         return (
             f"poses jump at frame {self.named(first)}: depth reprojects with {across:.1%} error from frame"
-            f" {self.named(first - 1)} to it, with {beside:.2%} among the frames before and among those after; correct"
+            f" {self.named(first - 1)} to it, with {around:.2%} among the frames before and among those after; correct"
             f" the poses, or fuse the two parts one by one (--frames :{before + 1} and --frames {index}:)"
         )
 
     def said_of_misfits(self, chain: Chain) -> Iterator[str]:
         """Yield a line on frames whose depth or pose does not fit that of their neighbours."""
-        found = chain.misfits()
-        if not found or len(found) > MOST_BAD * len(chain.positions):
+        misfits = chain.misfits()
+        if not misfits or len(misfits) > MOST_BAD * len(chain.positions):
             return
-        for position in found[:MOST_NAMED]:
+        for position in misfits[:MOST_NAMED]:
             yield f"{self._misfit(chain, position)}; correct it, or leave the frame out (setting frames.list)"
-        if len(found) > MOST_NAMED:
-            yield f"{len(found) - MOST_NAMED} more frames do not fit their neighbours: {self._list(found[MOST_NAMED:])}"
+        if len(misfits) > MOST_NAMED:
+            more = misfits[MOST_NAMED:]
+            yield f"{len(more)} more frames do not fit their neighbours: {self._list(more)}"
 
     def _misfit(self, chain: Chain, position: int) -> str:
         at = chain.positions.index(position)
@@ -327,10 +328,10 @@ class Neighbours:
 
     def said_of_labels(self, chain: Chain) -> Iterator[str]:
         """Yield a line on frames whose labels do not agree with those of their neighbours."""
-        found = chain.mislabelled()
-        if not found or self.source is None or len(found) > MOST_BAD * len(chain.positions):
+        mislabelled = chain.mislabelled()
+        if not mislabelled or self.source is None or len(mislabelled) > MOST_BAD * len(chain.positions):
             return
-        for position in found[:MOST_NAMED]:
+        for position in mislabelled[:MOST_NAMED]:
             at = chain.positions.index(position)
             before, after = chain.positions[at - 1], chain.positions[at + 1]
             agreement = max(chain.links[before, position].agreement, chain.links[position, after].agreement)
@@ -339,8 +340,8 @@ class Neighbours:
                 f" agrees with those of the frames beside it in {agreement:.0%} of the points, they with each other in"
                 f" {chain.links[before, after].agreement:.0%}: is it of another frame? Predict it again"
             )
-        if len(found) > MOST_NAMED:
-            yield f"labels of {self.source}: so it is in {len(found) - MOST_NAMED} more frames"
+        if len(mislabelled) > MOST_NAMED:
+            yield f"labels of {self.source}: so it is in {len(mislabelled) - MOST_NAMED} more frames"
 
     def _list(self, positions: Sequence[int]) -> str:
         listed = ", ".join(map(self.named, positions[:MOST_NAMED]))
@@ -357,7 +358,7 @@ def _step(first: Float64, second: Float64) -> float:
     return float(np.linalg.norm(t) + np.linalg.norm(R - np.eye(3)))
 
 
-def _beside(steps: Float64, k: int) -> float:
+def _ratio_to_those_around(steps: Float64, k: int) -> float:
     """Return a step's ratio to the median of those on both sides of it."""
     near = np.concatenate([steps[max(0, k - AROUND) : k], steps[k + 1 : k + 1 + AROUND]])
     return float(steps[k] / max(1e-9, np.nanmedian(near)))

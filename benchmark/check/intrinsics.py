@@ -95,13 +95,13 @@ def with_intrinsics(verdict: Verdict, sample: Sample, how: Reading) -> Verdict:
     """
     if verdict.mend and not _is_a_guess(verdict, how):
         return verdict
-    found = fitted(sample)
-    if found is None or (verdict.mend and SIMPLER * found.error > verdict.fits[1][1].error):
+    fit = fitted(sample)
+    if fit is None or (verdict.mend and SIMPLER * fit.error > verdict.fits[1][1].error):
         return verdict
-    if found.error > REFUSED * found.present and verdict.state != "unsound":
-        return dataclasses.replace(verdict, remarks=(*verdict.remarks, found.text()))
+    if fit.error > REFUSED * fit.present and verdict.state != "unsound":
+        return dataclasses.replace(verdict, remarks=(*verdict.remarks, fit.text()))
     return dataclasses.replace(
-        verdict, state="unsound", text=f"{found.text()}; correct the intrinsics", mend=(), undetermined=(), reason=""
+        verdict, state="unsound", text=f"{fit.text()}; correct the intrinsics", mend=(), undetermined=(), reason=""
     )
 
 

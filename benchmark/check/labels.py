@@ -115,7 +115,7 @@ class Alternative:
 
 def alternatives(width: int, height: int) -> tuple[Alternative, ...]:
     """Return the mistakes that are tried, for images of that size."""
-    found = [
+    mistakes = [
         Alternative("are one frame late", "give frame k the file of frame k + 1", step=1),
         Alternative("are one frame early", "give frame k the file of frame k - 1", step=-1),
         Alternative("are mirrored left to right", "mirror the files", change=lambda L, _: L[:, ::-1]),
@@ -131,11 +131,11 @@ def alternatives(width: int, height: int) -> tuple[Alternative, ...]:
         x, y = (min(width, height) / side for side in (width, height))
         crop = "are those of the central square of the image"
         padded = "have the padding to a square still in them"
-        found += [
+        mistakes += [
             Alternative(crop, "label the whole image", change=lambda L, none: _scaled(L, x, y, none)),
             Alternative(padded, "cut it off", change=lambda L, none: _scaled(L, 1 / y, 1 / x, none)),
         ]
-    return tuple(found)
+    return tuple(mistakes)
 
 
 def _fill(labels: Ids, shape: tuple[int, ...]) -> Ids:
@@ -268,7 +268,7 @@ class Comparison:
     agreement: Contrast
 
     @property
-    def is_found(self) -> bool:
+    def is_better(self) -> bool:
         """Return whether one measure is clearly better, and the other is not worse."""
         edges, agreement = self.edges, self.agreement
         by_edges = edges.is_clear and edges.other >= max(LEAST_FIT, BETTER * edges.given)
@@ -366,8 +366,8 @@ def check_labels(
     if (same := _identical(read_runs)) is not None:
         return LabelFindings(model, (f"labels of {model} {same}",), remarks)
     comparisons = compare(read_runs)
-    found = sorted((each for each in comparisons if each.is_found), key=lambda each: -each.edges.other)
-    wrong = tuple(f"labels of {model} {each}" for each in found[:1])
+    better = sorted((each for each in comparisons if each.is_better), key=lambda each: -each.edges.other)
+    wrong = tuple(f"labels of {model} {each}" for each in better[:1])
     return LabelFindings(model, wrong, remarks, None if wrong else _open(comparisons))
 
 

@@ -308,14 +308,14 @@ REGISTERED_FRAMES = 16
 
 def notes(scene: Scene, views: Sequence[View], model: str) -> Iterator[str]:
     """Yield one line each; the views have the labels of `model`, or none."""
-    some = [views[k] for k in evenly(len(views), REGISTERED_FRAMES)]
-    if (share := mean(np.array([np.mean((v.depth > 0) & (v.depth < np.inf)) for v in some]))) < FEW:
+    sampled = [views[k] for k in evenly(len(views), REGISTERED_FRAMES)]
+    if (share := mean(np.array([np.mean((v.depth > 0) & (v.depth < np.inf)) for v in sampled]))) < FEW:
         yield (
             f"{100 * share:.2g} % of the pixels have depth: labels of the others are in no map, and flicker is of those"
             " that have it"
         )
-    if (offset := find_offset(list(_edges(scene, some)))) is not None:
-        what = "the images" if some[0].labels is None else f"labels of {model}"
+    if (offset := find_offset(list(_edges(scene, sampled)))) is not None:
+        what = "the images" if sampled[0].labels is None else f"labels of {model}"
         mend = "register them to the depth"
         if "color_intrinsics" in scene.settings:
             mend = f"set {OPTION}color_intrinsics: [fx, fy, cx, cy], or {mend}"

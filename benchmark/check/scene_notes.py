@@ -28,8 +28,8 @@ def scene_notes(scene: Scene, indices: Sequence[int], model: str, config: Config
     predicted = config.dataset.name == PREDICTED
     inspection = Inspection(scene, indices, None if predicted else model, (), POINTS, fused=REGISTERED_FRAMES)
     views = [inspection.views[at] for at in sorted(inspection.views)]
-    found = [] if predicted else label_findings(scene, indices, [model], LABEL_RUNS)
+    findings = [] if predicted else label_findings(scene, indices, [model], LABEL_RUNS)
     return (
-        *(line for each in found for line in (*each.wrong, *each.remarks)),
+        *(line for each in findings for line in (*each.wrong, *each.remarks)),
         *notes(scene, views, model),
     )

@@ -32,8 +32,8 @@ def with_voxel_size(config: Config, scenes: Mapping[str, Scene]) -> tuple[Config
     """
     if config.sets_voxel_size or _is_made(config):
         return config, {}
-    some = [[*scenes.values()][k] for k in evenly(len(scenes), SCENES)]
-    coverages = {scene.name: coverage for scene in some if (coverage := _coverage(config, scene)) is not None}
+    sampled = [[*scenes.values()][k] for k in evenly(len(scenes), SCENES)]
+    coverages = {scene.name: coverage for scene in sampled if (coverage := _coverage(config, scene)) is not None}
     sizes = [size for coverage in coverages.values() if (size := suggested_size(coverage)) is not None]
     if not sizes:
         return config, {}

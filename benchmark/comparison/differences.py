@@ -302,7 +302,7 @@ def find(
                 each.name,
                 each.source,
                 each.model,
-                uninformative=all(each.scenes[row.scene].judged.startswith("uninformative") for row in scenes),
+                uninformative=all(each.scenes[row.scene].caveat.startswith("uninformative") for row in scenes),
             )
             for each in handles
         ),
@@ -335,18 +335,18 @@ def _scene(scene: str, runs: Sequence[RunHandle], scope: Scope) -> tuple[SceneCo
                 columns=Path(COLUMNS) / f"{slug(scene, names[0], names[n])}.parquet",
             )
         against.append(result)
-    judged = [f"{name} is {text}" for name, entry in zip(names, entries, strict=True) if (text := entry.judged)]
-    return _scene_comparison(scene, common, tuple(judged), tuple(against)), changes
+    caveats = [f"{name} is {text}" for name, entry in zip(names, entries, strict=True) if (text := entry.caveat)]
+    return _scene_comparison(scene, common, tuple(caveats), tuple(against)), changes
 
 
 def _scene_comparison(
-    scene: str, common: Common, judged: tuple[str, ...], against: tuple[Against, ...]
+    scene: str, common: Common, caveats: tuple[str, ...], against: tuple[Against, ...]
 ) -> SceneComparison:
     frames = min((sums.frame_count for sums in common.sums), default=0)
     voxels = len(common.tables[0]) if common.tables else 0
     voxels = int((common.tables[0].op >= 2).sum()) if voxels else 0
     return SceneComparison(
-        scene, common.basis, (*judged, *common.notes), voxels, frames, common.coverage, common.observations, against
+        scene, common.basis, (*caveats, *common.notes), voxels, frames, common.coverage, common.observations, against
     )
 
 

@@ -150,7 +150,7 @@ def _notes(run: RunHandle, base: RunHandle | None, scenes: Sequence[str]) -> lis
         f"{scene}: {each.name} is {why}"
         for scene in scenes
         for each in (run, base)
-        if each is not None and (why := each.scenes[scene].judged)
+        if each is not None and (why := each.scenes[scene].caveat)
     ]
     left = [scene for scene in run.scenes if scene not in scenes]
     missing = [scene for scene in (base.scenes if base else ()) if scene not in scenes]

@@ -105,7 +105,7 @@ class Entry(EntryNumbers):
         return tuple(replace(each, name=names.get(str(each.frame), "")) for each in frames)
 
     @property
-    def judged(self) -> str:
+    def caveat(self) -> str:
         """Why its agreement does not assess its labels, as its verdict has it; '' where it does."""
         statistics = self.summary.statistics
         if statistics is None or statistics.verdict.level not in ("uninformative", "misleading"):

@@ -60,7 +60,7 @@ def _value(value: Any) -> Any:
     if "scope" in named and "low" in named:  # an interval
         named["scope"] = SCOPES.get(named["scope"], named["scope"])
         named["locations"] = named.pop("places", 0)
-    if "alpha" in named and any(beside <= named.keys() for beside in VOXEL_ALPHA):
+    if "alpha" in named and any(names <= named.keys() for names in VOXEL_ALPHA):
         named["voxel_alpha"] = named.pop("alpha")
     if isinstance(named.get("blocks"), Mapping):  # statistics
         named["cubes"] = named.pop("blocks").get("count", 0)

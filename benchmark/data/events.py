@@ -111,7 +111,7 @@ class Events:
 
     def _few_at_a_time(self) -> Iterator[Events]:
         """Yield the logs of voxels one after the other, of as many as have little evidence when it is dense."""
-        edges = np.array([some.start for some in self.evidence.chunks()])
+        edges = np.array([chunk.start for chunk in self.evidence.chunks()])
         cuts = np.unique(np.append(np.searchsorted(self.starts, edges), len(self.ix))).tolist()
         for first, last in zip(cuts, cuts[1:] or cuts, strict=False):
             own, of = slice(self.bounds[first], self.bounds[last]), slice(first, last)
@@ -157,9 +157,9 @@ class Events:
     def save(self, path: str | Path, tile: parquet.Tile | None = None) -> None:
         """Write Parquet, atomically: one row an observation, with its voxel's index."""
 
-        def columns(some: slice) -> dict[str, npt.NDArray[Any]]:
-            own = {name: getattr(self, name)[some] for name in OF_EVENTS}
-            return own | {name: getattr(self, name)[self.voxel[some]] for name in INDEX}
+        def columns(chunk: slice) -> dict[str, npt.NDArray[Any]]:
+            own = {name: getattr(self, name)[chunk] for name in OF_EVENTS}
+            return own | {name: getattr(self, name)[self.voxel[chunk]] for name in INDEX}
 
         parts = map(columns, self.evidence.chunks())
         parquet.write(path, parts, type(self).__name__, self.voxel_size, self.classes, tile)

@@ -61,14 +61,14 @@ class Evidence(NDArrayOperatorsMixin):
         if isinstance(rows, Evidence):
             return rows
         dense = np.asarray(rows, dtype=np.float64)
-        return cls.read(len(dense), dense.shape[1], lambda some: dense[some])
+        return cls.read(len(dense), dense.shape[1], lambda chunk: dense[chunk])
 
     @classmethod
     def read(cls, rows: int, K: int, dense: Callable[[slice], Float64]) -> Evidence:
         """Read so many rows of an array or `Evidence`, dense (r, K)."""
         counts, labels, weights = [np.zeros(1, np.int64)], [], []
-        for some in row_chunks(rows, K):
-            part = dense(some)
+        for chunk in row_chunks(rows, K):
+            part = dense(chunk)
             row, label = np.nonzero(part)
             counts.append(np.bincount(row, minlength=len(part)))
             labels.append(label.astype(np.uint16))
@@ -151,7 +151,7 @@ class Evidence(NDArrayOperatorsMixin):
 
     def rowwise(self, formula: Callable[[Float64], npt.NDArray[Any]]) -> npt.NDArray[Any]:
         """Return what a formula makes of dense rows (r, K), chunk by chunk: (n, ...)."""
-        return np.concatenate([formula(self[some]) for some in self.chunks()])
+        return np.concatenate([formula(self[chunk]) for chunk in self.chunks()])
 
     @property
     def dtype(self) -> np.dtype[np.float64]:

@@ -61,7 +61,7 @@ class Voxels:
 def chunks(table: Beliefs) -> Iterator[Rows]:
     """Return the voxels, few enough at a time for dense evidence."""
     n, K = table.evidence.shape
-    return (Rows(table.op[some], table.evidence[some], table.drift_sum[some]) for some in row_chunks(n, K))
+    return (Rows(table.op[chunk], table.evidence[chunk], table.drift_sum[chunk]) for chunk in row_chunks(n, K))
 
 
 def by_chunk(formula: Callable[[Rows], Values]) -> Callable[[Beliefs], Values]:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy.typing as npt
 
@@ -49,6 +49,8 @@ class LonePicture:
         alone: (h, w) pixels whose label differs from that of each other frame, which all see the same surface point.
         color: (h, w, 3) its image; None where there is none.
     """
+
+    __pydantic_config__: ClassVar = {"arbitrary_types_allowed": True}  # JSON of a record holds no pictures
 
     frame: int
     labels: npt.NDArray[Any]

@@ -284,11 +284,11 @@ class VoxelTable:
         not read back.
         """
 
-        def columns(some: slice) -> dict[str, npt.NDArray[Any]]:
-            part = self.rows(some)
+        def columns(chunk: slice) -> dict[str, npt.NDArray[Any]]:
+            part = self.rows(chunk)
             own = {name: np.asarray(getattr(part, name)) for name in OF_VOXELS}
             made = {name: of(part) for name, of in (computed or {}).items()}
-            return own | made | {name: values[some] for name, values in (extra or {}).items()}
+            return own | made | {name: values[chunk] for name, values in (extra or {}).items()}
 
         parts = map(columns, self.evidence.chunks())
         parquet.write(path, parts, type(self).__name__, self.voxel_size, self.classes, tile)

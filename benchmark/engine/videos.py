@@ -4,15 +4,22 @@ from __future__ import annotations
 
 import contextlib
 import dataclasses
+import logging
 import math
 from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
 
 from semstab.config import Config
+from semstab.core.files import content_key, read_json, remove_leftovers, write_json
+from semstab.core.json_form import from_json, to_json
 from semstab.core.prefetch import prefetch
 from semstab.data.frames import Frame
 from semstab.data.measures import mean
+from semstab.data.records import UNITS
+from semstab.data.results import slug
 from semstab.data.statistics import OutlyingFrames
 from semstab.data.videos import LonePicture, VideoRecord, VideoResult, VideoRow
 from semstab.datasets import Scene
@@ -24,12 +31,27 @@ from semstab.metrics.video_measures import VideoMeter
 from semstab.statistics.frame_disagreement import LoneDisagreement, outlying_frames
 from semstab.task import Task, read, tasks_of, truth_task
 
+logger = logging.getLogger("semstab")
+
+FORMAT = 1
+"""Part of every key: raise it with any change of the numbers that a video's settings and input lead to."""
+
 
 class VideoObserver:
-    """An observer of a run over videos; override what is of interest."""
+    """An observer of a run over videos; override what is of interest.
+
+    Attributes:
+        of_earlier_starts: Whether it is also told the frames of videos that an earlier start measured; they are read
+            again for that.
+    """
+
+    of_earlier_starts = False
 
     def run_started(self, frames: int) -> None:
         """Take note that so many frames are to be measured, those of each model."""
+
+    def measured_earlier(self, records: Sequence[VideoRecord], of: int) -> None:
+        """Take note of the records, of so many in all, that an earlier start measured."""
 
     def frame_measured(self, task: Task, frame: Frame, numbers: Mapping[str, float]) -> None:
         """Take note of a frame of a model, whose labels are rows of the task's classes, and its numbers by column."""
@@ -41,19 +63,88 @@ class VideoObserver:
         """Take note of the end, also after an interruption."""
 
 
+@dataclass(frozen=True)
+class MeasuredEarlier:
+    """The videos that are measured, in a run's folder: a killed run goes on with the next one."""
+
+    folder: Path
+    config: Config
+
+    def load(self, tasks: Sequence[Task]) -> list[VideoRecord] | None:
+        """Return the records of the models on a video, if all were measured with these settings and this input."""
+        records = [self._load(task) for task in tasks]
+        known = [record for record in records if record is not None]
+        return known if len(known) == len(tasks) else None
+
+    def save(self, tasks: Sequence[Task], records: Sequence[VideoRecord]) -> None:
+        """Store the records of the models on a video; their pictures are made again from its frames."""
+        for task, record in zip(tasks, records, strict=True):
+            bare = dataclasses.replace(record, pictures=())
+            write_json(self._file(task), {"key": self._key(task), "record": to_json(bare)})
+
+    def _load(self, task: Task) -> VideoRecord | None:
+        path = self._file(task)
+        if not path.is_file():
+            return None
+        try:
+            content = read_json(path)
+            if not isinstance(content, dict) or content.get("key") != self._key(task):
+                return None
+            record = from_json(VideoRecord, content.get("record"), path)
+        except DataError:
+            logger.warning("%s: damaged; the video is measured again", path)
+            return None
+        return dataclasses.replace(record, pictures=tuple(_pictures(task, record.outlying, self.config.pixel_stride)))
+
+    def _file(self, task: Task) -> Path:
+        return self.folder / UNITS / f"{slug(task.scene.name, task.model)}.json"
+
+    def _key(self, task: Task) -> str:
+        """Return a hash of all that the numbers follow from."""
+        mapping, truth = task.mapping, truth_task(task)
+        content = {
+            "format": FORMAT,
+            "settings": self.config.model_dump(mode="json", include={"pixel_stride", "video_measures"}),
+            "unit": [task.scene.name, task.model],
+            "frames": [*task.indices],
+            "classes": [mapping.target.to_dict(), mapping.source.ids, mapping.rows],
+            "input": task.digest,
+            "truth": None if truth is None else [truth.mapping.rows, truth.scene.digest(_there(truth), truth.model)],
+        }
+        return content_key(to_json(content))
+
+
+def _there(truth: Task) -> list[int]:
+    """Return the frames that have ground truth."""
+    return [index for index in truth.indices if not truth.scene.missing(index, [truth.model])]
+
+
 def measured_videos(
-    config: Config, scenes: Mapping[str, Scene], observers: Sequence[VideoObserver]
+    config: Config, scenes: Mapping[str, Scene], observers: Sequence[VideoObserver], folder: Path | None = None
 ) -> Iterator[VideoRecord]:
-    """Yield the record of each model on each video.
+    """Yield the record of each model on each video; take those that an earlier start left in the folder.
 
     Raises:
         ConfigError, DataError: If labels, images or classes are missing or do not fit.
     """
     tasks = [_tasks(scene, config) for scene in scenes.values()]
+    earlier = None if folder is None else MeasuredEarlier(folder, config)
+    if folder is not None:
+        remove_leftovers(folder / UNITS)
+    known = [None if earlier is None else earlier.load(own) for own in tasks]
     for observer in observers:
-        observer.run_started(sum(len(task.indices) for own in tasks for task in own))
-    for own in tasks:
-        yield from _measured(own, config, observers)
+        observer.measured_earlier([record for records in known for record in records or ()], sum(map(len, tasks)))
+        missing = [own for own, records in zip(tasks, known, strict=True) if records is None]
+        observer.run_started(sum(len(task.indices) for own in missing for task in own))
+    for own, records in zip(tasks, known, strict=True):
+        if records is not None:
+            _show(own, records, config, [observer for observer in observers if observer.of_earlier_starts])
+            yield from records
+            continue
+        measured = _measured(own, config, observers)
+        if earlier is not None:
+            earlier.save(own, measured)
+        yield from measured
 
 
 def _tasks(scene: Scene, config: Config) -> list[Task]:
@@ -70,13 +161,10 @@ def _measured(tasks: Sequence[Task], config: Config, observers: Sequence[VideoOb
     meters = [_Meter(task, config, flows) for task in tasks]
 
     def decoded(index: int) -> list[tuple[Frame, Frame | None]]:
-        frames = [read(task, index, config.pixel_stride, color=k == 0) for k, task in enumerate(tasks)]
-        shown = [dataclasses.replace(frame, color=frames[0].color) for frame in frames]
-        return [(frame, meter.true(index)) for meter, frame in zip(meters, shown, strict=True)]
+        frames = _frames(tasks, index, config.pixel_stride)
+        return [(frame, meter.true(index)) for meter, frame in zip(meters, frames, strict=True)]
 
-    with contextlib.ExitStack() as stack:
-        for task in tasks:
-            stack.enter_context(task.scene.reading([*indices], task.model))
+    with _reading(tasks) as stack:
         fetched = prefetch(decoded, indices, threads=config.threads, size=lambda each: sum(f.nbytes for f, _ in each))
         for each in stack.enter_context(contextlib.closing(fetched)):
             for meter, (frame, truth) in zip(meters, each.item, strict=True):
@@ -84,6 +172,39 @@ def _measured(tasks: Sequence[Task], config: Config, observers: Sequence[VideoOb
                 for observer in observers:
                     observer.frame_measured(meter.task, frame, numbers)
     return [meter.record() for meter in meters]
+
+
+@contextlib.contextmanager
+def _reading(tasks: Sequence[Task]) -> Iterator[contextlib.ExitStack]:
+    """Announce to the video that its frames are read, each once, with the labels of all models."""
+    with contextlib.ExitStack() as stack:
+        for task in tasks:
+            stack.enter_context(task.scene.reading([*task.indices], task.model))
+        yield stack
+
+
+def _frames(tasks: Sequence[Task], index: int, stride: int) -> list[Frame]:
+    """Return a frame of each model; its image is decoded once."""
+    frames = [read(task, index, stride, color=k == 0) for k, task in enumerate(tasks)]
+    return [dataclasses.replace(frame, color=frames[0].color) for frame in frames]
+
+
+def _show(
+    tasks: Sequence[Task], records: Sequence[VideoRecord], config: Config, observers: Sequence[VideoObserver]
+) -> None:
+    """Tell observers the frames of a video that is measured already."""
+    if not observers:
+        return
+    with _reading(tasks):
+        for k, index in enumerate(tasks[0].indices):
+            for task, record, frame in zip(tasks, records, _frames(tasks, index, config.pixel_stride), strict=True):
+                numbers = {name: getattr(record.rows[k], name) for name in OF_A_FRAME}
+                for observer in observers:
+                    observer.frame_measured(task, frame, numbers)
+
+
+OF_A_FRAME = ("flicker_percent", "compensated_flicker_percent")
+"""The numbers of a frame that are known when it is measured."""
 
 
 class _Meter:
@@ -120,7 +241,7 @@ class _Meter:
         self._pixels += np.bincount(labelled, minlength=len(self._pixels))[: len(self._pixels)]
         self._times.append(math.nan if frame.timestamp is None else frame.timestamp)
         self._previous = frame
-        return {"flicker_percent": flicker, "compensated_flicker_percent": compensated}
+        return dict(zip(OF_A_FRAME, (flicker, compensated), strict=True))
 
     def record(self) -> VideoRecord:
         """Return the measures of all frames."""
@@ -149,7 +270,7 @@ class _Meter:
             largest_share=float(share[largest]),
             effective_classes=float(1 / (share**2).sum()),
             input=task.digest,
-            pictures=tuple(self._pictures(outlying)),
+            pictures=tuple(_pictures(task, outlying, self._stride)),
             colors=tuple(task.mapping.target.colors),
             rows=tuple(
                 VideoRow(
@@ -160,24 +281,23 @@ class _Meter:
             ),
         )  # fmt: skip
 
-    def _pictures(self, outlying: OutlyingFrames) -> Iterator[LonePicture]:
-        """Yield the frames that stand out most as pictures; they are read once more, with those beside them."""
-        indices = [*self.task.indices]
-        for each in outlying.frames[:PICTURED]:
-            at = indices.index(each.frame)
-            before, frame, after = (
-                read(self.task, index, self._stride, color=True) for index in indices[at - 1 : at + 2]
-            )
-            if before.shape == frame.shape == after.shape:
-                yield video_picture(frame, [before, after])
-
     def _outlying(self) -> OutlyingFrames:
         known = [own for own in self._meter.lone if own.pixels]
         share = np.array([own.share for own in known], np.float64)
-        found = LoneDisagreement(
+        disagreement = LoneDisagreement(
             np.array([own.frame for own in known], np.int64),
             np.array([own.pixels for own in known], np.int64),
             share,
             np.full(len(share), share.mean() if len(share) else math.nan),
         )
-        return outlying_frames(found, len(known), name=self.task.scene.frame_name)
+        return outlying_frames(disagreement, len(known), name=self.task.scene.frame_name)
+
+
+def _pictures(task: Task, outlying: OutlyingFrames, stride: int) -> Iterator[LonePicture]:
+    """Yield the frames that stand out most as pictures; they are read once more, with those beside them."""
+    indices = [*task.indices]
+    for each in outlying.frames[:PICTURED]:
+        at = indices.index(each.frame)
+        before, frame, after = (read(task, index, stride, color=True) for index in indices[at - 1 : at + 2])
+        if before.shape == frame.shape == after.shape:
+            yield video_picture(frame, [before, after])

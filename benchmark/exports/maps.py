@@ -48,9 +48,7 @@ def write_raster(chosen: Chosen, path: Path, cell: int = 1) -> int:
         MissingDependencyError: If rasterio is not installed.
     """
     try:
-        import rasterio
-        from rasterio import Affine
-        from rasterio.windows import Window as Pixels
+        import rasterio  # noqa: F401
     except ImportError as error:
         raise MissingDependencyError(f"{path}: .tif needs rasterio; {INSTALL}") from error
     part, seen, voxels = chosen.first, {}, 0
@@ -58,46 +56,74 @@ def write_raster(chosen: Chosen, path: Path, cell: int = 1) -> int:
         seen[tile] = _window(chosen[tile], cell)
         voxels += len(chosen[tile].table)
     whole = _fitting(functools.reduce(Window.around, seen.values()))
-    edge, (west, north) = cell * part.table.voxel_size, _corner(part, whole, cell)
-    height, width = whole.shape
-    shape: dict[str, Any] = {
-        "driver": "GTiff", "width": width, "height": height, "transform": Affine(edge, 0, west, 0, -edge, north),
-        "crs": None if part.georeference is None else rasterio.crs.CRS.from_wkt(part.georeference.crs),
-        "compress": "deflate", "tiled": True, "blockxsize": 256, "blockysize": 256, "bigtiff": "if_safer",
-    }  # fmt: skip
-    legend = {str(k): name for k, name in enumerate(("unclassified", *part.classes))}
-    names = ("class", *part.columns, "stable", "height")
-    many: dict[str, Any] = {"count": len(names), "dtype": "float32", "nodata": np.nan, "predictor": 3}
-    kind = np.uint8 if len(legend) <= 2**8 else np.uint16
-    palette = {0: (0, 0, 0, 0)} | {k: (*map(int, color), 255) for k, color in enumerate(part.colors, start=1)}
-    one: dict[str, Any] = {"count": 1, "dtype": kind, "nodata": 0}
+    grid, names = _grid(part, whole, cell), _names(part)
+    few = len(part.classes) < 2**8
     with (
         atomic_path(path) as temporary,
         atomic_path(path.with_suffix(f".class{path.suffix}")) as temporary_classes,
-        _raster(temporary, **many, **shape) as file,
-        _raster(temporary_classes, **one, **shape) as classes,
+        _raster(temporary, count=len(names), dtype="float32", nodata=np.nan, predictor=3, **grid) as measures,
+        _raster(temporary_classes, count=1, dtype="uint8" if few else "uint16", nodata=0, **grid) as classes,
     ):
         for window in whole.parts():
             parts = [chosen[tile] for tile, own in seen.items() if own.meets(window)]
             bands = _bands(together(parts), cell, window) if parts else {}
-            at = Pixels(window.low[1] - whole.low[1], whole.high[0] - window.high[0], *reversed(window.shape))
             nothing = np.full(window.shape, np.nan, np.float32)
-            for number, name in enumerate(names, start=1):
-                file.write(bands[name].values if bands else nothing, number, at)
-            label = bands["class"].values if bands else nothing
-            classes.write(np.nan_to_num(label, nan=0).astype(kind), 1, at)
-        for number, (name, unit, about) in enumerate(_abouts(part), start=1):
-            file.raster.set_band_description(number, name)
-            file.raster.set_band_unit(number, unit)
-            file.raster.update_tags(number, about=about)
-        file.raster.update_tags(1, **legend)
-        if part.benchmark:
-            file.raster.update_tags(benchmark=part.benchmark)
-            classes.raster.update_tags(benchmark=part.benchmark)
-        classes.raster.write_colormap(1, palette)
-        classes.raster.set_band_description(1, "class")
-        classes.raster.update_tags(1, **legend)
+            values = {name: bands[name].values if bands else nothing for name in names}
+            _write_window(measures, classes, values, window.within(whole))
+        _describe_measures(measures.raster, part)
+        _describe_classes(classes.raster, part)
     return voxels
+
+
+def _names(part: Voxels) -> tuple[str, ...]:
+    """Return the names of the bands of measures."""
+    return ("class", *part.columns, "stable", "height")
+
+
+def _grid(part: Voxels, whole: Window, cell: int) -> dict[str, Any]:
+    """Return where the cells of a raster lie, and how they are stored."""
+    import rasterio
+
+    edge, (west, north) = cell * part.table.voxel_size, _corner(part, whole, cell)
+    height, width = whole.shape
+    return {
+        "driver": "GTiff", "width": width, "height": height,
+        "transform": rasterio.Affine(edge, 0, west, 0, -edge, north),
+        "crs": None if part.georeference is None else rasterio.crs.CRS.from_wkt(part.georeference.crs),
+        "compress": "deflate", "tiled": True, "blockxsize": 256, "blockysize": 256, "bigtiff": "if_safer",
+    }  # fmt: skip
+
+
+def _write_window(measures: _Raster, classes: _Raster, values: Mapping[str, npt.NDArray[Any]], window: Any) -> None:
+    """Write the bands of a window, the classes into the file of their colours, too."""
+    for number, band in enumerate(values.values(), start=1):
+        measures.write(band, number, window)
+    kind = classes.raster.dtypes[0]
+    classes.write(np.nan_to_num(values["class"], nan=0).astype(kind), 1, window)
+
+
+def _describe_measures(raster: Any, part: Voxels) -> None:
+    """Say what the bands are, and the classes by number."""
+    for number, (name, unit, about) in enumerate(_abouts(part), start=1):
+        raster.set_band_description(number, name)
+        raster.set_band_unit(number, unit)
+        raster.update_tags(number, about=about)
+    raster.update_tags(1, **_legend(part))
+    if part.benchmark:
+        raster.update_tags(benchmark=part.benchmark)
+
+
+def _describe_classes(raster: Any, part: Voxels) -> None:
+    """Say which classes the numbers mean, and their colours."""
+    if part.benchmark:
+        raster.update_tags(benchmark=part.benchmark)
+    raster.write_colormap(1, {0: (0, 0, 0, 0)} | {k: (*map(int, c), 255) for k, c in enumerate(part.colors, start=1)})
+    raster.set_band_description(1, "class")
+    raster.update_tags(1, **_legend(part))
+
+
+def _legend(part: Voxels) -> dict[str, str]:
+    return {str(k): name for k, name in enumerate(("unclassified", *part.classes))}
 
 
 @dataclass
@@ -161,6 +187,12 @@ class Window:
     def meets(self, other: Window) -> bool:
         """Return whether they share a cell."""
         return all(self.low[k] <= other.high[k] and other.low[k] <= self.high[k] for k in (0, 1))
+
+    def within(self, whole: Window) -> Any:
+        """Return it as rasterio's window of the pixels of a raster."""
+        from rasterio.windows import Window as Pixels
+
+        return Pixels(self.low[1] - whole.low[1], whole.high[0] - self.high[0], *reversed(self.shape))
 
     def parts(self) -> Iterator[Window]:
         """Yield windows that make it up, WINDOW cells a side, from the farthest row on, as files have their blocks."""
@@ -327,16 +359,16 @@ def write_mesh(chosen: Chosen, path: Path) -> int:
     import trimesh
 
     corners = {tile: chosen[tile].table.index.min(axis=0).astype(np.int64) for tile in chosen.tiles()}
-    some, low = chosen.first, np.min([*corners.values()], axis=0)
+    first, low = chosen.first, np.min([*corners.values()], axis=0)
     extras = {
-        "origin": (some.linear @ (low * some.table.voxel_size) + some.offset).tolist(),
-        "coordinates": "the scene" if some.georeference is None else crs_name(some.georeference),
-        "voxel_size": some.table.voxel_size,
-        "classes": list(some.classes),
-        "benchmark": some.benchmark,
+        "origin": (first.linear @ (low * first.table.voxel_size) + first.offset).tolist(),
+        "coordinates": "the scene" if first.georeference is None else crs_name(first.georeference),
+        "voxel_size": first.table.voxel_size,
+        "classes": list(first.classes),
+        "benchmark": first.benchmark,
     }
     scene: Any = trimesh.Scene(metadata=extras)
-    voxels, size, to_gltf = 0, 0, some.table.voxel_size * (_to_gltf(some.up) @ some.linear).T
+    voxels, size, to_gltf = 0, 0, first.table.voxel_size * (_to_gltf(first.up) @ first.linear).T
     for tile in corners:
         part = chosen[tile]
         voxels += len(part.table)
@@ -352,7 +384,7 @@ def write_mesh(chosen: Chosen, path: Path) -> int:
             trimesh.Trimesh(
                 (corner @ to_gltf).astype(np.float32),
                 np.concatenate([quads[:, [0, 1, 2]], quads[:, [0, 2, 3]]]).astype(np.uint32),
-                vertex_colors=some.colors[label],
+                vertex_colors=first.colors[label],
                 process=False,
             )
         )

@@ -83,13 +83,10 @@ def relabel(
     belief, name, space = belief or Belief(), name or f"{record.unit.model}-fused", task.mapping.target
     folder = _folder(Path(out), name, task, record, belief, overwrite=overwrite)
     fused = FusedLabels(Tiles.open(record.voxels_file, VoxelTable), belief, len(space))
-    tally = Tally(len(space))
     with contextlib.closing(folder):
+        tally = Tally(len(space))
         for done, (frame, rows, known) in enumerate(_fused_frames(task, fused, pixel_stride), start=1):
-            maps = _label_map(rows, task)
-            if done == 1:
-                _require_size_of_depth(task, frame, maps)
-            folder.write(task.scene.image_name(frame.index), record.key, maps, 0.0)
+            _write_map(folder, record.key, task, frame, rows)
             tally.add(frame, rows, known)
             progress(f"{task.scene.name} · {name}", done, len(task.indices))
         folder.require_whole()
@@ -123,6 +120,14 @@ def _fused_frames(task: Task, fused: FusedLabels, pixel_stride: int) -> Iterator
         return frame, fused.of(frame, pixel_stride), known
 
     return (fetched.item for fetched in prefetch(read_and_fuse, task.indices))
+
+
+def _write_map(folder: PredictionFolder, key: str, task: Task, frame: Frame, rows: Int64) -> None:
+    """Write the label map of a frame's fused rows (H, W)."""
+    maps = _label_map(rows, task)
+    if frame.index == task.indices[0]:
+        _require_size_of_depth(task, frame, maps)
+    folder.write(task.scene.image_name(frame.index), key, maps, 0.0)
 
 
 def _label_map(rows: Int64, task: Task) -> UInt8 | UInt16:

@@ -107,11 +107,11 @@ def boards(folder: Path, definitions: Mapping[str, Benchmark] | None = None) -> 
     files = sorted(folder.rglob(f"*{SUFFIX}"))
     if not files:
         raise ConfigError(f"{folder}: it holds no result, NAME{SUFFIX}; write one with benchmark ... --submit")
-    found: dict[str, tuple[Benchmark, list[Result]]] = {}
+    by_benchmark: dict[str, tuple[Benchmark, list[Result]]] = {}
     for file in files:
         benchmark, about, handle = load_submission(file, definitions)
-        found.setdefault(benchmark.id, (benchmark, []))[1].append((str(file.relative_to(folder)), about, handle))
-    return tuple(board_of(benchmark, results) for _, (benchmark, results) in sorted(found.items()))
+        by_benchmark.setdefault(benchmark.id, (benchmark, []))[1].append((str(file.relative_to(folder)), about, handle))
+    return tuple(board_of(benchmark, results) for _, (benchmark, results) in sorted(by_benchmark.items()))
 
 
 def board_of(benchmark: Benchmark, results: Sequence[Result]) -> Board:

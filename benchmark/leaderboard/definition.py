@@ -186,8 +186,8 @@ class Benchmark(Settings):
             return
         for name, scene in self.open_scenes(data).items():
             known, indices = self.digests.get(name, "").split(), self.selected(scene)
-            for (index, found), expected in zip(self._found(scene, indices), known, strict=False):
-                for (what, hashed), stated in zip(found.items(), expected.split("-"), strict=True):
+            for (index, hashes), expected in zip(self._hashes(scene, indices), known, strict=False):
+                for (what, hashed), stated in zip(hashes.items(), expected.split("-"), strict=True):
                     if hashed != stated:
                         raise DataError(f"{name}: {what} differs from that of {self.id} (frame {index}); {self._again}")
             if len(indices) != len(known):
@@ -206,12 +206,12 @@ class Benchmark(Settings):
     def digests_of(self, data: Path | None = None) -> dict[str, str]:
         """Return the hashes of the data as a definition states them."""
         return {
-            name: " ".join("-".join(found.values()) for _, found in self._found(scene, self.selected(scene)))
+            name: " ".join("-".join(hashes.values()) for _, hashes in self._hashes(scene, self.selected(scene)))
             for name, scene in self.open_scenes(data).items()
         }
 
     @staticmethod
-    def _found(scene: Scene, indices: Sequence[int]) -> Iterator[tuple[int, Mapping[str, str]]]:
+    def _hashes(scene: Scene, indices: Sequence[int]) -> Iterator[tuple[int, Mapping[str, str]]]:
         """Yield frames of a scene with their hashes, in order."""
         for index, fetched in zip(indices, prefetch(scene.fingerprints, indices), strict=True):
             yield index, fetched.item

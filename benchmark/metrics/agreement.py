@@ -139,7 +139,7 @@ def compare(
     if sum(only_in) > voxel_share * max(len(a), len(b)):
         first = next(_in_one_only(a, b, in_a, in_b))
     for name in differences:
-        first = first or _joined([found for chunk in chunks if (found := chunk[name].first) is not None])
+        first = first or _joined([place for chunk in chunks if (place := chunk[name].first) is not None])
     return Agreement(
         scene=units[0].scene,
         model=units[0].model,

@@ -112,9 +112,9 @@ def lone_picture(frame: Frame, others: Sequence[Frame]) -> LonePicture:
 
 def picture_of(frame: Frame, sample: Frame, alone: Mask) -> LonePicture:
     """Return a frame, a sample of its pixels, and those of them that stand alone (H, W), as a small picture."""
-    some = thumbnail(sample.shape)
+    pixels = thumbnail(sample.shape)
     color = None if frame.color is None else frame.color[thumbnail(frame.color.shape)]
-    return LonePicture(frame.index, sample.predicted[some], alone[some], color)
+    return LonePicture(frame.index, sample.predicted[pixels], alone[pixels], color)
 
 
 def picture_arrays(pictures: Sequence[LonePicture]) -> dict[str, npt.NDArray[Any]]:

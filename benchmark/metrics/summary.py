@@ -82,8 +82,8 @@ class TableSums:
         category, K = np.zeros(len(CATEGORIES)), table.K if table.K <= MOST_CONFUSED else 0
         confusion = np.zeros((K, K))
         by_op = np.zeros((1 + 3 * len(measures()), len(finest) + 1))
-        for some in stretches(len(table)):
-            rows = Voxels(table.op[some], table.evidence.take(some).measured(), table.drift_sum[some])
+        for stretch in stretches(len(table)):
+            rows = Voxels(table.op[stretch], table.evidence.take(stretch).measured(), table.drift_sum[stretch])
             values = [measure.of(rows) for measure in measures()]
             sums[1] += _by_group(values, rows.op, dominant(rows), table.K)
             by_op += _by_group(values, rows.op, groups_of(rows.op, finest), by_op.shape[1])

@@ -89,6 +89,8 @@ def _largest_plane(points: Float64, distance: float, rng: np.random.Generator) -
     offset = np.where(normal.any(axis=1), -(normal * a).sum(axis=1), np.inf)  # three points in a line are no plane
     plane = np.column_stack([normal, offset]).astype(np.float32)
     homogeneous = np.vstack([points.T, np.ones(len(points))]).astype(np.float32)
-    within = [np.count_nonzero(np.abs(some @ homogeneous) <= distance, axis=1) for some in np.split(plane, DRAW_CHUNKS)]
+    within = [
+        np.count_nonzero(np.abs(chunk @ homogeneous) <= distance, axis=1) for chunk in np.split(plane, DRAW_CHUNKS)
+    ]
     inlier: Mask = np.abs(plane[int(np.argmax(np.concatenate(within)))] @ homogeneous) <= distance
     return inlier

@@ -15,9 +15,10 @@ from pathlib import Path
 from typing import Any
 
 from rich.console import Console
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn
+from rich.progress import TextColumn
 
 from semstab.config import DatasetConfig, FrameSelection, validated
+from semstab.core.progress import frame_progress
 from semstab.data.frames import Frame
 from semstab.datasets import Scene, open_dataset, options_model
 from semstab.datasets.formats.disk import natural
@@ -118,7 +119,7 @@ def file_job(pattern: str, frames: FrameSelection, out: Path | None) -> Job:
     if out is None:
         raise ConfigError("--images: predictions of single images need a folder; name it with --out")
     files = ImageFiles(pattern)
-    return Job(files, _some(frames.indices(len(files)), files), out)
+    return Job(files, _require_some(frames.indices(len(files)), files), out)
 
 
 def scene_jobs(
@@ -143,7 +144,7 @@ def scene_jobs(
     jobs = []
     for name in names:
         scene = opened.scene(name)
-        indices = _some(select_frames(scene, frames, **looks_at).indices, scene)
+        indices = _require_some(select_frames(scene, frames, **looks_at).indices, scene)
         jobs.append(Job(scene, indices, _folder_for(scene, out if out is None or len(names) == 1 else out / name)))
     return jobs
 
@@ -155,7 +156,7 @@ def _folder_for(scene: Scene, out: Path | None) -> Path:
     return folder
 
 
-def _some(indices: list[int], sequence: ImageSequence) -> list[int]:
+def _require_some(indices: list[int], sequence: ImageSequence) -> list[int]:
     if not indices:
         raise ConfigError(
             f"{sequence.name}: the selection of frames leaves none of its {len(sequence)}; change --frames"
@@ -170,13 +171,7 @@ class PredictionBar(PredictionObserver):
     """One bar a sequence. Speed and time left count frames that the model saw, not those of an earlier start."""
 
     def __init__(self, console: Console) -> None:
-        columns = (
-            TextColumn("{task.description}", markup=False),
-            BarColumn(),
-            MofNCompleteColumn(),
-            TextColumn("frames"),
-        )
-        self._bar = Progress(*columns, TextColumn("{task.fields[speed]}"), console=console, transient=True)
+        self._bar = frame_progress(console, TextColumn("{task.fields[speed]}"))
         self._work = self._bar.add_task("starting", total=None, speed="")
         self._left = self._predicted = 0
         self._started = time.monotonic()

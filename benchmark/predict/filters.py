@@ -156,13 +156,13 @@ def parse(text: str) -> FilterSpec:
     return FilterSpec(name, number, kind)
 
 
-def too_sparse(filters: Sequence[FilterSpec], found: float) -> str | None:
+def too_sparse(filters: Sequence[FilterSpec], density: float) -> str | None:
     """Return why filters that warp cannot be used with depth of that density; None where they can, or none warps."""
     warped = [str(spec) for spec in filters if spec.kind.warps]
-    if not warped or not found < LEAST_DENSITY:
+    if not warped or not density < LEAST_DENSITY:
         return None
     return (
-        f"depth is sparse: {100 * found:.0f} % of the neighbours of a pixel with depth have depth,"
+        f"depth is sparse: {100 * density:.0f} % of the neighbours of a pixel with depth have depth,"
         f" {100 * LEAST_DENSITY:.0f} % are needed; {', '.join(warped)} would find few points in the frame before: make"
         " depth dense, or use ema or vote"
     )

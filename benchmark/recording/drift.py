@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import PurePath
 from typing import Any, NamedTuple
@@ -189,6 +190,28 @@ def top_voxels(table: VoxelTable) -> Int64:
     return rows[chosen]
 
 
+@dataclass(frozen=True, eq=False)
+class Drifted:
+    """A voxel that drifted much, and the frames that moved it.
+
+    Attributes:
+        number: From 1 on, in the order of the drift.
+        center: (3,) world coordinates, metres.
+        op, bits, sbd: Its observations, the drift of all together and their mean, bits.
+        first_frame, first_class: The frame that saw it first, and its dominant class then.
+        moves: Records of MOVE.
+    """
+
+    number: int
+    center: Float64
+    op: np.integer[Any]
+    bits: np.floating[Any]
+    sbd: np.floating[Any]
+    first_frame: int
+    first_class: int
+    moves: npt.NDArray[np.void]
+
+
 class DriftLog:
     """A log of the frames that moved the beliefs of a map, and of where they were taken."""
 
@@ -227,52 +250,76 @@ class DriftLog:
         """Log a lane with the dominant class of each top voxel of a map, its moves in words, and its position."""
         if not self._views:
             return
-        top, names = top_voxels(table), classes.classes
-        bits, first_frame, op = table.drift_sum[top], table.first_frame[top], table.op[top]
-        voxels, centers = packed(table.index[top]), table.centers[top]
+        drifted = self._drifted(table)
+        for voxel in drifted:
+            self._log_lane(stream, path(scene, "flips", model, f"voxel_{voxel.number}"), voxel, classes, clock)
+        report = "\n".join(self._report(model, drifted, classes.classes)) + "\n"
+        text = rr.TextDocument(report, media_type=rr.MediaType.MARKDOWN)
+        stream.log(path(scene, "flips_report", model), text, static=True)
+        if drifted:
+            centers = np.array([voxel.center for voxel in drifted])
+            numbers = [f"{voxel.number}" for voxel in drifted]
+            points = rr.Points3D(
+                centers - translation, labels=numbers, colors=COLORS[: len(drifted)], radii=rr.Radius.ui_points(5.0),
+                show_labels=True,
+            )  # fmt: skip
+            stream.log(path(scene, "flips_at", model), points, static=True)
+            self._log_in_images(stream, path(scene, "camera", model, "flips"), centers, clock)
+
+    def _drifted(self, table: VoxelTable) -> list[Drifted]:
+        """Return the top voxels of a map, with the frames that moved them."""
+        top = top_voxels(table)
+        bits, op = table.drift_sum[top], table.op[top]
+        voxels, centers, first_frame = packed(table.index[top]), table.centers[top], table.first_frame[top]
         class_now, sbd = np.asarray(table.evidence.take(top)).argmax(axis=1), mean_drift(bits, op)
-        every = np.concatenate([np.zeros(0, dtype=MOVE), *self._moves])
-        lines = [f"**{model}**: the voxels with the largest drift, and the frames that moved them", ""]
-        lines += [] if len(top) else ["No voxel drifted."]
-        lanes = rr.StateConfiguration(values=names, labels=names, colors=[(*color, 255) for color in classes.colors])
+        every, drifted = np.concatenate([np.zeros(0, dtype=MOVE), *self._moves]), []
         for i, voxel in enumerate(voxels):
             moves = every[every["voxel"] == voxel]
             first = int(moves["before"][0]) if len(moves) else int(class_now[i])
-            x, y, z = centers[i]
-            lines.append(
-                f"- **voxel {i + 1}** at ({x:.2f}, {y:.2f}, {z:.2f}) m: OP {op[i]}, drift {bits[i]:.3f} bits in all,"
-                f" SBD {sbd[i]:.4f} bits; {names[first]} in frame {first_frame[i]}"
+            drifted.append(Drifted(i + 1, centers[i], op[i], bits[i], sbd[i], int(first_frame[i]), first, moves))
+        return drifted
+
+    def _log_lane(
+        self, stream: rr.RecordingStream, lane: str, voxel: Drifted, classes: LabelSpace, clock: Clock
+    ) -> None:
+        """Log the dominant class of a voxel from frame to frame."""
+        names, colors = classes.classes, [(*color, 255) for color in classes.colors]
+        stream.log(lane, rr.StateConfiguration(values=names, labels=names, colors=colors), static=True)
+        changes = [(frame, after) for _, frame, before, after, _ in voxel.moves.tolist() if before != after]
+        for frame, label in [(voxel.first_frame, voxel.first_class), *changes]:
+            clock.set(stream, frame, self._views[frame].timestamp)
+            stream.log(lane, rr.StateChange(state=names[label]))
+
+    def _report(self, model: str, drifted: Sequence[Drifted], names: Sequence[str]) -> Iterator[str]:
+        """Yield lines of Markdown on voxels and the frames that moved them."""
+        yield f"**{model}**: the voxels with the largest drift, and the frames that moved them"
+        yield ""
+        if not drifted:
+            yield "No voxel drifted."
+        for voxel in drifted:
+            x, y, z = voxel.center
+            yield (
+                f"- **voxel {voxel.number}** at ({x:.2f}, {y:.2f}, {z:.2f}) m: OP {voxel.op}, drift {voxel.bits:.3f}"
+                f" bits in all, SBD {voxel.sbd:.4f} bits; {names[voxel.first_class]} in frame {voxel.first_frame}"
             )
-            lane = path(scene, "flips", model, f"voxel_{i + 1}")
-            stream.log(lane, lanes, static=True)
-            clock.set(stream, int(first_frame[i]), self._views[int(first_frame[i])].timestamp)
-            stream.log(lane, rr.StateChange(state=names[first]))
-            for _, frame, before, after, moved in moves.tolist():
-                view, change = self._views[frame], f"stays {names[before]}"
-                if before != after:
-                    change = f"**{names[before]} → {names[after]}**"
-                    clock.set(stream, frame, view.timestamp)
-                    stream.log(lane, rr.StateChange(state=names[after]))
-                lines.append(f"    - frame {frame}{f' ({view.file})' if view.file else ''}: {change}, {moved:.4f} bits")
-        report = rr.TextDocument("\n".join(lines) + "\n", media_type=rr.MediaType.MARKDOWN)
-        stream.log(path(scene, "flips_report", model), report, static=True)
-        if not len(top):
-            return
-        labels, colors = [f"{i + 1}" for i in range(len(top))], COLORS[: len(top)]
-        points = rr.Points3D(
-            centers - translation, labels=labels, colors=colors, radii=rr.Radius.ui_points(5.0), show_labels=True
-        )
-        stream.log(path(scene, "flips_at", model), points, static=True)
-        for index, view in self._views.items():  # the view of an image would also draw 3D points outside of it
+            for _, frame, before, after, moved in voxel.moves.tolist():
+                file = self._views[frame].file
+                change = f"**{names[before]} → {names[after]}**" if before != after else f"stays {names[before]}"
+                yield f"    - frame {frame}{f' ({file})' if file else ''}: {change}, {moved:.4f} bits"
+
+    def _log_in_images(self, stream: rr.RecordingStream, entity: str, centers: Float64, clock: Clock) -> None:
+        """Log the numbers of voxels at their pixels: the view of an image would also draw 3D points outside of it."""
+        numbers, colors = [f"{i + 1}" for i in range(len(centers))], COLORS[: len(centers)]
+        for index, view in self._views.items():
             if view.intrinsics is None:
                 continue
             pixels, inside = view.project(centers)
             clock.set(stream, index, view.timestamp)
-            numbers = rr.Points2D(
+            points = rr.Points2D(
                 pixels[inside],
-                labels=list(itertools.compress(labels, inside)),
+                labels=list(itertools.compress(numbers, inside)),
                 colors=list(itertools.compress(colors, inside)),
                 radii=rr.Radius.ui_points(4.0),
                 show_labels=True,
             )
-            stream.log(path(scene, "camera", model, "flips"), numbers)
+            stream.log(entity, points)

@@ -33,6 +33,8 @@ class VideoRecording(VideoObserver):
         target: Its file, and the viewer that follows it.
     """
 
+    of_earlier_starts = True
+
     def __init__(self, target: Target) -> None:
         self._target, self._clock = target, Clock()
         self._background: FrameJobs | None = None

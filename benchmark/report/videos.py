@@ -45,6 +45,11 @@ class VideoProgress(VideoObserver):
         """Show the bar."""
         self._bar.begin(frames)
 
+    def measured_earlier(self, records: Sequence[VideoRecord], of: int) -> None:
+        """Say how much there is."""
+        if records:
+            self._bar.bar.console.print(f"measured earlier: {len(records)} of {of} label sources", style="dim")
+
     def frame_measured(self, task: Task, frame: Frame, numbers: Mapping[str, float]) -> None:
         """Advance the bar."""
         self._bar.advanced(1, f"{task.scene.name} · {task.model}")

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import functools
 import math
+import operator
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from typing import Any
 
 import numpy as np
@@ -103,18 +105,49 @@ def correctness(belief: Float64 | Evidence, label: Int64, name: str = "all") -> 
     return correctness_of(prediction_sums(Predictions.of(belief, label), label >= 0), name)
 
 
-def prediction_sums(predictions: Predictions, where: Mask) -> Float64:
-    """Return the sums (3 + 3 BINS + 3 K,) that `correctness_of` takes, over the voxels for which `where` (n,) holds.
+@dataclass(frozen=True, eq=False)
+class PredictionSums:
+    """Sums over predictions, from which their correctness and calibration follow; those of disjoint parts add up.
 
-    They are voxels, right ones and errors; by bin of confidence voxels, confidence and right ones; by class right,
-    true and predicted ones.
+    Attributes:
+        error: Sum of the squared distances, for Brier's score.
+        voxels_of_bin, confidence_of_bin, right_of_bin: (BINS,) by bin of confidence the voxels, the sum of their
+            confidence, and the right ones.
+        right_of_class, true_of_class, predicted_of_class: (K,) by class the right voxels, those of which it is the true
+            class, and those of which it is the most likely one.
     """
-    sums: Float64 = _prediction_sums_by_group(predictions, where - np.int64(1), 1)[0]
+
+    error: float
+    voxels_of_bin: Float64
+    confidence_of_bin: Float64
+    right_of_bin: Float64
+    right_of_class: Float64
+    true_of_class: Float64
+    predicted_of_class: Float64
+
+    def __add__(self, other: PredictionSums) -> PredictionSums:
+        """Return the sums over both."""
+        return PredictionSums(*(getattr(self, each.name) + getattr(other, each.name) for each in fields(self)))
+
+    @property
+    def voxels(self) -> int:
+        """Number of voxels."""
+        return int(self.voxels_of_bin.sum())
+
+    @property
+    def right(self) -> int:
+        """Number of right voxels."""
+        return int(self.right_of_bin.sum())
+
+
+def prediction_sums(predictions: Predictions, where: Mask) -> PredictionSums:
+    """Return the sums over the voxels for which `where` (n,) holds."""
+    (sums,) = _prediction_sums_by_group(predictions, where - np.int64(1), 1)
     return sums
 
 
-def _prediction_sums_by_group(predictions: Predictions, group: Int64, groups: int) -> Float64:
-    """Return (G, ...) `prediction_sums` of each group; -1 is none."""
+def _prediction_sums_by_group(predictions: Predictions, group: Int64, groups: int) -> list[PredictionSums]:
+    """Return the sums of each group; -1 is none."""
     rows, K = np.flatnonzero(group >= 0), predictions.K
     of, label, predicted, confidence = (
         group[rows],
@@ -129,33 +162,29 @@ def _prediction_sums_by_group(predictions: Predictions, group: Int64, groups: in
         result = np.bincount(of * width + within, weights=weights, minlength=groups * width)
         return result.astype(np.float64).reshape(groups, width)
 
-    return np.hstack([
-        sums(1, 0), sums(1, 0, right), sums(1, 0, predictions.error[rows]),
+    of_groups = zip(
+        sums(1, 0, predictions.error[rows]),
         sums(BINS, bins), sums(BINS, bins, confidence), sums(BINS, bins, right),
-        sums(K, label, right), sums(K, label), sums(K, predicted),
-    ])  # fmt: skip
+        sums(K, label, right), sums(K, label), sums(K, predicted), strict=True,
+    )  # fmt: skip
+    return [PredictionSums(float(error), *of_bins_and_classes) for (error,), *of_bins_and_classes in of_groups]
 
 
-def correctness_of(sums: Float64, name: str = "all") -> Correctness:
-    """Return the correctness of voxels with these sums, see `prediction_sums`."""
-    n, right, error = sums[:3]
+def correctness_of(sums: PredictionSums, name: str = "all") -> Correctness:
+    """Return the correctness of the voxels with these sums."""
+    n = sums.voxels
     if not n:
         return Correctness(name, 0, math.nan, math.nan, math.nan, math.nan)
-    _, confidence, right_of_bin = _by_bin(sums)
-    ece, miou = calibration_error(right_of_bin - confidence, n), mean_iou(*sums[3 + 3 * BINS :].reshape(3, -1))
-    return Correctness(name, int(n), float(right / n), float(miou), float(ece), float(error / n))
+    ece = calibration_error(sums.right_of_bin - sums.confidence_of_bin, np.asarray(n))
+    miou = mean_iou(sums.right_of_class, sums.true_of_class, sums.predicted_of_class)
+    return Correctness(name, n, sums.right / n, float(miou), float(ece), sums.error / n)
 
 
-def _by_bin(sums: Float64) -> Float64:
-    """Return voxels, confidence and right ones (3, BINS) by bin of confidence, of `prediction_sums`."""
-    return sums[3 : 3 + 3 * BINS].reshape(3, BINS)
-
-
-def reliability_of(sums: Float64) -> tuple[Reliability, ...]:
-    """Return the bins of the reliability diagram of voxels with these sums, see `prediction_sums`."""
-    count, confidence, right = _by_bin(sums)
+def reliability_of(sums: PredictionSums) -> tuple[Reliability, ...]:
+    """Return the bins of the reliability diagram of the voxels with these sums."""
+    count = sums.voxels_of_bin
     with np.errstate(invalid="ignore"):
-        confidence, accuracy = confidence / count, right / count
+        confidence, accuracy = sums.confidence_of_bin / count, sums.right_of_bin / count
     return tuple(
         Reliability(b / BINS, (b + 1) / BINS, int(count[b]), float(confidence[b]), float(accuracy[b]))
         for b in range(BINS)
@@ -171,9 +200,8 @@ def by_stratum(predictions: Predictions, op: Int32, known: Mask, edges: Sequence
     """Return the correctness of all voxels whose true class is known (n,), then of each stratum of OP (n,)."""
     sums = _prediction_sums_by_group(predictions, np.where(known, groups_of(op, edges), -1), len(edges) + 1)
     names = ["all", *(name for name, _, _ in strata(edges))]
-    return tuple(
-        correctness_of(of_group, name) for of_group, name in zip([sums.sum(axis=0), *sums], names, strict=True)
-    )
+    whole = functools.reduce(operator.add, sums)
+    return tuple(correctness_of(of_group, name) for of_group, name in zip([whole, *sums], names, strict=True))
 
 
 QUADRANTS = ("consistent_right", "consistent_wrong", "inconsistent_right", "inconsistent_wrong")

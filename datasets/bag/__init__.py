@@ -111,8 +111,8 @@ class Recorded:
         for source, images in chosen.labels.items():
             stream = streams[images.topic]
             near = stream.near(named.stamps[to], options.max_difference)
-            found = [None if k is None else stream.place(k) for k in near]
-            folders.append(Folder.of_images(bag, images, found, color=False))
+            label_places = [None if k is None else stream.place(k) for k in near]
+            folders.append(Folder.of_images(bag, images, label_places, color=False))
             count = len(near) - near.count(None)
             self.sources.append(f"labels   {source}: {images}, of {count} of {len(at)} frames")
         self.messages = Messages(bag, folders, self._names)

@@ -31,9 +31,9 @@ class OfBags:
         Raises:
             DataError: If there is none, or two would have one name.
         """
-        found = find_bags(root)
-        self.bags = {entry.folder: path for entry, path in found}
-        return [entry for entry, _ in found]
+        entries = find_bags(root)
+        self.bags = {entry.folder: path for entry, path in entries}
+        return [entry for entry, _ in entries]
 
     def is_scene(self, folder: Path) -> bool:
         """Return whether a path is a bag."""
@@ -51,15 +51,15 @@ def find_bags(root: Path) -> list[tuple[SceneEntry, Path]]:
     paths = [root] if is_bag(root) else sorted(_bags_below(root, DEEPEST), key=lambda path: natural(str(path)))
     if not paths:
         raise DataError(f"{root}: no bag here, nor {DEEPEST} folders deep; expected {CONTENTS}")
-    bags, found = dict[Path, Path](), []
+    bags, entries = dict[Path, Path](), []
     for path in paths:
         folder = path if path.is_dir() else path.with_suffix("")
         if folder in bags:
             raise DataError(f"{path}: {bags[folder].name} would be a scene of the same name; rename one")
         bags[folder] = path
         parts = (folder.resolve().name or "scene",) if path == root else folder.relative_to(root).parts
-        found.append((SceneEntry("-".join(parts), folder, "/".join(parts)), path))
-    return found
+        entries.append((SceneEntry("-".join(parts), folder, "/".join(parts)), path))
+    return entries
 
 
 def _bags_below(folder: Path, levels: int) -> Iterator[Path]:

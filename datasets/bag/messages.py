@@ -81,7 +81,7 @@ class Messages(Folders):
     def has(self, path: Path) -> bool:
         """Return whether there is such a message, or file."""
         if os.path.dirname(path) in self._topics:  # noqa: PTH120  as quick as a look-up of each frame must be
-            return self._found(path) is not None
+            return self._locate(path) is not None
         return super().has(path)
 
     def read(self, path: Path) -> bytes:
@@ -90,14 +90,14 @@ class Messages(Folders):
         Raises:
             DataError: If it is damaged.
         """
-        if (found := self._found(path)) is None:
+        if (location := self._locate(path)) is None:
             return super().read(path)
-        folder, place = found
+        folder, place = location
         return folder.content(self._message(folder.topic, place), str(path))
 
     def digest(self, path: Path) -> bytes:
         """Return a hash of the same."""
-        return super().digest(path) if self._found(path) is None else digest(self.read(path))
+        return super().digest(path) if self._locate(path) is None else digest(self.read(path))
 
     def _message(self, topic: str, place: Place) -> Any:
         """Return a message; of a topic that is several folders each thread keeps its last one for the next file."""
@@ -107,7 +107,7 @@ class Messages(Folders):
             self._last.message, self._last.key = self._bag.message(topic, place), (topic, place)
         return self._last.message
 
-    def _found(self, path: Path) -> tuple[Folder, Place] | None:
+    def _locate(self, path: Path) -> tuple[Folder, Place] | None:
         folder, name = os.path.split(path)
         topic = self._topics.get(folder)
         if topic is None:

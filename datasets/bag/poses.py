@@ -64,9 +64,9 @@ class SensorPoses:
         self._transforms = Transforms()
         self._tf = bag.of_types(*TF_TYPE)
         named = None if options.pose == TF else options.pose
-        found = [name for kind in POSES for name in sorted(bag.of_types(kind), key=lambda k: -bag.topics[k].count)]
+        topics = [name for kind in POSES for name in sorted(bag.of_types(kind), key=lambda k: -bag.topics[k].count)]
         wanted = options.trajectory is None and options.pose != TF
-        self._topic = named or (found[0] if found and wanted else None)
+        self._topic = named or (topics[0] if topics and wanted else None)
         self._read = None if self._topic is None else POSES[bag.topics[self._topic].type]
         self._own, self._of = Trajectory(), ""
         self._frame = ""
@@ -180,8 +180,8 @@ class SensorPoses:
         if not moving:
             return [], f"no transform moves between '{sensor}' and '{chain[-1]}', from which it hangs"
         named = (f for word in WORLDS for f in moving if word in f.rpartition("/")[2].lower())
-        found = next(named, moving[-1])
-        return chain[: chain.index(found) + 1], ""
+        topmost = next(named, moving[-1])
+        return chain[: chain.index(topmost) + 1], ""
 
 
 def _snapped(stamps: Sequence[int], others: Sequence[int]) -> list[int]:

@@ -147,8 +147,8 @@ class OpenBag:
             DataError: If it is damaged.
         """
         with self._lock, self._one_line(f"{topic} at {seconds(place.time)}"):
-            found = self._reader.messages(self._connections[topic], start=place.time, stop=place.time + 1)
-            connection, _, raw = next(itertools.islice(found, place.rank, None), (None, 0, b""))
+            messages = self._reader.messages(self._connections[topic], start=place.time, stop=place.time + 1)
+            connection, _, raw = next(itertools.islice(messages, place.rank, None), (None, 0, b""))
             if connection is None:
                 raise DataError(
                     f"{self.path}: {topic} has no message at {seconds(place.time)} any more; it has changed"
@@ -161,10 +161,10 @@ class OpenBag:
         if not wanted:
             return
         with self._lock, self._one_line():
-            found = self._reader.messages(wanted)
+            messages = self._reader.messages(wanted)
         while True:
             with self._lock, self._one_line():
-                item = next(found, None)
+                item = next(messages, None)
             if item is None:
                 return
             connection, time, raw = item

@@ -69,7 +69,7 @@ class BagScans(OfBags, ScanDataset[BagScanOptions]):
             DataError: If the first one with depth or clouds has depth, so that `bag` reads it, or none has clouds.
         """
         bags = list(self.bags.values())
-        if not next((found for path in bags if (found := _holds_clouds(path)) is not None), False):
+        if not next((holds for path in bags if (holds := _holds_clouds(path)) is not None), False):
             raise DataError(f"{self.options.root}: no bag with clouds, and without depth")
         return bags
 
@@ -191,8 +191,8 @@ def _topic_of(bag: OpenBag, options: BagScanOptions) -> tuple[str, list[str]]:
     for name, topic, types in (("points", options.points, (CLOUD,)), ("pose", pose, tuple(POSES))):
         if topic is not None:
             require(bag, name, topic, types)
-    found = bag.of_types(CLOUD)
-    lacks = [] if found else [f"clouds ({CLOUD})"]
+    clouds = bag.of_types(CLOUD)
+    lacks = [] if clouds else [f"clouds ({CLOUD})"]
     if options.trajectory is None and not bag.of_types(*TF_TYPE, *POSES):
         lacks.append("poses")
     if lacks:
@@ -200,8 +200,10 @@ def _topic_of(bag: OpenBag, options: BagScanOptions) -> tuple[str, list[str]]:
             f"{bag.path}: holds no {' and no '.join(lacks)}; record these, too, or write its scans as a points_folder"
             f" (docs/datasets.md); its topics: {bag.listed()}"
         )
-    chosen = options.points or min(found, key=lambda name: (not _has_classes(bag, name), -bag.topics[name].count, name))
-    return chosen, [name for name in found if name != chosen]
+    chosen = options.points or min(
+        clouds, key=lambda name: (not _has_classes(bag, name), -bag.topics[name].count, name)
+    )
+    return chosen, [name for name in clouds if name != chosen]
 
 
 def _has_classes(bag: OpenBag, topic: str) -> bool:

@@ -171,7 +171,7 @@ def _images(bag: OpenBag, options: BagOptions) -> Iterable[tuple[str, Images]]:
 def _labels(images: dict[str, Images], options: BagOptions) -> dict[str, Images]:
     if options.label_topics is not None:
         return {name: images[topic] for name, topic in options.label_topics.items()}
-    found = [
+    label_maps = [
         each
         for each in images.values()
         if LABELS.search(each.topic.lower())
@@ -179,7 +179,9 @@ def _labels(images: dict[str, Images], options: BagOptions) -> dict[str, Images]
         and (each.kind.transport == "raw" or each.kind.suffix == ".png")
         and each.topic not in (options.depth, options.color)
     ]
-    return {_source_name(each.base): each for each in sorted(found, key=lambda each: each.kind.transport, reverse=True)}
+    return {
+        _source_name(each.base): each for each in sorted(label_maps, key=lambda each: each.kind.transport, reverse=True)
+    }
 
 
 def _source_name(topic: str) -> str:
@@ -192,10 +194,10 @@ Rank = tuple[bool | int | str, ...]
 
 
 def _one(
-    named: str | None, images: dict[str, Images], found: list[Images], rank: Callable[[Images], Rank]
+    named: str | None, images: dict[str, Images], candidates: list[Images], rank: Callable[[Images], Rank]
 ) -> Images | None:
     """Return the images of a named topic, else those of the lowest rank; None where there are none."""
-    return images[named] if named is not None else min(found, key=rank, default=None)
+    return images[named] if named is not None else min(candidates, key=rank, default=None)
 
 
 def _depth_rank(images: Images, bag: OpenBag) -> Rank:

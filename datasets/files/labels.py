@@ -96,8 +96,8 @@ class LabelSource:
         """Return the JPEG of the first frame that has one in the place of a label map."""
         bare = self.template.removesuffix(".png")
         places = (self.base / bare.replace("{name}", frame.name) for frame in frames)
-        found = (self.folders.one_of(place, LOSSY_SUFFIXES) for place in places)
-        return next((path for path in found if path is not None), None)
+        paths = (self.folders.one_of(place, LOSSY_SUFFIXES) for place in places)
+        return next((path for path in paths if path is not None), None)
 
     def missing(self, frame: Named) -> list[str]:
         """Return nothing, or the path that the file of that frame would have."""
@@ -300,12 +300,12 @@ class LabelMaps:
         if space is None:
             assert source.first is not None
             folder = source.first[1].parent
-            beside = f", or put a {LABEL_SPACE_FILE} into {folder}" if folder.is_dir() else ""
+            hint = f", or put a {LABEL_SPACE_FILE} into {folder}" if folder.is_dir() else ""
             settings = "set" if where.exists() else f"write {where.name} with"
             raise DataError(
                 f"{where if where.exists() else where.parent}: the classes of '{model}' are not known; {settings}"
                 f" classes: [name, ...] in id order, taxonomy: NAME, or taxonomies: {{{model}: NAME}}"
-                f" (--option 'classes=[name, ...]' and so on){beside}"
+                f" (--option 'classes=[name, ...]' and so on){hint}"
             )
         return space
 

@@ -193,11 +193,11 @@ class ScanScene(Scene):
         self.label_paths = tuple(str(base / template.filled(**shown)) for template in known)
         self._sources = dict[str, LabelSource]()
         for template in known:
-            found = {
+            sources = {
                 model: LabelSource.of("points", base, filled, scans, self._files)
                 for model, filled in matching_folders(base, template, "model", scene=entry.below_root).items()
             }
-            self._sources |= {model: source for model, source in found.items() if source.first is not None}
+            self._sources |= {model: source for model, source in sources.items() if source.first is not None}
             if self._sources:
                 break
         for name, labels in (own or {}).items():

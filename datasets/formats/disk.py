@@ -323,12 +323,12 @@ def read_matrices(path: Path) -> dict[str, Float64]:
     Raises:
         DataError: For a word that is no number, with the line.
     """
-    found = {}
+    matrices = {}
     for line, text in records(path):
         key, _, values = text.partition(":")
         if len(words := values.split()) == 12:
-            found[key.strip()] = matrix_of([to_number(word, path, line) for word in words])
-    return found
+            matrices[key.strip()] = matrix_of([to_number(word, path, line) for word in words])
+    return matrices
 
 
 def matrix_of(rows: npt.ArrayLike) -> Float64:

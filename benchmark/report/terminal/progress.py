@@ -6,10 +6,11 @@ import time
 from collections.abc import Iterator, Mapping, Sequence
 
 from rich.console import Console
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
+from rich.progress import TimeElapsedColumn, TimeRemainingColumn
 
 from semstab.check import Verdict
 from semstab.config import BASE
+from semstab.core.progress import frame_progress
 from semstab.data.records import Failure, Record, RegionFlicker, Result
 from semstab.engine.observer import Observer
 from semstab.engine.units import Plan
@@ -23,13 +24,7 @@ class ProgressBar(Observer):
     """A progress bar for the whole run, in frames that are fused."""
 
     def __init__(self, console: Console) -> None:
-        columns = (
-            TextColumn("{task.description}", markup=False),
-            BarColumn(),
-            MofNCompleteColumn(),
-            TextColumn("frames"),
-        )
-        self.bar = Progress(*columns, TimeElapsedColumn(), TimeRemainingColumn(), console=console, transient=True)
+        self.bar = frame_progress(console, TimeElapsedColumn(), TimeRemainingColumn())
         self.work = self.bar.add_task("starting", total=None)
         self.notes: list[str] = []
         self._printed = time.monotonic()
