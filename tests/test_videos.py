@@ -266,7 +266,7 @@ def test_a_killed_run_goes_on_with_the_next_video(tmp_path, monkeypatch) -> None
     measured.clear()
     again = bench("run", *words, "--out", "out", cwd=tmp_path, report=True, recording=True)
     assert len(measured) == 2 * COUNT
-    assert "measured earlier: 2 of 4" in again.stderr
+    assert "finished earlier: 2 of 4" in again.stderr
     assert _numbers(tmp_path / "out") == _numbers(tmp_path / "whole")
     pages = [(tmp_path / folder / "report.html").read_text().split("manifest")[0] for folder in ("out", "whole")]
     assert pages[0] == pages[1]

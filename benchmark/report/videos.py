@@ -48,7 +48,7 @@ class VideoProgress(VideoObserver):
     def measured_earlier(self, records: Sequence[VideoRecord], of: int) -> None:
         """Say how much there is."""
         if records:
-            self._bar.bar.console.print(f"measured earlier: {len(records)} of {of} label sources", style="dim")
+            self._bar.bar.console.print(f"finished earlier: {len(records)} of {of} label sources", style="dim")
 
     def frame_measured(self, task: Task, frame: Frame, numbers: Mapping[str, float]) -> None:
         """Advance the bar."""
