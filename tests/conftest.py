@@ -30,7 +30,7 @@ configure_process()  # threads that spin would take the time of the other worker
 
 
 EARLY = (
-    "backends", "torch_backend", "check", "check_scene", "city", "images", "tutorials", "predict", "packaging",
+    "backends", "torch_backend", "check", "city", "images", "tutorials", "predict", "packaging",
     "benchmarks", "study_executors", "notebook", "declared", "online_metric",
 )  # fmt: skip
 """Run first: the file that compiles the loops, and beside it some that need none of them; then those that take long."""
