@@ -14,6 +14,8 @@ EXAMPLES = re.compile(r"^ *>>> |\.__doc__ = ", re.MULTILINE)
 """In a module that has examples, or takes them over."""
 
 CONFIG = {"dataset": CITY, "scenes": ["scene0"], "voxel_size": 0.5}
+SMALLER = CONFIG | {"dataset": {"name": "city", "options": {"width": 96, "height": 54, "frames": 12}}}
+"""For examples that run it again, and print no number of it."""
 
 
 def pytest_collect_file(file_path: Path, parent: pytest.Collector) -> DoctestModule | None:
@@ -50,7 +52,7 @@ def _of_examples(request: pytest.FixtureRequest) -> None:
 
     source = "".join(example.source for example in item.dtest.examples)
     names: dict[str, Any] = request.getfixturevalue("doctest_namespace")
-    names.update(np=np, semstab=semstab, config=CONFIG, frames=[wall(k) for k in range(6)])
+    names.update(np=np, semstab=semstab, config=SMALLER, frames=[wall(k) for k in range(6)])
     if "semstab." in source:
         request.getfixturevalue("monkeypatch").chdir(
             request.getfixturevalue("example_folder" if "run" in source else "tmp_path")

@@ -62,7 +62,7 @@ def run_of(folder: Path, *, blurred: int | None = None, color: bool = True) -> P
     semstab.run({
         "dataset": {"name": "posed_folder", "options": {"root": str(scene)}}, "voxel_size": SIZE, "taxonomy": None,
         "check": None,
-    }, out=folder / "run")  # fmt: skip
+    }, out=folder / "run", report=False)  # fmt: skip
     return folder / "run"
 
 
@@ -125,7 +125,7 @@ def test_where_frames_agree_there_is_nothing_to_annotate(tmp_path):
     frames = [dataclasses.replace(frame(k), labels=np.zeros((H, W), np.uint8)) for k in range(3)]
     scene = write_posed(tmp_path / "same", ["a", "b", "c"], {"net": frames}, classes=["floor", "mat"])
     config = {"dataset": {"name": "posed_folder", "options": {"root": str(scene)}}, "voxel_size": SIZE, "check": None}
-    semstab.run(config, out=tmp_path / "run")
+    semstab.run(config, out=tmp_path / "run", report=False)
     with pytest.raises(ConfigError, match="the frames disagree nowhere; there is nothing to annotate"):
         written(tmp_path / "run", tmp_path, "coco")
     assert not (tmp_path / "tasks.json").exists()

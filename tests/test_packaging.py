@@ -84,16 +84,18 @@ def test_the_metadata_say_who_what_and_where(built) -> None:
 def installed(built, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A clean environment that holds the wheel and what it declares, as `pip install` leaves it; its folder bin/.
 
-    The files of the dependencies are links to those of this environment: nothing is downloaded.
+    The packages of the dependencies are links to those of this environment: nothing is downloaded.
     """
     environment = tmp_path_factory.mktemp("clean")
     venv.create(environment, symlinks=True)
     python = environment / "bin" / "python"
     (site,) = environment.glob("lib/python*/site-packages")
-    for name in needed(["semstab"]) - {"semstab"}:
-        for file in metadata.distribution(name).files or ():
-            source, target = Path(str(file.locate())), site / file
-            if source.is_file() and ".." not in file.parts and not target.exists():
+    for distribution in map(metadata.distribution, needed(["semstab"]) - {"semstab"}):
+        files = [file for file in distribution.files or () if ".." not in file.parts]
+        whole = {file.parts[0] for file in files if file.name in ("__init__.py", "METADATA") and len(file.parts) == 2}
+        for name in whole | {str(file) for file in files if file.parts[0] not in whole}:
+            source, target = Path(str(distribution.locate_file(name))), site / name
+            if source.exists() and not target.exists():
                 target.parent.mkdir(parents=True, exist_ok=True)
                 target.symlink_to(source)
     for words in (("install", "--quiet", "--no-deps", "--no-index", str(built[2])), ("check",)):
