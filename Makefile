@@ -26,7 +26,7 @@ bench: setup
 
 test: setup-dev
 	$(MAKE) --no-print-directory -j2 --output-sync=target lint fuzz-short
-	$(BIN)/pytest -n auto --maxprocesses 4 --dist loadfile
+	$(BIN)/pytest -n auto --maxprocesses 4 --dist loadfile --no-loadscope-reorder
 
 quick: setup-dev
 	@$(BIN)/ruff check --quiet .

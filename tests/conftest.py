@@ -1,4 +1,5 @@
 import atexit
+import collections
 import gc
 import os
 import shutil
@@ -9,7 +10,6 @@ import time
 
 import hypothesis
 import pytest
-from xdist.scheduler import LoadFileScheduling
 
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # read by numpy; the workers share the processors
 
@@ -33,24 +33,14 @@ EARLY = (
     "backends", "torch_backend", "check", "city", "images", "tutorials", "predict", "packaging",
     "benchmarks", "study_executors", "notebook", "declared", "online_metric",
 )  # fmt: skip
-"""Run first: the file that compiles the loops, and beside it some that need none of them; then those that take long."""
+"""Files that run first: the one that compiles the loops, beside it some that need none, and those that take long."""
 
 
-class EarlyFirst(LoadFileScheduling):
-    """These files first, then those with most tests, as xdist has it."""
-
-    def _assign_work_unit(self, node) -> None:
-        for file in (f"tests/test_{name}.py" for name in EARLY):
-            if file in self.workqueue:
-                self.workqueue.move_to_end(file, last=False)
-                break
-        super()._assign_work_unit(node)
-
-
-@pytest.hookimpl(optionalhook=True)
-def pytest_xdist_make_scheduler(config, log) -> LoadFileScheduling | None:
-    """Let the workers not compile the same loops at the same time."""
-    return EarlyFirst(config, log) if config.getoption("dist") == "loadfile" else None
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Put the files in order: let the workers not compile the same loops at the same time, and none end late."""
+    tests = collections.Counter(item.path for item in items)
+    early = {f"test_{name}.py": rank for rank, name in enumerate(EARLY)}
+    items.sort(key=lambda item: (early.get(item.path.name, len(early)), -tests[item.path], item.path))
 
 
 def pytest_collection_finish() -> None:

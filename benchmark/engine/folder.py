@@ -14,8 +14,6 @@ from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, S
 from pathlib import Path
 from typing import Any
 
-import yaml
-
 from semstab.backends import keeps_log
 from semstab.config import Config, read_yaml
 from semstab.core.files import (
@@ -124,7 +122,7 @@ class Folder:
         self.path = Path(path).absolute()
         earlier, config = _claimed(self.path), plan.config
         self._files = {file.stem: file for file in (self.path / UNITS).glob("*.json")}
-        before, now = earlier or {}, yaml.safe_load(config.to_yaml())
+        before, now = earlier or {}, config.model_dump(mode="json")
         other_map = _first_change({key: before[key] for key in OF_MAPS if key in before}, now)
         if (
             other_map
