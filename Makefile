@@ -1,16 +1,17 @@
 # A fresh Debian or Ubuntu machine needs no more than `make bench` and `make test`.
 BIN := .venv/bin
+TESTS := $(BIN)/pytest -n auto --maxprocesses 4 --dist loadfile --no-loadscope-reorder
 
 .PHONY: help setup setup-dev bench quick test docs fuzz fuzz-short faults mutants lint format clean
 
 help:
 	@echo 'make bench   set up, then fuse the built-in city with Open3D: semstab-bench --backend open3d'
-	@echo 'make test    set up, then lint, types and import contract beside a minute of damaged files, and the whole test suite'
+	@echo 'make test    set up, then lint, types and import contract beside a minute of damaged files, and the test suite'
 	@echo 'make quick   between edits, a minute at most: ruff, and the tests of what changed since the last commit'
 	@echo 'make fuzz    damage files of every kind for an hour (FUZZ_SECONDS=3600 FUZZ_SEED=1); fuzz-short: the same 10,000 inputs everywhere'
 	@echo 'make faults  kill 280 runs, studies, predictions, exports and conversions (FAULTS=280), fill their disk, and see that nothing is lost'
 	@echo 'make mutants  change 100 lines of the product, one at a time (MUTANTS="--lines 100 --seed 0"), and say which the tests find'
-	@echo 'make docs    build the documentation into site/, warnings are errors'
+	@echo 'make docs    build the documentation into site/, warnings are errors; type its tutorials, and the examples of the help, as they stand'
 	@echo 'make setup   the set-up alone: system libraries, .venv, semstab; make setup-dev: and what the tests need'
 	@echo 'make format  let ruff format and mend the code'
 	@echo 'make clean   remove .venv and what tools left behind'
@@ -26,7 +27,7 @@ bench: setup
 
 test: setup-dev
 	$(MAKE) --no-print-directory -j2 --output-sync=target lint fuzz-short
-	$(BIN)/pytest -n auto --maxprocesses 4 --dist loadfile --no-loadscope-reorder
+	$(TESTS) --ignore tests/docs
 
 quick: setup-dev
 	@$(BIN)/ruff check --quiet .
@@ -35,6 +36,7 @@ quick: setup-dev
 
 docs: setup-dev
 	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict
+	$(TESTS) tests/docs
 
 FUZZ_SECONDS := 3600
 FUZZ_SEED := 1

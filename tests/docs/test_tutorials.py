@@ -16,7 +16,7 @@ from test_readers_odm import write_georeference, write_project
 
 from semstab.testing import BackendConformance
 
-DOCS = Path(__file__).parents[1] / "docs"
+DOCS = Path(__file__).parents[2] / "docs"
 TUTORIALS = DOCS / "tutorials"
 BLOCKS = re.compile(r"```(python|console)\n(.*?)```", re.DOTALL)
 

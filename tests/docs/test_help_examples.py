@@ -35,7 +35,7 @@ SLOW = (
 )  # fmt: skip
 """All cases, all models loaded, five flights, two processes: other tests run these, or their like."""
 
-RESULTS = Path(__file__).parents[1] / "results"
+RESULTS = Path(__file__).parents[2] / "results"
 BENCHMARK = {
     "description": "a wall", "get": "write it", "license": "none", "citation": "nobody", "voxel_size": 0.2,
     "dataset": {"name": "posed_folder"}, "scenes": ["flight"],

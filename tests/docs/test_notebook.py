@@ -1,4 +1,4 @@
-"""The notebook of the documentation, run as it stands; a refreshed copy: `python tests/test_notebook.py`."""
+"""The notebook of the documentation, run as it stands; a refreshed copy: `python tests/docs/test_notebook.py`."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ import nbclient
 import nbformat
 import pytest
 
-NOTEBOOK = Path(__file__).parents[1] / "docs/tutorials/decision.ipynb"
+NOTEBOOK = Path(__file__).parents[2] / "docs/tutorials/decision.ipynb"
 PICTURE = re.compile(r'src="data:image/png;base64,[^"]*"')
 
 
