@@ -76,34 +76,38 @@ def finish(live: LiveMap, stream: Stream, watch: Stopwatch) -> Work:
             if sample is not None and tile is None:
                 analysis = analyse_sample(live.task, config, sample, observations)
             trim_malloc(least=SMALL)
+        result = TileResult(
+            {},
+            None if fused is None else fused.checked,
+            sizes,
+            _quality(stream),
+            live.origin,
+            None if stream.video is None else stream.video.result(),
+            series=live.rows.numbers,
+            sums=sums,
+            reduced=np.zeros(0) if fused is None else fused.reduced,
+            image=np.zeros((0, 0)) if stream.image_space is None else stream.image_space.rows.table(),
+            poses=stream.poses,
+            seen=np.concatenate([np.zeros((0, 3), np.int32), *live.tiles]),
+        )
+        record = None
+        if tile is None:
+            assert fused is not None
+            with watch("measure"):
+                record = record_of(work.unit, live.task, live.rows, result, analysis)
+                if work.unit.image_space:
+                    record = in_image_space(record, live.task, result, fused.table)
         with watch("write"):
             beside.drain()
             files.write(_savers(live, stream, fused, observations, sample, analysis))
             if fused is not None and config.statistics:
                 files.write(_map_savers(live, fused, analysis))
-    result = TileResult(
-        files.digests,
-        None if fused is None else fused.checked,
-        sizes,
-        _quality(stream),
-        live.origin,
-        None if stream.video is None else stream.video.result(),
-        series=live.rows.numbers,
-        sums=sums,
-        reduced=np.zeros(0) if fused is None else fused.reduced,
-        image=np.zeros((0, 0)) if stream.image_space is None else stream.image_space.rows.table(),
-        poses=stream.poses,
-        seen=np.concatenate([np.zeros((0, 3), np.int32), *live.tiles]),
-    )
-    if tile is not None:
-        with watch("write"):
-            files.write({f"{tile.folder}/{tile.name}.npz": result.save})
+            if tile is not None:
+                files.write({f"{tile.folder}/{tile.name}.npz": replace(result, files={**files.digests}).save})
+    if record is None:
         return replace(work, files=files.returned)
     assert fused is not None
-    with watch("measure"):
-        record = record_of(work.unit, live.task, live.rows, result, analysis)
-        if work.unit.image_space:
-            record = in_image_space(record, live.task, result, fused.table)
+    record = replace(record, files=files.digests)
     return replace(work, record=record, files=files.returned, table=fused.table if work.watched else None)
 
 
