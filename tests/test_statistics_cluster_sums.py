@@ -20,7 +20,15 @@ from semstab.metrics.agreement import rows_of
 from semstab.statistics import class_agreement, correctness, expected_sbd, krippendorff_alpha, psa
 from semstab.statistics.accumulate import cluster_sums_of, sums_of_cells
 from semstab.statistics.agreement import consistency_posterior
-from semstab.statistics.cluster_sums import FUNCTIONALS, MOST_CLASSES, ClusterSums, aligned, value
+from semstab.statistics.cluster_sums import (
+    FUNCTIONALS,
+    MOST_CLASSES,
+    ClusterSums,
+    aligned,
+    count_distinct,
+    distinct_rows,
+    value,
+)
 from semstab.statistics.intervals import (
     coverage,
     difference,
@@ -331,3 +339,13 @@ def test_measures_of_the_register_have_sums_of_their_own(tmp_path):
         {key: value(again, key) for key in FUNCTIONALS}, rel=0, nan_ok=True
     )
     assert difference(old, again, "psa").value == 0
+
+
+@pytest.mark.parametrize("reach", [3, 2**40])
+def test_rows_are_counted_as_they_are_told_apart(reach) -> None:
+    rng = np.random.default_rng(0)
+    for rows in (rng.integers(-reach, reach, (n, 3)) for n in (0, 1, 500)):
+        distinct, of = distinct_rows(rows)
+        np.testing.assert_array_equal(distinct, np.unique(rows, axis=0))
+        np.testing.assert_array_equal(distinct[of], rows)
+        assert count_distinct(rows) == len(distinct)

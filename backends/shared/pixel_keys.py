@@ -91,50 +91,57 @@ def drawn_of(frame: Frame, size: float, odd: Int64, one_in: int) -> Mask:
 
     A filter for the numpy reference, which decides on the pixels that are left by itself.
     """
-    pose = np.ascontiguousarray(frame.T_wc)
+    pose, odds = tuple(map(tuple, frame.T_wc[:3].tolist())), tuple(odd.tolist())
+    drawn = np.empty(frame.shape, np.bool_)
     if frame.points is not None:
-        drawn: Mask = drawn_points(frame.points, frame.valid, pose, size, odd, one_in)
+        drawn_points(frame.points, frame.valid, pose, size, odds, one_in, drawn)
     else:
-        K = frame.intrinsics
-        drawn = drawn_pixels(frame.depth, frame.valid, (K.fx, K.fy, K.cx, K.cy), pose, size, odd, one_in)
+        drawn_pixels(frame.depth, frame.valid, *frame.rays, pose, size, odds, one_in, drawn)
     return drawn
 
 
 @serial
-def drawn_points(points, wanted, T, size, odd, one_in):
-    """Return the wanted points (H, W), of (H, W, 3), that may fall into a voxel of the sample, see `drawn_of`."""
-    out = np.zeros(wanted.shape, dtype=np.bool_)
+def drawn_points(points, wanted, pose, size, odd, one_in, out):
+    """Mark the wanted points (H, W), of (H, W, 3), that may fall into a voxel of the sample, see `drawn_of`."""
     for v in range(wanted.shape[0]):
         for u in range(wanted.shape[1]):
             x, y, z = np.float64(points[v, u, 0]), np.float64(points[v, u, 1]), np.float64(points[v, u, 2])
-            out[v, u] = wanted[v, u] and _may_be_drawn(x, y, z, T, size, odd, one_in)
-    return out
+            out[v, u] = wanted[v, u] & _may_be_drawn(x, y, z, pose, size, odd, one_in)
 
 
 @serial
-def _may_be_drawn(x, y, z, T, size, odd, one_in):
-    mixed, near = np.int64(0), False
-    for axis in range(3):
-        q = in_voxels(T[axis, 0], T[axis, 1], T[axis, 2], T[axis, 3], x, y, z, size)
-        low = np.floor(q)
-        near |= not (1e-6 < q - low < 1 - 1e-6 and abs(q) < FACE)
-        mixed += np.int64(low) * odd[axis] if abs(q) < FACE else 0
-    return near or ((mixed >> 40) & (one_in - 1)) == 0
-
-
-@serial
-def drawn_pixels(depth, wanted, camera, T, size, odd, one_in):
-    """Return the wanted pixels (H, W) that may fall into a voxel of the sample, see `drawn_of`."""
-    fx, fy, cx, cy = camera
-    out = np.zeros(depth.shape, dtype=np.bool_)
+def drawn_pixels(depth, wanted, ray_x, ray_y, pose, size, odd, one_in, out):
+    """Mark the wanted pixels (H, W) that may fall into a voxel of the sample, see `drawn_of`."""
     for v in range(depth.shape[0]):
-        ray_y = (v - cy) / fy
-        for u in range(depth.shape[1]):
-            if not wanted[v, u]:
-                continue
-            d = np.float64(depth[v, u])
-            out[v, u] = _may_be_drawn((u - cx) / fx * d, ray_y * d, d, T, size, odd, one_in)
-    return out
+        drawn_row(depth[v], wanted[v], ray_x, ray_y[v], pose, size, odd, one_in, out[v])
+
+
+@serial
+def drawn_row(depth, wanted, ray_x, ray_y, pose, size, odd, one_in, out):
+    """Mark pixels of a row; without a branch, for vectors."""
+    for u in range(depth.shape[0]):
+        d = np.float64(depth[u])
+        out[u] = wanted[u] & _may_be_drawn(ray_x[u] * d, ray_y * d, d, pose, size, odd, one_in)
+
+
+@serial
+def _may_be_drawn(x, y, z, pose, size, odd, one_in):
+    (r00, r01, r02, t0), (r10, r11, r12, t1), (r20, r21, r22, t2) = pose
+    a = in_voxels(r00, r01, r02, t0, x, y, z, size)
+    b = in_voxels(r10, r11, r12, t1, x, y, z, size)
+    c = in_voxels(r20, r21, r22, t2, x, y, z, size)
+    clear = _is_clear(a) & _is_clear(b) & _is_clear(c)
+    i, j, k = np.floor(a), np.floor(b), np.floor(c)
+    i, j, k = i if clear else 0.0, j if clear else 0.0, k if clear else 0.0
+    mixed = np.int64(np.int32(i)) * odd[0] + np.int64(np.int32(j)) * odd[1] + np.int64(np.int32(k)) * odd[2]
+    return (not clear) | (((mixed >> 40) & (one_in - 1)) == 0)
+
+
+@serial
+def _is_clear(q):
+    """Return whether a coordinate in voxels is not close to a face, and near enough to tell."""
+    part = q - np.floor(q)
+    return (part > 1e-6) & (part < 1 - 1e-6) & (np.abs(q) < FACE)
 
 
 def columns_of(within, origin):

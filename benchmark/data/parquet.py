@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import json
 import re
 from collections.abc import Iterable, Iterator, Mapping, Sequence
@@ -25,6 +26,9 @@ if TYPE_CHECKING:
 
 
 SCHEMA = 1
+
+IN_GROUP = 8
+"""Parts in a row group: of less, a file takes more space, and more time to be written and read."""
 
 TILE = re.compile(r"tile=(-?\d+)_(-?\d+)\.parquet")
 """Files of a folder that hold a map together."""
@@ -65,11 +69,11 @@ def write(
     about = {"schema": SCHEMA, "kind": kind, "voxel_size": voxel_size, "classes": classes}
     if tile is not None:
         about |= {"tile": [tile.x, tile.y], "tile_size": tile.size, "map": tile.map}
+    tables = (pa.table({name: _to_arrow(values) for name, values in columns.items()}) for columns in parts)
     with atomic_path(path) as temporary, ExitStack() as open_files:
         writer = None
-        for columns in parts:
-            content = pa.table({name: _to_arrow(values) for name, values in columns.items()})
-            content = content.replace_schema_metadata({"semstab": json.dumps(about)})
+        while some := [*itertools.islice(tables, IN_GROUP)]:
+            content = pa.concat_tables(some).replace_schema_metadata({"semstab": json.dumps(about)})
             writer = writer or open_files.enter_context(pq.ParquetWriter(temporary, content.schema, compression="zstd"))
             writer.write_table(content)
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 from collections.abc import Callable, Mapping
 from dataclasses import replace
 from functools import partial
@@ -13,6 +14,7 @@ import numpy.typing as npt
 
 from semstab.backends.numpy_reference import NumpySample, in_sample
 from semstab.config import Config
+from semstab.core.background import Background
 from semstab.core.files import ScratchFolder, atomic_path, file_digest
 from semstab.core.process import Stopwatch, trim_malloc
 from semstab.core.types import Float64
@@ -55,48 +57,58 @@ def finish(live: LiveMap, stream: Stream, watch: Stopwatch) -> Work:
     Raises:
         DataError: If no pixel of a whole map was valid.
     """
-    work, config, tile = live.work, live.config, live.work.tile
+    work, config, tile, files = live.work, live.config, live.work.tile, Files(live.work.start)
     fused = _fused_map(live, watch) if work.fuses else None
     if fused is not None and tile is None and not len(fused.table):
         raise no_voxels(live.task, config)
-    with watch("voxel sizes"):
-        sizes = () if live.sizes is None else live.sizes.alphas()
     observations, sums, sample, analysis = live.sampled_observations(), dict[str, Float64](), None, None
-    with watch("statistics"):
-        if fused is not None and work.unit.assessed:
-            log = fused.events if config.statistics else None
-            sample = MapSample.draw(fused.table, log, fused.truth, edges=config.strata)
-        if fused is not None:
-            sums = (TableSums.of(fused.table, config.strata) if sample is None else sample.summary).arrays()
-        if sample is not None and tile is None:
-            analysis = analyse_sample(live.task, config, sample, observations)
-        trim_malloc(least=SMALL)
-    with watch("write"):
-        files, returned = written(work.start, _savers(live, stream, fused, observations, sample, analysis))
-    result = TileResult(
-        files,
-        None if fused is None else fused.checked,
-        sizes,
-        _quality(stream),
-        live.origin,
-        None if stream.video is None else stream.video.result(),
-        series=live.rows.numbers,
-        sums=sums,
-        reduced=np.zeros(0) if fused is None else fused.reduced,
-        image=np.zeros((0, 0)) if stream.image_space is None else stream.image_space.rows.table(),
-        poses=stream.poses,
-        seen=np.concatenate([np.zeros((0, 3), np.int32), *live.tiles]),
-    )
-    if tile is not None:
+    with contextlib.closing(Background("semstab-files", 1)) as beside:
+        if fused is not None and not config.statistics:  # else columns of the statistics go along
+            beside.submit(partial(files.write, _map_savers(live, fused, None)))
+        with watch("voxel sizes"):
+            sizes = () if live.sizes is None else live.sizes.alphas()
+        with watch("statistics"):
+            if fused is not None and work.unit.assessed:
+                log = fused.events if config.statistics else None
+                sample = MapSample.draw(fused.table, log, fused.truth, edges=config.strata)
+            if fused is not None:
+                sums = (TableSums.of(fused.table, config.strata) if sample is None else sample.summary).arrays()
+            if sample is not None and tile is None:
+                analysis = analyse_sample(live.task, config, sample, observations)
+            trim_malloc(least=SMALL)
+        result = TileResult(
+            {},
+            None if fused is None else fused.checked,
+            sizes,
+            _quality(stream),
+            live.origin,
+            None if stream.video is None else stream.video.result(),
+            series=live.rows.numbers,
+            sums=sums,
+            reduced=np.zeros(0) if fused is None else fused.reduced,
+            image=np.zeros((0, 0)) if stream.image_space is None else stream.image_space.rows.table(),
+            poses=stream.poses,
+            seen=np.concatenate([np.zeros((0, 3), np.int32), *live.tiles]),
+        )
+        record = None
+        if tile is None:
+            assert fused is not None
+            with watch("measure"):
+                record = record_of(work.unit, live.task, live.rows, result, analysis)
+                if work.unit.image_space:
+                    record = in_image_space(record, live.task, result, fused.table)
         with watch("write"):
-            _, own = written(work.start, {f"{tile.folder}/{tile.name}.npz": result.save})
-        return replace(work, files=returned | own)
+            beside.drain()
+            files.write(_savers(live, stream, fused, observations, sample, analysis))
+            if fused is not None and config.statistics:
+                files.write(_map_savers(live, fused, analysis))
+            if tile is not None:
+                files.write({f"{tile.folder}/{tile.name}.npz": replace(result, files={**files.digests}).save})
+    if record is None:
+        return replace(work, files=files.returned)
     assert fused is not None
-    with watch("measure"):
-        record = record_of(work.unit, live.task, live.rows, result, analysis)
-        if work.unit.image_space:
-            record = in_image_space(record, live.task, result, fused.table)
-    return replace(work, record=record, files=returned, table=fused.table if work.watched else None)
+    record = replace(record, files=files.digests)
+    return replace(work, record=record, files=files.returned, table=fused.table if work.watched else None)
 
 
 class FusedMap(NamedTuple):
@@ -261,12 +273,9 @@ def _savers(
     sample: MapSample | None,
     analysis: Analysis | None,
 ) -> Savers:
-    """Return the files of a unit, of a tile, or of the pass over the frames of tiles.
-
-    A tile's voxels to which statistics add columns wait in its folder until the whole map is there.
-    """
+    """Return the files of a unit, of a tile, or of the pass over the frames of tiles, but for those of its map."""
     work, config, tile, savers = live.work, live.config, live.work.tile, Savers()
-    unit, of_unit = work.unit, live.name.slug
+    unit = work.unit
     if unit.image_space and stream.overview:
         pictures = pictures_of_outlying(live.task, config, analysis)
         savers[overview_file(live.task)] = partial(save_overview, stream.overview | pictures)
@@ -274,11 +283,18 @@ def _savers(
         savers[f"{tile.folder}/{tile.size}_{TILE_OBSERVATIONS}"] = observations.save
     if tile is None and unit.stored:
         savers |= unit_savers(live.task, live.rows, observations, analysis)
-    if fused is None or not len(fused.table):
-        return savers
-    if tile is not None and sample is not None:
+    if fused is not None and len(fused.table) and tile is not None and sample is not None:
         savers[f"{tile.folder}/{tile.name}.sample"] = sample.below(tile.bound).save
-    if not unit.stored:
+    return savers
+
+
+def _map_savers(live: LiveMap, fused: FusedMap, analysis: Analysis | None) -> Savers:
+    """Return the files of a map: its voxels, with the columns of the statistics where they are wanted, log and truth.
+
+    A tile's voxels to which statistics add columns wait in its folder until the whole map is there.
+    """
+    config, tile, unit, of_unit, savers = live.config, live.work.tile, live.work.unit, live.name.slug, Savers()
+    if not unit.stored or not len(fused.table):
         return savers
     own = None if tile is None or tile.index is None else Tile(*tile.index, tile.size, tile.key)
 
@@ -333,6 +349,24 @@ def pictures_of_outlying(task: Task, config: Config, analysis: Analysis | None) 
         others = [read(task, task.indices[k], config.pixel_stride) for k in range(start, start + 3) if k != at]
         pictures.append(lone_picture(read(task, each.frame, config.pixel_stride, color=True), others))
     return picture_arrays(pictures)
+
+
+class Files:
+    """The files of a work.
+
+    Attributes:
+        digests: Their digests by their path in the folder.
+        returned: Their bytes, where the folder is not shared.
+    """
+
+    def __init__(self, start: Start) -> None:
+        self._start, self.digests, self.returned = start, dict[str, str](), dict[str, bytes]()
+
+    def write(self, savers: Savers) -> None:
+        """Write some of them."""
+        digests, returned = written(self._start, savers)
+        self.digests |= digests
+        self.returned |= returned
 
 
 def written(start: Start, savers: Savers) -> tuple[dict[str, str], dict[str, bytes]]:

@@ -20,7 +20,7 @@ from semstab.data.frames import Frame
 from semstab.engine.units import Unit
 from semstab.errors import ConfigError, DataError, OutgrownError
 from semstab.pixels.preparation import perturb
-from semstab.statistics.cluster_sums import distinct_rows
+from semstab.statistics.cluster_sums import count_distinct
 from semstab.task import Task, read
 
 if TYPE_CHECKING:
@@ -227,8 +227,9 @@ def map_size(task: Task, settings: Config) -> MapSize:
     frames = len(task.indices)
     sampled = evenly(frames, SAMPLED)
     seen = [seen_by(k) for k in sampled]
-    distinct = distinct_rows(np.concatenate(seen))[0]
-    quarter, half, voxels = _count(seen[::4]), _count(seen[::2]), float(len(distinct))
+    together = np.concatenate(seen)
+    distinct, columns = count_distinct(together), count_distinct(together[:, :2])
+    quarter, half, voxels = _count(seen[::4]), _count(seen[::2]), float(distinct)
     factor, added, read = min((voxels - half) / max(half - quarter, 1), 2.0), voxels - half, len(sampled)
     while read < frames:
         added *= factor
@@ -238,12 +239,11 @@ def map_size(task: Task, settings: Config) -> MapSize:
     pairs = [(seen[k], seen_by(sampled[k] + 1)) for k in range(0, len(sampled), 3) if sampled[k] + 1 < frames]
     new = [_count(pair) - len(pair[0]) for pair in pairs]
     most = each + (frames - 1) * (float(np.mean(new)) if new else 0.0)
-    columns = len(distinct_rows(distinct[:, :2])[0])
-    return MapSize(max(float(len(distinct)), min(voxels, most)), frames * each, len(distinct) / max(columns, 1))
+    return MapSize(max(float(distinct), min(voxels, most)), frames * each, distinct / max(columns, 1))
 
 
 def _count(seen: Sequence[Int64]) -> int:
-    return len(distinct_rows(np.concatenate(seen))[0]) if seen else 0
+    return count_distinct(np.concatenate(seen)) if seen else 0
 
 
 def _geometry(task: Task, settings: Config, index: int) -> Frame:

@@ -12,23 +12,21 @@ import numpy as np
 import numpy.typing as npt
 import rerun as rr
 
-from semstab.backends.shared.association import back_project, voxel_index
 from semstab.core.types import Float32, Float64, Int64, Mask, UInt8
 from semstab.data.frames import Frame, Intrinsics
-from semstab.data.labels import GLOW, LabelSpace, between
+from semstab.data.labels import GLOW, LabelSpace, between, fixed
 from semstab.data.measures import SBD_MAX, mean_drift
 from semstab.data.results import Changes
 from semstab.data.voxels import VoxelTable
+from semstab.recording.loops import AGREES, CONTRADICTS, NO_VOXEL, draw_changes, key_of
 from semstab.recording.timeline import Clock, path
 
 # The pictures show levels of drift, in colours that no class has, and labels that contradict the map.
 
-NO_VOXEL, FIRST_SEEN, NO_DRIFT = 0, 1, 2
+FIRST_SEEN, NO_DRIFT = 1, 2
 LEVELS = 24
 LEVEL_EDGES = SBD_MAX * (np.arange(LEVELS + 1) / LEVELS) ** 2
 """The edges of the levels of drift, bits: finer where drift is small; the last level is open."""
-
-AGREES, CONTRADICTS = 1, 2
 
 PICTURES = {
     "contradictions": "contradictions (orange)",
@@ -92,19 +90,13 @@ class FrameChanges:
 
     def values(self, frame: Frame) -> dict[str, UInt8]:
         """Return each of PICTURES for the pixels or points (H, W) of the frame, or of every n-th."""
-        key = packed(self.changes.index)
-        order = np.argsort(key)
-        pixels = packed(voxel_index(back_project(frame), self.voxel_size, frame).T)
-        first = np.flatnonzero(np.diff(pixels, prepend=-1))  # of neighbouring pixels in one voxel
-        voxel = np.repeat(order[np.searchsorted(key[order], pixels[first])], np.diff(first, append=len(pixels)))
-        contradicts = frame.predicted[frame.valid] != self.changes.before[voxel]
-        shown = {
-            "contradictions": np.where(contradicts, CONTRADICTS, AGREES),
-            "drift": levels_of(self.changes.drift)[voxel],
-        }
         values = {name: np.full(frame.shape, NO_VOXEL, np.uint8) for name in PICTURES}
-        for name, of_name in values.items():
-            of_name[frame.valid] = shown[name]
+        points = np.zeros((0, 0, 3), np.float32) if frame.points is None else frame.points
+        draw_changes(
+            fixed(frame.depth), fixed(points), fixed(frame.valid), fixed(frame.predicted), *frame.rays,
+            fixed(frame.T_wc), self.voxel_size, packed(self.changes.index), fixed(self.changes.before),
+            levels_of(self.changes.drift), values["contradictions"], values["drift"],
+        )  # fmt: skip
         return values
 
 
@@ -127,8 +119,7 @@ def log_points(stream: rr.RecordingStream, entity: str, frame: Frame, drift: Fra
 
 def packed(index: npt.NDArray[np.integer[Any]]) -> Int64:
     """Return one number (n,) for each voxel (n, 3), different for voxels within 2^20 of each other along each axis."""
-    x, y, z = index.T.astype(np.int64) & ((1 << 21) - 1)
-    return np.asarray(x << 42 | y << 21 | z)
+    return np.asarray(key_of.py_func(*index.T.astype(np.int64)))
 
 
 # The voxels that drifted most, and the frames that contributed most to their drift.

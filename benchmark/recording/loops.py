@@ -1,0 +1,64 @@
+"""A compiled pass over a frame's pixels: it draws what the frame changed in their voxels."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from semstab.backends.shared.pixel_keys import in_voxels
+from semstab.core.compiled import serial
+
+NO_VOXEL, AGREES, CONTRADICTS = 0, 1, 2
+"""Values of a picture of contradictions, the first one of a picture of drift as well."""
+
+AXIS = 21
+"""Bits of an index in a key."""
+
+GOLDEN = np.uint64(0x9E3779B97F4A7C15)
+
+
+@serial
+def draw_changes(depth, points, valid, labels, ray_x, ray_y, T, size, key, before, level, contradictions, drift):
+    """Draw the valid pixels into pictures (H, W) that hold NO_VOXEL: a label against the map's, the level of drift.
+
+    - `points`: (H, W, 3) of a scan, for which rays do not count; (0, 0, 3) of an image
+    - `key`, `before`, `level`: (n,) of each voxel: its indices, see `key_of`, the map's class, the level of its drift
+    """
+    bits = 1
+    while 1 << bits <= 2 * len(key):
+        bits += 1
+    rows, shift = np.full(1 << bits, -1, np.int32), np.uint64(64 - bits)
+    for row in range(len(key)):
+        rows[find(key[row], key, rows, shift)] = row
+    H, W = depth.shape
+    for v in range(H):
+        for u in range(W):
+            if not valid[v, u]:
+                continue
+            if points.shape[0]:
+                x, y, z = np.float64(points[v, u, 0]), np.float64(points[v, u, 1]), np.float64(points[v, u, 2])
+            else:
+                z = np.float64(depth[v, u])
+                x, y = ray_x[u] * z, ray_y[v] * z
+            a = np.floor(in_voxels(T[0, 0], T[0, 1], T[0, 2], T[0, 3], x, y, z, size))
+            b = np.floor(in_voxels(T[1, 0], T[1, 1], T[1, 2], T[1, 3], x, y, z, size))
+            c = np.floor(in_voxels(T[2, 0], T[2, 1], T[2, 2], T[2, 3], x, y, z, size))
+            row = rows[find(key_of(np.int64(a), np.int64(b), np.int64(c)), key, rows, shift)]
+            if row >= 0:
+                contradictions[v, u] = CONTRADICTS if labels[v, u] != before[row] else AGREES
+                drift[v, u] = level[row]
+
+
+@serial
+def key_of(x, y, z):
+    """Return one number for a voxel, different for voxels within 2^20 of each other along each axis."""
+    low = (1 << AXIS) - 1
+    return (x & low) << 2 * AXIS | (y & low) << AXIS | (z & low)
+
+
+@serial
+def find(wanted, key, rows, shift):
+    """Return the place of a key in a table of rows, or the free one where it belongs."""
+    at = np.int64((np.uint64(wanted) * GOLDEN) >> shift)
+    while rows[at] >= 0 and key[rows[at]] != wanted:
+        at = (at + 1) & (len(rows) - 1)
+    return at
