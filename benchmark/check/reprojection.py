@@ -5,15 +5,17 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, field
-from typing import Any, cast
+from typing import Any, NamedTuple, cast
 
 import numpy as np
 import numpy.typing as npt
 
 from semstab.check.conventions import Convention
+from semstab.check.loops import look_up
 from semstab.core.prefetch import prefetch
 from semstab.core.types import Float32, Float64, Int64, Mask
 from semstab.data.frames import Frame, Intrinsics
+from semstab.data.labels import fixed
 from semstab.datasets import GROUND_TRUTH, Scene
 from semstab.datasets.geometry.cameras import CAMERA_AXES, ray_lengths
 from semstab.errors import DataError
@@ -81,14 +83,16 @@ class View:
         made_for = (width * convention.ratio[0], height * convention.ratio[1])
         return self.camera.resized(cast(Any, made_for), self.size).every(self.stride)
 
-    def planar(self, u: Int64, v: Int64, convention: Convention, configured: Convention) -> Float64:
-        """Return planar depth at pixels of the file as that convention reads it, without its factor."""
-        depth: Float64 = self.depth[v, u].astype(np.float64)
+    def rays(self, convention: Convention, configured: Convention) -> tuple[int, Intrinsics]:
+        """Return by which power of the rays' length depth of the file becomes planar, and the intrinsics of the rays.
+
+        The file is read as that convention does; the factor of depth is left out.
+        """
         if convention.depth == configured.depth:
-            return depth
-        if configured.depth == "ray":
-            return depth * ray_lengths(self.sampled_camera(configured), u, v)
-        return depth / ray_lengths(self.sampled_camera(convention), u, v)
+            return 0, self.sampled_camera(configured)
+        return (
+            (1, self.sampled_camera(configured)) if configured.depth == "ray" else (-1, self.sampled_camera(convention))
+        )
 
 
 def clusters(length: int, count: int) -> list[list[int]]:
@@ -138,8 +142,23 @@ def frames_at(
             yield position, fetched.item
 
 
-Placed = tuple[Float64, Intrinsics, Float64]
-"""A view as a convention reads it: camera-to-world (4, 4), intrinsics, and its sample (3, N) in the camera's axes."""
+class Placed(NamedTuple):
+    """A view as a convention reads it.
+
+    Attributes:
+        pose: (4, 4) camera-to-world.
+        back: (3, 3) the inverse of its rotation.
+        camera: Intrinsics.
+        power, rays: How depth of its file becomes planar, see `View.rays`.
+        points: (3, N) its sample in the camera's axes.
+    """
+
+    pose: Float64
+    back: Float64
+    camera: Intrinsics
+    power: int
+    rays: Intrinsics
+    points: Float64
 
 
 @dataclass(frozen=True, eq=False)
@@ -157,28 +176,26 @@ class Sample:
 
     def matched(self, pair: Pair, convention: Convention, factors: Float64) -> Matches:
         """Look the sample of the pair's first view up in the second one, for each factor on depth."""
-        (pose, _, points), (other, K_b, _) = (self._placed_by(convention, position) for position in pair)
-        R, t = motion(pose, other)
-        b = self.views[pair[1]]
-        # depth times f and t as it is, or depth as it is and t over f: the same but for the unit
-        x, y, z = (turned + t_i / factors[:, None] for turned, t_i in zip(R @ points, t, strict=True))
-        with np.errstate(all="ignore"):
-            u, v = np.floor(K_b.fx * (x / z) + K_b.cx + 0.5), np.floor(K_b.fy * (y / z) + K_b.cy + 0.5)
-            H, W = b.depth.shape
-            inside = (z > 0) & (u >= 0) & (v >= 0) & (u < W) & (v < H)
-            u, v = (np.where(inside, at, 0).astype(np.int64) for at in (u, v))
-            seen = b.planar(u, v, convention, self.configured)
-            error = np.where(inside & (seen > 0) & (seen < np.inf), np.abs(seen / z - 1), np.inf)
-        return Matches(u, v, z, seen, inside, error)
+        a, b = (self._placed_by(convention, position) for position in pair)
+        shape = len(factors), a.points.shape[1]
+        u, v = np.empty(shape, np.int64), np.empty(shape, np.int64)
+        z, depth, error, inside = np.empty(shape), np.empty(shape), np.empty(shape), np.empty(shape, np.bool_)
+        look_up(
+            a.points, b.back @ a.pose[:3, :3], b.back @ (a.pose[:3, 3] - b.pose[:3, 3]), factors, _lens(b.camera),
+            fixed(self.views[pair[1]].depth), b.power, _lens(b.rays), u, v, z, depth, inside, error,
+        )  # fmt: skip
+        return Matches(u, v, z, depth, inside, error)
 
     def _placed_by(self, convention: Convention, position: int) -> Placed:
         """Return a view as a convention reads it; it is in several pairs."""
         if (known := self._placed.get((position, convention))) is not None:
             return known
-        view = self.views[position]
-        K, depth = view.sampled_camera(convention), view.planar(view.u, view.v, convention, self.configured)
+        view, pose = self.views[position], self.views[position].pose(convention, self.configured)
+        K, (power, rays) = view.sampled_camera(convention), view.rays(convention, self.configured)
+        depth = view.depth[view.v, view.u] * ray_lengths(rays, view.u, view.v) ** power
         points = np.stack([(view.u - K.cx) / K.fx * depth, (view.v - K.cy) / K.fy * depth, depth])
-        placed = self._placed[position, convention] = view.pose(convention, self.configured), K, points
+        back = np.linalg.inv(pose[:3, :3]).astype(np.float64)
+        placed = self._placed[position, convention] = Placed(pose, back, K, power, rays, points)
         return placed
 
     def motions(self, convention: Convention) -> list[tuple[Float64, Float64]]:
@@ -205,6 +222,10 @@ class Matches:
     depth: Float64
     inside: Mask
     error: Float64
+
+
+def _lens(camera: Intrinsics) -> tuple[float, float, float, float]:
+    return camera.fx, camera.fy, camera.cx, camera.cy
 
 
 def motion(pose: Float64, other: Float64) -> tuple[Float64, Float64]:
