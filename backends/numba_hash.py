@@ -145,7 +145,7 @@ class NumbaHash:
     @staticmethod
     def expected_bytes(voxels: int, observations: int, num_classes: int, soft: bool = False) -> int:
         """Return a record, its share of the nodes or a dense row of scores, and room to grow; the hash."""
-        return (110 + (9 * num_classes if soft else 0)) * voxels
+        return (102 + (9 * num_classes if soft else 0)) * voxels
 
     def integrate(self, frame: Frame) -> FrameReport:
         """Fuse one frame: pixels to observations, then each partition of the map."""
