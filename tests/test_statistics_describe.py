@@ -80,6 +80,9 @@ def test_how_many_voxels_are_summed_at_a_time_does_not_matter(monkeypatch, soft)
     table = replace(table, self_sum=np.where(np.arange(len(table)) == 7, 0.9, 1.0) * table.self_sum) if soft else table
     whole = analyse(MapSample.draw(table))
     monkeypatch.setattr("semstab.data.evidence.STRETCH", 50)
+    monkeypatch.setattr("semstab.data.evidence.STRETCH_ENTRIES", 50)
+    assert len([*table.evidence.stretches()]) > 10
+    assert whole.summary.flipping.share.value > 0
     parts = analyse(MapSample.draw(table))
     assert differences(to_json(whole.summary), to_json(parts.summary), tolerance=1e-12) == []
     for name in ("class_own", "sbd_excess"):

@@ -22,6 +22,9 @@ PAIRWISE = 8
 STRETCH = 1 << 17
 """The voxels that are looked at together, where sums over all of them are wanted."""
 
+STRETCH_ENTRIES = 1 << 22
+"""Likewise for entries, of which soft scores have K a voxel."""
+
 
 def row_chunks(rows: int, K: int) -> Iterator[slice]:
     """Return slices of consecutive rows whose dense evidence has at most `CHUNK_VALUES` values.
@@ -148,6 +151,11 @@ class Evidence(NDArrayOperatorsMixin):
     def chunks(self) -> Iterator[slice]:
         """Return consecutive rows that together are small when dense."""
         return row_chunks(len(self), self.K)
+
+    def stretches(self) -> Iterator[slice]:
+        """Return consecutive rows with about `STRETCH_ENTRIES` entries: computations on entries take little memory."""
+        rows = len(self)
+        return stretches(rows, max(1, STRETCH_ENTRIES * rows // max(len(self.weight), 1)))
 
     def rowwise(self, formula: Callable[[Float64], npt.NDArray[Any]]) -> npt.NDArray[Any]:
         """Return what a formula makes of dense rows (r, K), chunk by chunk: (n, ...)."""

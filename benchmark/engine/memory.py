@@ -21,6 +21,7 @@ from semstab.engine.units import Unit
 from semstab.errors import ConfigError, DataError, OutgrownError
 from semstab.pixels.preparation import perturb
 from semstab.statistics.cluster_sums import count_distinct
+from semstab.statistics.sample import MOST_VOXELS
 from semstab.task import Task, read
 
 if TYPE_CHECKING:
@@ -54,6 +55,7 @@ def map_bytes(
     total = expected_bytes(backend, n, seen, K, soft=soft) + (1 + logged) * table_bytes(n, K, soft=soft)
     total += (logged + soft) * expected_bytes(backend, n, seen, K)  # the ground truth, and the map of reduced scores
     total += logged * log_bytes(seen, K, soft=soft)
+    total += soft * 18 * K * min(n, MOST_VOXELS)  # statistics look at each class of a voxel
     return total + sampled * expected_bytes("numpy", n // ONE_IN, 0, K)
 
 

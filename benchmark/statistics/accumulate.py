@@ -89,12 +89,16 @@ class Cubes:
 
     def sums_by_class(self, evidence: Evidence, *weights: Float64) -> list[Any]:
         """Return (G, K) for weights (m,) of the entries of the voxels' evidence: their sums by cube and class."""
-        of = np.repeat(self.at, np.diff(evidence.starts)).astype(np.int64)
-        rows = np.flatnonzero(of >= 0)
-        key, shape = of[rows] * evidence.K + evidence.label[rows], (self.count, evidence.K)
-        size = self.count * evidence.K
-        sums = (np.bincount(key, weights=weight[rows], minlength=size).astype(np.float64) for weight in weights)
-        return [total.reshape(shape) for total in sums]
+        starts, size = evidence.starts, self.count * evidence.K
+        sums = np.zeros((len(weights), size))
+        for stretch in evidence.stretches():
+            entries = slice(starts[stretch.start], starts[stretch.stop])
+            of = np.repeat(self.at[stretch].astype(np.int64), np.diff(starts[stretch.start : stretch.stop + 1]))
+            rows = np.flatnonzero(of >= 0)
+            key = of[rows] * evidence.K + evidence.label[entries][rows]
+            for total, weight in zip(sums, weights, strict=True):
+                np.add(total, np.bincount(key, weights=weight[entries][rows], minlength=size), out=total)
+        return [*sums.reshape(len(weights), self.count, evidence.K)]
 
     def named(self, sums: Mapping[str, Float64]) -> ClusterSums:
         """Return sums (G, C) over these cubes by name."""

@@ -125,11 +125,16 @@ class FlippingSums:
 def _together(table: VoxelTable, inconsistent: Float64) -> Float64:
     """Return (K, K) for voxels that are inconsistent with a probability (n,), NaN for those that do not count."""
     starts, label, weight = table.evidence.entries
-    of = np.repeat(np.arange(len(table)), np.diff(starts))
-    share, counts, pairs = weight / table.op[of], np.nan_to_num(inconsistent)[of], np.zeros((table.K, table.K))
-    for ahead in range(1, int(np.diff(starts).max(initial=1))):
-        first = np.flatnonzero(of[ahead:] == of[:-ahead])
-        np.add.at(pairs, (label[first], label[first + ahead]), counts[first] * share[first] * share[first + ahead])
+    counts, pairs = np.nan_to_num(inconsistent), np.zeros((table.K, table.K))
+    for rows in table.evidence.stretches():
+        entries = slice(starts[rows.start], starts[rows.stop])
+        number = np.diff(starts[rows.start : rows.stop + 1])
+        of, classes = np.repeat(np.arange(rows.start, rows.stop), number), label[entries]
+        share = weight[entries] / table.op[of]
+        for ahead in range(1, int(number.max(initial=1))):
+            first = np.flatnonzero(of[ahead:] == of[:-ahead])
+            together = counts[of[first]] * share[first] * share[first + ahead]
+            np.add.at(pairs, (classes[first], classes[first + ahead]), together)
     return pairs
 
 
