@@ -1,4 +1,4 @@
-"""A compiled look-up of points of one view in another."""
+"""The compiled loop behind `Sample.matched`: points of one view in another, for several factors on depth."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from semstab.core.compiled import serial
 
 
 @serial
-def look_up(points, R, t, factors, lens, image, power, rays, u, v, z, depth, inside, error):
+def find_matches(points, R, t, factors, lens, image, power, rays, u, v, z, depth, inside, error):
     """Find the points (3, N) of a view in another, for factors (F,) on depth, and fill in `Matches`, all (F, N).
 
     - `R`, `t`: from the first camera's axes to the second's, metres

@@ -11,7 +11,7 @@ import numpy as np
 import numpy.typing as npt
 
 from semstab.check.conventions import Convention
-from semstab.check.loops import look_up
+from semstab.check.loops import find_matches
 from semstab.core.prefetch import prefetch
 from semstab.core.types import Float32, Float64, Int64, Mask
 from semstab.data.frames import Frame, Intrinsics
@@ -180,7 +180,7 @@ class Sample:
         shape = len(factors), a.points.shape[1]
         u, v = np.empty(shape, np.int64), np.empty(shape, np.int64)
         z, depth, error, inside = np.empty(shape), np.empty(shape), np.empty(shape), np.empty(shape, np.bool_)
-        look_up(
+        find_matches(
             a.points, b.back @ a.pose[:3, :3], b.back @ (a.pose[:3, 3] - b.pose[:3, 3]), factors, _lens(b.camera),
             fixed(self.views[pair[1]].depth), b.power, _lens(b.rays), u, v, z, depth, inside, error,
         )  # fmt: skip

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from semstab.backends.shared.keys import mix
 from semstab.backends.shared.pixel_keys import in_voxels
 from semstab.core.compiled import serial
 
@@ -12,8 +13,6 @@ NO_VOXEL, AGREES, CONTRADICTS = 0, 1, 2
 
 AXIS = 21
 """Bits of an index in a key."""
-
-GOLDEN = np.uint64(0x9E3779B97F4A7C15)
 
 
 @serial
@@ -26,9 +25,9 @@ def draw_changes(depth, points, valid, labels, ray_x, ray_y, T, size, key, befor
     bits = 1
     while 1 << bits <= 2 * len(key):
         bits += 1
-    rows, shift = np.full(1 << bits, -1, np.int32), np.uint64(64 - bits)
+    rows = np.full(1 << bits, -1, np.int32)
     for row in range(len(key)):
-        rows[find(key[row], key, rows, shift)] = row
+        rows[find(key[row], key, rows)] = row
     H, W = depth.shape
     for v in range(H):
         for u in range(W):
@@ -42,7 +41,7 @@ def draw_changes(depth, points, valid, labels, ray_x, ray_y, T, size, key, befor
             a = np.floor(in_voxels(T[0, 0], T[0, 1], T[0, 2], T[0, 3], x, y, z, size))
             b = np.floor(in_voxels(T[1, 0], T[1, 1], T[1, 2], T[1, 3], x, y, z, size))
             c = np.floor(in_voxels(T[2, 0], T[2, 1], T[2, 2], T[2, 3], x, y, z, size))
-            row = rows[find(key_of(np.int64(a), np.int64(b), np.int64(c)), key, rows, shift)]
+            row = rows[find(key_of(np.int64(a), np.int64(b), np.int64(c)), key, rows)]
             if row >= 0:
                 contradictions[v, u] = CONTRADICTS if labels[v, u] != before[row] else AGREES
                 drift[v, u] = level[row]
@@ -56,9 +55,9 @@ def key_of(x, y, z):
 
 
 @serial
-def find(wanted, key, rows, shift):
+def find(wanted, key, rows):
     """Return the place of a key in a table of rows, or the free one where it belongs."""
-    at = np.int64((np.uint64(wanted) * GOLDEN) >> shift)
+    at = np.int64(mix(wanted) & np.uint64(len(rows) - 1))
     while rows[at] >= 0 and key[rows[at]] != wanted:
         at = (at + 1) & (len(rows) - 1)
     return at
