@@ -22,8 +22,11 @@ PAIRWISE = 8
 STRETCH = 1 << 17
 """The voxels that are looked at together, where sums over all of them are wanted."""
 
-STRETCH_ENTRIES = 1 << 22
+STRETCH_ENTRIES = 1 << 20
 """Likewise for entries, of which soft scores have K a voxel."""
+
+ByEntry = Callable[[Float64, Int64], Float64]
+"""A value of each entry (e,), from its weight (e,) and its row (e,)."""
 
 
 def row_chunks(rows: int, K: int) -> Iterator[slice]:
@@ -152,10 +155,27 @@ class Evidence(NDArrayOperatorsMixin):
         """Return consecutive rows that together are small when dense."""
         return row_chunks(len(self), self.K)
 
-    def stretches(self) -> Iterator[slice]:
-        """Return consecutive rows with about `STRETCH_ENTRIES` entries: computations on entries take little memory."""
+    def stretches(self) -> Iterator[tuple[slice, Int64]]:
+        """Yield stretches of about `STRETCH_ENTRIES` entries, of whole rows, on which computations take little memory.
+
+        They are where the entries are, and the row of each of them.
+        """
         rows = len(self)
-        return stretches(rows, max(1, STRETCH_ENTRIES * rows // max(len(self.weight), 1)))
+        for some in stretches(rows, max(1, STRETCH_ENTRIES * rows // max(len(self.weight), 1))):
+            starts = self.starts[some.start : some.stop + 1]
+            yield slice(starts[0], starts[-1]), np.repeat(np.arange(some.start, some.stop), np.diff(starts))
+
+    def sums_by_class(self, group: npt.NDArray[np.signedinteger[Any]], groups: int, *values: ByEntry) -> list[Float64]:
+        """Return the sums (groups, K) of values of entries by the group (n,) of their row; it is -1 if none counts."""
+        sums = np.zeros((len(values), groups * self.K))
+        for entries, row in self.stretches():
+            of = group[row]
+            counted = np.flatnonzero(of >= 0)
+            weight, rows = self.weight[entries][counted], row[counted]
+            key = of[counted].astype(np.int64) * self.K + self.label[entries][counted]
+            for total, value in zip(sums, values, strict=True):
+                np.add(total, np.bincount(key, weights=value(weight, rows), minlength=sums.shape[1]), out=total)
+        return [total.reshape(groups, self.K) for total in sums]
 
     def rowwise(self, formula: Callable[[Float64], npt.NDArray[Any]]) -> npt.NDArray[Any]:
         """Return what a formula makes of dense rows (r, K), chunk by chunk: (n, ...)."""

@@ -11,7 +11,7 @@ import numpy.typing as npt
 
 from semstab.core.types import Float64, Int32, Int64, Mask
 from semstab.data.events import Events
-from semstab.data.evidence import Evidence
+from semstab.data.evidence import ByEntry, Evidence
 from semstab.data.information import by_group
 from semstab.data.measures import dominant, entropy, vss
 from semstab.data.results import RECURRENT
@@ -87,18 +87,9 @@ class Cubes:
         both = by_group(self.at, [*values.values()], self.count)
         return {name: np.stack(pair, axis=1) for name, *pair in zip(values, both[0].T, both[1].T, strict=True)}
 
-    def sums_by_class(self, evidence: Evidence, *weights: Float64) -> list[Any]:
-        """Return (G, K) for weights (m,) of the entries of the voxels' evidence: their sums by cube and class."""
-        starts, size = evidence.starts, self.count * evidence.K
-        sums = np.zeros((len(weights), size))
-        for stretch in evidence.stretches():
-            entries = slice(starts[stretch.start], starts[stretch.stop])
-            of = np.repeat(self.at[stretch].astype(np.int64), np.diff(starts[stretch.start : stretch.stop + 1]))
-            rows = np.flatnonzero(of >= 0)
-            key = of[rows] * evidence.K + evidence.label[entries][rows]
-            for total, weight in zip(sums, weights, strict=True):
-                np.add(total, np.bincount(key, weights=weight[entries][rows], minlength=size), out=total)
-        return [*sums.reshape(len(weights), self.count, evidence.K)]
+    def sums_by_class(self, evidence: Evidence, *values: ByEntry) -> list[Float64]:
+        """Return (G, K) for values of the entries of the voxels' evidence: their sums by cube and class."""
+        return evidence.sums_by_class(self.at, self.count, *values)
 
     def named(self, sums: Mapping[str, Float64]) -> ClusterSums:
         """Return sums (G, C) over these cubes by name."""
@@ -283,9 +274,12 @@ def _sums_of_table(table: VoxelTable, cubes: Cubes, true_label: Int64 | None, li
         "own": table.self_sum, "twice": twice, "twice_agreeing": twice * agreement, "recurrent": recurrent,
         "vss": recurrent * vss(table), "entropy": entropy(table),
     }  # fmt: skip
-    weight, others = table.evidence.weight, np.repeat(np.maximum(T - 1, 1), np.diff(table.evidence.starts))
-    apart = 2.0 * (others * weight - weight * weight + weight) / others  # for each observation
-    shares, apart = cubes.sums_by_class(table.evidence, weight, apart)
+    others = np.maximum(T - 1, 1)
+
+    def disagreement(weight: Float64, voxel: Int64) -> Float64:  # of each observation
+        return 2.0 * (others[voxel] * weight - weight * weight + weight) / others[voxel]
+
+    shares, apart = cubes.sums_by_class(table.evidence, lambda weight, _: weight, disagreement)
     by_class = {"evidence": shares}
     if K <= MOST_CLASSES:
         known = np.where(one_hot_where(table, cubes.at >= 0), 1.0, np.nan)

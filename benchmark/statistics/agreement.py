@@ -15,7 +15,6 @@ import numpy as np
 
 from semstab.core.types import Float64, Int64, Mask
 from semstab.data.events import Events
-from semstab.data.evidence import Evidence
 from semstab.data.measures import Quantity, entropy, vss
 from semstab.data.statistics import ClassAgreement
 from semstab.data.voxels import VoxelTable
@@ -164,27 +163,36 @@ def class_sums(table: VoxelTable, events: Events | None = None) -> Float64:
         one_hot, known = np.ones(len(table), np.bool_), one_hot_where(table, again)
     pairs = np.where(again, T * np.maximum(T - 1, 1), 1.0)
 
-    def by_class(evidence: Evidence, voxel: Int64, values: Float64, where: Mask) -> Float64:
-        some = np.flatnonzero((where & again)[voxel])
-        label, of, own = evidence.label[some], voxel[some], values[some]
-        apart = 2.0 * own / pairs[of]
-        return np.stack([np.bincount(label, weights=each, minlength=K) for each in (own, apart, T[of] * apart)])
+    def squares(s: Float64, voxel: Int64) -> Float64:
+        return np.where(one_hot[voxel], s, 0.0)
 
-    own, voxel = table.evidence.weight, np.repeat(np.arange(len(table)), np.diff(table.evidence.starts))
-    every, squares = np.ones(len(table), np.bool_), np.where(one_hot[voxel], own, 0.0)
-    total = by_class(table.evidence, voxel, own, every)[0]
-    shares = by_class(table.evidence, voxel, own / T[voxel], every)[0]
-    _, apart, weighted = by_class(table.evidence, voxel, (T[voxel] - 1.0) * own - own * own + squares, every)
-    of_squares = by_class(table.evidence, voxel, squares, every)[0]
+    def disagreement(s: Float64, voxel: Int64) -> Float64:
+        apart: Float64 = 2.0 * ((T[voxel] - 1.0) * s - s * s + squares(s, voxel)) / pairs[voxel]
+        return apart
+
+    def weighted(s: Float64, voxel: Int64) -> Float64:
+        return T[voxel] * disagreement(s, voxel)
+
+    group = np.where(again, 0, -1)
+    sums = table.evidence.sums_by_class(
+        group, 1, lambda s, _: s, lambda s, voxel: s / T[voxel], disagreement, weighted, squares
+    )
     if events is not None:  # evidence that is not one-hot: the log has the squares of its observations
-        log = events.evidence
-        further = by_class(log, np.repeat(events.voxel, np.diff(log.starts)), log.weight**2, ~one_hot)
-        of_squares, apart, weighted = of_squares + further[0], apart + further[1], weighted + further[2]
+        of = events.voxel
+
+        def further(s: Float64, row: Int64) -> Float64:
+            apart: Float64 = 2.0 * s**2 / pairs[of[row]]
+            return apart
+
+        logged = events.evidence.sums_by_class(
+            np.where(one_hot, -1, group)[of], 1, further, lambda s, row: T[of[row]] * further(s, row), lambda s, _: s**2
+        )
+        sums[2:] = [a + b for a, b in zip(sums[2:], logged, strict=True)]
+    by_class = np.concatenate(sums)
     if not known:
-        for unknown in (apart, weighted, of_squares):
-            unknown[total > 0] = np.nan
+        by_class[2:, by_class[0] > 0] = np.nan
     counts = np.full((2, K), [[np.count_nonzero(again)], [table.op.sum(where=again, dtype=np.float64)]], np.float64)
-    return np.concatenate([np.stack([total, shares, apart, weighted, of_squares]), counts])
+    return np.concatenate([by_class, counts])
 
 
 def class_agreement_of(sums: Float64, classes: Sequence[str] = ()) -> tuple[ClassAgreement, ...]:

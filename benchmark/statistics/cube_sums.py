@@ -72,8 +72,7 @@ def location_sums(table: VoxelTable, columns: Columns, cubes: Cubes) -> ClusterS
             **{name: columns[f"disagreement_{name}"] for name in ("within", "between")},
         }
     )
-    each = np.repeat(table.op.astype(np.float64), np.diff(table.evidence.starts))
-    (by_voxel,) = cubes.sums_by_class(table.evidence, table.evidence.weight / each)
+    (by_voxel,) = cubes.sums_by_class(table.evidence, lambda weight, voxel: weight / table.op[voxel])
     kappa = np.hstack([sums["psa"], by_voxel])  # as of `kappa_columns`
     return cubes.named(sums | {"kappa": kappa})
 
@@ -124,17 +123,10 @@ class FlippingSums:
 
 def _together(table: VoxelTable, inconsistent: Float64) -> Float64:
     """Return (K, K) for voxels that are inconsistent with a probability (n,), NaN for those that do not count."""
-    starts, label, weight = table.evidence.entries
-    counts, pairs = np.nan_to_num(inconsistent), np.zeros((table.K, table.K))
-    for rows in table.evidence.stretches():
-        entries = slice(starts[rows.start], starts[rows.stop])
-        number = np.diff(starts[rows.start : rows.stop + 1])
-        of, classes = np.repeat(np.arange(rows.start, rows.stop), number), label[entries]
-        share = weight[entries] / table.op[of]
-        for ahead in range(1, int(number.max(initial=1))):
-            first = np.flatnonzero(of[ahead:] == of[:-ahead])
-            together = counts[of[first]] * share[first] * share[first + ahead]
-            np.add.at(pairs, (classes[first], classes[first + ahead]), together)
+    from semstab.statistics.loops.pairs import add_class_pairs
+
+    pairs = np.zeros((table.K, table.K))
+    add_class_pairs(table.evidence.entries, table.op, np.nan_to_num(inconsistent), pairs)
     return pairs
 
 

@@ -71,8 +71,9 @@ def expected_sbd(table: VoxelTable, events: Events | None = None, *, seed: int =
 
     T, evidence = table.op, table.evidence
     known = (T >= 2) & (LONGEST_TABLE >= T) & (np.abs(table.self_sum - T) <= ONE_HOT * T)
-    entries = np.flatnonzero(np.repeat(known, np.diff(evidence.starts)))
-    of = np.repeat(np.arange(len(table)), np.diff(evidence.starts))[entries]
+    number = np.diff(evidence.starts)
+    entries = np.flatnonzero(np.repeat(known, number))
+    of = np.repeat(np.flatnonzero(known), number[known])
     times = np.rint(evidence.weight[entries]).astype(np.int64)
     pairs, which = np.unique(times * (LONGEST_TABLE + 1) + T[of], return_inverse=True)
     part, drifts = np.zeros(len(pairs)), one_hot_drifts(int(T.max(initial=2, where=known)))

@@ -1,4 +1,4 @@
-"""Compiled pass over pairs of observations: the sums of a correlogram, from which alpha of each of its bins follows."""
+"""Compiled passes over pairs: of observations, from which a correlogram follows, and of classes that share a voxel."""
 
 from __future__ import annotations
 
@@ -36,3 +36,19 @@ def add_pairs(first, second, bins, cluster, log, sums):
                 sums[k, of, 2] += own
                 for e in range(starts[one], starts[one + 1]):
                     sums[k, of, 3 + label[e]] += weight[e]
+
+
+@serial
+def add_class_pairs(evidence, op, weight_of, sums):
+    """Add to `sums` (K, K), above its diagonal, how much two classes share a voxel, times its weight (n,).
+
+    It is the product of the classes' shares of the voxel's evidence (starts, label, weight), whose sum is OP (n,).
+    """
+    starts, label, weight = evidence
+    for i in range(op.shape[0]):
+        if weight_of[i] == 0.0:
+            continue
+        for a in range(starts[i], starts[i + 1]):
+            share = weight_of[i] * (weight[a] / op[i])
+            for b in range(a + 1, starts[i + 1]):
+                sums[label[a], label[b]] += share * (weight[b] / op[i])
