@@ -13,13 +13,8 @@ import importlib.metadata
 import math
 from collections.abc import Callable, Iterator
 
-import krippendorff
 import numpy as np
 import numpy.typing as npt
-import torch
-from sklearn.metrics import cohen_kappa_score
-from statsmodels.stats.inter_rater import fleiss_kappa as statsmodels_kappa
-from torchmetrics.classification import MulticlassAccuracy, MulticlassCalibrationError, MulticlassJaccardIndex
 
 from semstab.data.events import Events
 from semstab.statistics import fleiss_kappa, krippendorff_alpha, psa
@@ -50,6 +45,8 @@ def log_of(labels: Labels, K: int) -> Events:
 
 def alpha(rng: np.random.Generator) -> tuple[float, float]:
     """Krippendorff's alpha of nominal labels."""
+    import krippendorff
+
     labels, K = labels_of(rng, all_seen=False)
     data = np.where(labels >= 0, labels, np.nan).T
     return krippendorff_alpha(log_of(labels, K).table()), krippendorff.alpha(data, level_of_measurement="nominal")
@@ -57,6 +54,8 @@ def alpha(rng: np.random.Generator) -> tuple[float, float]:
 
 def kappa(rng: np.random.Generator) -> tuple[float, float]:
     """Fleiss' kappa, of places that all frames see."""
+    from statsmodels.stats.inter_rater import fleiss_kappa as statsmodels_kappa
+
     labels, K = labels_of(rng, all_seen=True)
     counts = np.stack([(labels == k).sum(axis=1) for k in range(K)], axis=1)
     return fleiss_kappa(log_of(labels, K).table()), float(statsmodels_kappa(counts))
@@ -64,6 +63,8 @@ def kappa(rng: np.random.Generator) -> tuple[float, float]:
 
 def observed(rng: np.random.Generator) -> tuple[float, float]:
     """PSA of two frames: the observed agreement in Cohen's kappa, which follows from it and the margins."""
+    from sklearn.metrics import cohen_kappa_score
+
     labels, K = labels_of(rng, all_seen=True, raters=2)
     a, b = (np.bincount(rater, minlength=K) / len(labels) for rater in labels.T)
     chance, own = float(a @ b), float(psa(log_of(labels, K).table()).mean())
@@ -80,6 +81,9 @@ def beliefs(rng: np.random.Generator) -> tuple[Array, Labels]:
 
 def iou(rng: np.random.Generator) -> tuple[float, float]:
     """Mean IoU over the classes that are true or predicted somewhere."""
+    import torch
+    from torchmetrics.classification import MulticlassJaccardIndex
+
     belief, true = beliefs(rng)
     predicted, K = belief.argmax(axis=1), belief.shape[1]
     there = np.union1d(predicted, true)
@@ -89,6 +93,9 @@ def iou(rng: np.random.Generator) -> tuple[float, float]:
 
 def accuracy(rng: np.random.Generator) -> tuple[float, float]:
     """Share of right labels."""
+    import torch
+    from torchmetrics.classification import MulticlassAccuracy
+
     belief, true = beliefs(rng)
     other = MulticlassAccuracy(belief.shape[1], average="micro")
     return correctness(belief, true).accuracy, float(other(torch.from_numpy(belief), torch.from_numpy(true)))
@@ -96,6 +103,9 @@ def accuracy(rng: np.random.Generator) -> tuple[float, float]:
 
 def calibration(rng: np.random.Generator) -> tuple[float, float]:
     """Expected calibration error with as many bins."""
+    import torch
+    from torchmetrics.classification import MulticlassCalibrationError
+
     belief, true = beliefs(rng)
     other = MulticlassCalibrationError(belief.shape[1], n_bins=BINS, norm="l1")
     return correctness(belief, true).ece, float(other(torch.from_numpy(belief), torch.from_numpy(true)))

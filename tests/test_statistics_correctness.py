@@ -7,7 +7,6 @@ import math
 import numpy as np
 import pytest
 from simulated_events import grid, log_of, log_of_evidence
-from sklearn.metrics import accuracy_score, jaccard_score
 
 from semstab.data.information import normalise
 from semstab.errors import DataError
@@ -33,6 +32,8 @@ def test_the_truth_of_a_voxel_is_what_most_of_its_ground_truth_says():
 
 
 def test_accuracy_and_miou_are_those_of_scikit_learn_and_brier_of_the_normalised_evidence():
+    from sklearn.metrics import accuracy_score, jaccard_score
+
     belief, label = random_beliefs()
     found = correctness(belief, label)
     predicted = belief.argmax(axis=1)
