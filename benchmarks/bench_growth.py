@@ -29,7 +29,7 @@ from bench_statistics import Watch, resident
 
 from semstab import backends
 from semstab.core.files import write_json
-from semstab.engine.memory import map_bytes
+from semstab.engine.memory import MapMemory
 
 GROWING = ("frames", "voxels", "classes")
 VIEWS = 2
@@ -61,7 +61,7 @@ def measured(backend_name: str, size: tuple[int, int], frames: int, wanted: int,
         times.append(1e3 * (time.process_time() - started))
     end = finished(watch, backend)
     most = max(value for name, value in end.items() if name.endswith("_bytes"))
-    estimate = map_bytes(backend_name, K, voxels, observations) / voxels
+    estimate = MapMemory(backend_name, K).tile(voxels, observations) / voxels
     return {"ms": median(times), "bytes": held / voxels, "most": most, "estimate": estimate / most, "seen": voxels}
 
 

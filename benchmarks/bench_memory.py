@@ -4,7 +4,8 @@
 
 What a run takes is the peak of the whole command less what it has when it is planned (0.22 GB, with Open3D 0.36). The
 estimate is of all of that: what is loaded later, frames, and the map with what comes of it, of as many voxels and
-observations as there were; in tiles, the largest part's, where `memory_gb` is a third of what the whole map takes.
+observations as there were; in tiles, where `memory_gb` is a third of what the whole map takes, with a tile as large as
+the largest one was.
 """
 
 from __future__ import annotations
@@ -15,8 +16,7 @@ import json
 import subprocess
 import sys
 import tempfile
-from collections.abc import Callable, Iterator
-from functools import partial
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -26,7 +26,7 @@ import numpy as np
 import semstab
 from semstab.core.files import write_json
 from semstab.data.voxels import VoxelTable
-from semstab.engine.memory import GB, map_bytes, process_bytes
+from semstab.engine.memory import GB, MapMemory, process_bytes
 
 HERE = Path(__file__).resolve().parent
 sys.path.insert(0, str(HERE.parent / "tests"))
@@ -71,42 +71,28 @@ def taken(found: dict[str, float]) -> tuple[float, str]:
     return (found["all"] - found["digest"]) * GB, stage
 
 
-def largest_tile(out: Path, estimate: Callable[[float, float], float], observed: float) -> tuple[float, int]:
-    """Bytes, as estimated, and voxels of the largest tile of a run; `observed` is how often a voxel is seen."""
-    voxels = max(map(len, VoxelTable.iter_tiles(next((out / "voxels").iterdir()))))
-    return estimate(voxels, observed * voxels), voxels
+def largest_tile(out: Path) -> int:
+    """Voxels of the largest tile of a run."""
+    return max(map(len, VoxelTable.iter_tiles(next((out / "voxels").iterdir()))))
 
 
 def measured(scene: Path, out: Path, backend: str, K: int, kind: str, most_gb: float) -> Iterator[dict[str, Any]]:
     """At once, then in tiles."""
-    soft, (width, height) = kind == "scores", SIZE[kind]
-    first = flight.frame(0, width, height, K)
-    estimate = partial(map_bytes, backend, K, soft=soft, sampled=backend == "numba")
-    if estimate(most := FRAMES[kind] * MOST_VOXELS[kind], most) > most_gb * GB:
-        print(f"{backend:>8} {K:4} {kind:>7} left out: {estimate(most, most) / GB:.2g} GB")
+    estimate = MapMemory(backend, K, soft=kind == "scores", sampled=backend == "numba")
+    process = process_bytes(flight.frame(0, *SIZE[kind], K), K, None, soft=estimate.soft)
+    if estimate.whole(most := FRAMES[kind] * MOST_VOXELS[kind], most) > most_gb * GB:
+        print(f"{backend:>8} {K:4} {kind:>7} left out: {estimate.whole(most, most) / GB:.2g} GB")
         return
     found, stage = taken(stages(scene, out, backend, VOXEL_SIZE, "--set", "memory_gb=1000", "--tile-size", "off"))
     (summary,) = semstab.load_result(out).runs
     voxels, observations = summary.table.voxels, summary.table.observations
     own = {"backend": backend, "K": K, "kind": kind, "voxels": voxels}
-    whole = estimate(voxels, observations)
-    yield {
-        **own,
-        "run": "whole",
-        "bytes": found,
-        "estimate": whole + process_bytes(first, K, None, soft=soft),
-        "stage": stage,
-    }
+    whole = estimate.whole(voxels, observations)
+    yield {**own, "run": "whole", "bytes": found, "estimate": process + whole, "stage": stage}
     limit, out = whole / 3 / GB, out.with_name(f"{backend}-tiles")
     found, stage = taken(stages(scene, out, backend, VOXEL_SIZE, "--set", f"memory_gb={limit}"))
-    tile, voxels = largest_tile(out, estimate, observations / voxels)
-    yield {
-        **own,
-        "run": "tiles",
-        "bytes": found,
-        "estimate": tile + process_bytes(first, K, None, soft=soft),
-        "stage": stage,
-    }
+    tiles = estimate.tiles(voxels, observations, largest_tile(out))
+    yield {**own, "run": "tiles", "bytes": found, "estimate": process + tiles, "stage": stage}
 
 
 def main() -> None:

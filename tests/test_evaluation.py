@@ -23,7 +23,7 @@ from semstab.core.json_form import to_json
 from semstab.data.events import Events
 from semstab.data.voxels import VoxelTable
 from semstab.engine import Observer, load_result
-from semstab.engine.memory import map_bytes
+from semstab.engine.memory import MapMemory
 from semstab.errors import ConfigError, DataError
 from semstab.report import terminal
 from semstab.report.tables import tables
@@ -196,7 +196,7 @@ def test_models_of_different_classes_are_not_compared(tmp_path) -> None:
 
 def test_the_log_counts_as_memory(tmp_path) -> None:
     root = tiny_scene.write(tmp_path / "wall", ("a",), frames=30)
-    without, expected = (map_bytes("numba", 3, 222, 30 * 48, logged=wanted) for wanted in (False, True))
+    without, expected = (MapMemory("numba", 3, logged=logged).whole(222, 30 * 48) for logged in (False, True))
     held = 30 * 48 * (3 * 8 + 40)  # the log alone, as `Events` has it
     assert expected - without > held
     with pytest.raises(ConfigError, match="no statistics; or set memory_gb"):

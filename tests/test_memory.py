@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import re
 import tracemalloc
 
 import numpy as np
@@ -38,11 +39,45 @@ def test_the_estimate_holds_for_a_flight_and_saturates_over_one_place(tmp_path) 
     root = tiny_scene.write(tmp_path / "wall", models=("a",), frames=60)
     plan, config = planned(root, voxel_size=0.05, pixel_stride=1)
     table = semstab.run(config, report=False).runs[0].table
-    size = memory.map_size(plan.tasks[0], plan.units[0].config)
+    *_, size = memory.map_sizes(plan.tasks[0], plan.units[0].config)
     assert size.voxels == pytest.approx(table.voxels, rel=0.3)
     assert size.observations == pytest.approx(table.observations, rel=0.3)
     still = dataclasses.replace(plan.tasks[0], indices=[0] * 60)
-    assert memory.map_size(still, plan.units[0].config).voxels == pytest.approx(48)
+    *_, size = memory.map_sizes(still, plan.units[0].config)
+    assert size.voxels == pytest.approx(48)
+
+
+def test_a_flight_in_legs_is_looked_at_until_their_overlap_is_seen(root, monkeypatch) -> None:
+    """A few frames far apart see no overlap; of 12 legs of 20 frames, each sees 20 by 20 voxels."""
+    plan, _ = planned(root)
+    x, y = (axis.ravel() for axis in np.indices((20, 20)))
+
+    def seen(index: int) -> np.ndarray:
+        leg, along = divmod(index, 20)
+        return np.stack([x + 12 * leg, y + 10 * along, np.zeros(400, int)], axis=1)
+
+    monkeypatch.setattr(memory, "_geometry", lambda task, settings, index: index)
+    monkeypatch.setattr(memory, "voxels_in", lambda index, voxel_size: seen(index))
+    flight = dataclasses.replace(plan.tasks[0], indices=[*range(240)])
+    first, *_, last = memory.map_sizes(flight, plan.units[0].config)
+    true = len(np.unique(np.concatenate([seen(index) for index in range(240)]), axis=0))
+    assert first.voxels > 1.3 * true
+    assert last.voxels == pytest.approx(true, rel=0.1)
+    assert last.observations == pytest.approx(240 * 400)
+
+
+def test_of_large_frames_a_part_is_looked_at(root, monkeypatch) -> None:
+    plan, _ = planned(root)
+    x, y, z = (axis.ravel() for axis in np.indices((300, 300, 3)))
+
+    def seen(index: int) -> np.ndarray:
+        return np.stack([x + 30 * index, y, z], axis=1)
+
+    monkeypatch.setattr(memory, "_geometry", lambda task, settings, index: index)
+    monkeypatch.setattr(memory, "voxels_in", lambda index, voxel_size: seen(index))
+    *_, size = memory.map_sizes(dataclasses.replace(plan.tasks[0], indices=[*range(10)]), plan.units[0].config)
+    assert size.voxels == pytest.approx(570 * 300 * 3, rel=0.03)
+    assert size.by_column == 3
 
 
 def test_a_unit_that_will_not_fit_is_refused_before_a_frame_is_fused(root, tmp_path) -> None:
@@ -60,22 +95,23 @@ def test_a_unit_that_will_not_fit_is_fused_in_tiles(root, monkeypatch) -> None:
     monkeypatch.setattr(memory, "available_bytes", lambda: 1000)
     sizing = memory.planned_sizes(config, plan.units, 1)
     assert sizing.tile_sizes.keys() == {each.identity for each in plan.units}
-    assert "2.5e-07 GB are free: it is fused in tiles of" in sizing.lines[0]
+    assert re.search(r"2\.5e-07 GB are free: it is fused in tiles of .* m, which take .* GB$", sizing.lines[0])
 
 
 def test_tiles_are_as_large_as_the_memory_allows_and_as_many_as_processes_need(root) -> None:
     (unit,) = planned(root, backends=["numba"], check=None)[0].units
     size = memory.MapSize(voxels=1e8, observations=3e8, by_column=2.0)
-    edges = [memory._tile_edge(unit, size, budget, 1, soft=False) for budget in (1e8, 4e8, 16e8)]
+    kind = memory._kind(unit, soft=False)
+    edges = [memory._tile_edge(kind, size, budget, 1) for budget in (1e8, 4e8, 16e8)]
     assert edges[1] == 2 * edges[0]
     assert edges[2] == 4 * edges[0]
-    assert memory.map_bytes("numba", 3, 2 * edges[0] ** 2, 6 * edges[0] ** 2) < 1e8
-    assert memory._tile_edge(unit, memory.MapSize(1e6, 3e6, 2.0), 1e12, 8, soft=False) ** 2 * 2 * 2 * 8 <= 1e6
+    assert memory.MapMemory("numba", 3).tile(2 * edges[0] ** 2, 6 * edges[0] ** 2) < 1e8
+    assert memory._tile_edge(kind, memory.MapSize(1e6, 3e6, 2.0), 1e12, 8) ** 2 * 2 * 2 * 8 <= 1e6
 
 
 def test_one_frame_is_enough_where_there_is_ample_room(root, monkeypatch) -> None:
     plan, config = planned(root)
-    monkeypatch.setattr(memory, "map_size", lambda *_: pytest.fail("frames were read"))
+    monkeypatch.setattr(memory, "map_sizes", lambda *_: pytest.fail("frames were read"))
     sizing = memory.planned_sizes(config, plan.units, 1)
     assert not sizing.tile_sizes
     assert not sizing.refused

@@ -45,7 +45,7 @@ from semstab.statistics.verdict import Limits
 from semstab.task import Task, read
 
 SMALL = 1 << 30
-"""A process with fewer bytes keeps freed memory for the next table."""
+"""A process with fewer bytes keeps freed memory for the next table, but between tiles: there memory is short."""
 
 Savers = dict[str, Callable[[Path], None]]
 """A function that writes each file of a unit, by the file's path in the folder."""
@@ -75,7 +75,7 @@ def finish(live: LiveMap, stream: Stream, watch: Stopwatch) -> Work:
                 sums = (TableSums.of(fused.table, config.strata) if sample is None else sample.summary).arrays()
             if sample is not None and tile is None:
                 analysis = analyse_sample(live.task, config, sample, observations)
-            trim_malloc(least=SMALL)
+            trim_malloc(least=SMALL if tile is None else 0)
         result = TileResult(
             {},
             None if fused is None else fused.checked,
@@ -135,7 +135,7 @@ def _fused_map(live: LiveMap, watch: Stopwatch) -> FusedMap:
     live.background.close()
     with watch("reference"):
         checked = None if live.reference is None else _checked(live, table, live.reference)
-        trim_malloc(least=SMALL)
+        trim_malloc(least=SMALL if live.work.tile is None else 0)
     events = None if events is None else replace(events, classes=classes)
     return FusedMap(*_left(live, table, events), truth, reduced, checked)
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, NamedTuple
 
@@ -13,9 +13,10 @@ from semstab.backends import expected_bytes, is_pointwise
 from semstab.backends.numpy_reference import ONE_IN
 from semstab.config import Config
 from semstab.core.arrays import evenly
-from semstab.core.prefetch import default_threads
+from semstab.core.prefetch import default_threads, prefetch
 from semstab.core.process import available_bytes, resident_bytes, trim_malloc
-from semstab.core.types import Int64
+from semstab.core.types import Int32, Int64
+from semstab.data.evidence import STRETCH_ENTRIES
 from semstab.data.frames import Frame
 from semstab.engine.units import Unit
 from semstab.errors import ConfigError, DataError, OutgrownError
@@ -29,34 +30,67 @@ if TYPE_CHECKING:
 
 GB = 1e9
 
-LOADED = 250e6
-"""Bytes of code that a run loads once it is planned, of the sample of observations, and left between tiles."""
+LOADED = 210e6
+"""Bytes of code that a run loads once it is planned, and of the sample of observations and its statistics."""
 
 FRAMES_AT_WORK = 3
 """Frames that are in memory in addition to those which are read ahead."""
 
 
-def map_bytes(
-    backend: str,
-    K: int,
-    voxels: float,
-    observations: float,
-    *,
-    soft: bool = False,
-    logged: bool = False,
-    sampled: bool = False,
-) -> float:
-    """Return roughly the bytes that a map of K classes and its tables take.
+@dataclass(frozen=True)
+class MapMemory:
+    """What maps of one kind take, roughly: bytes by their voxels and observations.
 
-    soft: of scores, which are fused as labels as well; logged: with every observation and the ground truth; sampled:
-    with the reference on a sample of its voxels.
+    Attributes:
+        backend: By which they are fused.
+        K: Number of classes.
+        soft: Of scores, which are fused as labels as well.
+        logged: With every observation and the ground truth.
+        sampled: With the reference on a sample of the voxels.
     """
-    n, seen = int(voxels), int(observations)
-    total = expected_bytes(backend, n, seen, K, soft=soft) + (1 + logged) * table_bytes(n, K, soft=soft)
-    total += (logged + soft) * expected_bytes(backend, n, seen, K)  # the ground truth, and the map of reduced scores
-    total += logged * log_bytes(seen, K, soft=soft)
-    total += soft * 18 * K * min(n, MOST_VOXELS)  # statistics look at each class of a voxel
-    return total + sampled * expected_bytes("numpy", n // ONE_IN, 0, K)
+
+    backend: str
+    K: int
+    soft: bool = False
+    logged: bool = False
+    sampled: bool = False
+
+    def growing(self, voxels: float, observations: float) -> float:
+        """Return the bytes of a map, of that of the ground truth or of reduced scores, and of the reference."""
+        n, seen = int(voxels), int(observations)
+        both = expected_bytes(self.backend, n, seen, self.K, soft=self.soft)
+        both += (self.logged + self.soft) * expected_bytes(self.backend, n, seen, self.K)
+        return both + self.sampled * expected_bytes("numpy", n // ONE_IN, 0, self.K)
+
+    def tables(self, voxels: float, observations: float) -> float:
+        """Return the bytes of its tables and of its log."""
+        n, seen = int(voxels), int(observations)
+        tables = (1 + self.logged) * table_bytes(n, self.K, soft=self.soft)
+        return tables + self.logged * log_bytes(seen, self.K, soft=self.soft)
+
+    def statistics(self, voxels: float) -> float:
+        """Return the bytes that statistics take beyond the tables: columns of voxels, and a stretch of scores."""
+        drawn = min(int(voxels), MOST_VOXELS)
+        return 240 * drawn + self.soft * 80 * min(self.K * drawn, STRETCH_ENTRIES)
+
+    def whole(self, voxels: float, observations: float) -> float:
+        """Return the bytes of a map and its tables, while they are made of it or measured."""
+        return self.tables(voxels, observations) + max(self.growing(voxels, observations), self.statistics(voxels))
+
+    def tile(self, voxels: float, observations: float) -> float:
+        """Return the bytes of a tile and its tables."""
+        return self.tables(voxels, observations) + self.growing(voxels, observations)
+
+    def tiles(self, voxels: float, observations: float, tile_voxels: float) -> float:
+        """Return the bytes of a map in tiles of at most `tile_voxels`.
+
+        That is a tile beside the voxels that are drawn from those before it, or the statistics of the voxels that are
+        drawn from all of them.
+        """
+        seen, drawn = observations / max(voxels, 1.0), min(voxels, MOST_VOXELS)
+        held = min(voxels, 2 * drawn)
+        tile = self.tables(held, seen * held) + self.tile(tile_voxels, seen * tile_voxels)
+        return max(tile, self.tables(drawn, seen * drawn) + self.statistics(drawn))
 
 
 def log_bytes(observations: int, num_classes: int, *, soft: bool) -> int:
@@ -88,13 +122,22 @@ def voxels_in(frame: Frame, voxel_size: float) -> Int64:
 DOUBT = 10
 """A sequence whose frames might see that many times the voxels of the first one, all new, is surely small enough."""
 
-SAMPLED = 24
-"""Frames, evenly spaced, from which the size of a map is estimated; every third of them with its successor."""
+SAMPLED, MOST_SAMPLED = 24, 192
+"""Frames, evenly spaced, from which the size of a map is estimated: first, and where that leaves doubt."""
 
-SHARE = 0.5
+CERTAIN = 1.2
+"""An estimate that is at most so many times what the sampled frames see needs no more frames."""
+
+PAIRS = 8
+"""Frames of the sample that are looked at with their successors."""
+
+DRAWN = 1 << 13
+"""Voxels of a frame, about, that are looked at."""
+
+SHARE = 0.6
 """The part of the memory for maps that a tile takes: a hash or a grid that doubles needs room."""
 
-CROWDED = 1.5
+CROWDED = 1.3
 """A tile may have that many times the mean number of voxels of its size."""
 
 SMALLEST, LARGEST = 8, 1 << 16
@@ -141,14 +184,15 @@ def _plan_sizes(config: Config, group: Sequence[Unit], width: int, sizing: Sizin
     most = DOUBT * len(task.indices) * len(voxels_in(first.every(2), settings.voxel_size))
     for soft in (True, False):  # if scores would fit, no label is decoded to know, which a network may have to predict
         free = available_for_maps(config, width, process_bytes(first, K, settings.threads, soft=soft))
-        if sum(_bytes_of(each, most, most, soft=soft) for each in group) <= free:
+        kinds = [_kind(each, soft=soft) for each in group]
+        if sum(kind.whole(most, most) for kind in kinds) <= free:
             return
         if soft and read(task, task.indices[0], settings.pixel_stride).scores is not None:
             break
-    size = map_size(task, settings)
-    needed = sum(_bytes_of(each, size.voxels, size.observations, soft=soft) for each in group)
-    if needed <= free:
-        return
+    for size in map_sizes(task, settings):
+        needed = sum(kind.whole(size.voxels, size.observations) for kind in kinds)
+        if needed <= free:
+            return
     takes = (
         f"{task.scene.name}, {task.model}: about {size.voxels / 1e6:.2g} million voxels of {settings.voxel_size:g} m"
         f" would take {needed / GB:.2g} GB"
@@ -161,11 +205,14 @@ def _plan_sizes(config: Config, group: Sequence[Unit], width: int, sizing: Sizin
         )
         sizing.refused |= {each.identity: line for each in group}
         return
-    edges = {each.identity: _tile_edge(each, size, SHARE * free, width, soft=soft) for each in group}
-    sizing.tile_sizes |= edges
+    edges = [_tile_edge(kind, size, SHARE * free, width) for kind in kinds]
+    sizing.tile_sizes |= {each.identity: edge for each, edge in zip(group, edges, strict=True)}
+    tiles = max(
+        kind.tiles(size.voxels, size.observations, size.of_tile(edge)) for kind, edge in zip(kinds, edges, strict=True)
+    )
     sizing.lines.append(
         f"{takes}, {free / GB:.2g} GB are free{' for each process' if width > 1 else ''}: it is fused in tiles of"
-        f" {edges[group[0].identity] * settings.voxel_size:g} m"
+        f" {edges[0] * settings.voxel_size:g} m, which take {tiles / GB:.2g} GB"
     )
 
 
@@ -178,10 +225,9 @@ def available_for_maps(config: Config, width: int, taken: float) -> float:
     return max(free - taken, free / 4) if config.memory_gb is None else config.memory_gb * GB / width
 
 
-def _bytes_of(unit: Unit, voxels: float, observations: float, *, soft: bool) -> float:
+def _kind(unit: Unit, *, soft: bool) -> MapMemory:
     config, K = unit.config, len(unit.task.mapping.target)
-    logged = config.statistics or config.events
-    return map_bytes(unit.name.backend, K, voxels, observations, soft=soft, logged=logged, sampled=unit.sampled)
+    return MapMemory(unit.name.backend, K, soft, config.statistics or config.events, unit.sampled)
 
 
 def _without(group: Sequence[Unit], settings: Config) -> str:
@@ -198,53 +244,79 @@ class MapSize(NamedTuple):
     observations: float
     by_column: float
 
+    def of_tile(self, edge: int) -> float:
+        """Return the voxels of a tile, where they are crowded."""
+        return min(CROWDED * self.by_column * edge**2, self.voxels)
 
-def _tile_edge(unit: Unit, size: MapSize, budget: float, width: int, *, soft: bool) -> int:
+
+def _tile_edge(kind: MapMemory, size: MapSize, budget: float, width: int) -> int:
     """Return the largest edge of a tile, a power of 2, within the budget.
 
     It is smaller where several processes share the tiles.
     """
     edge = LARGEST
     while edge > SMALLEST:
-        voxels = min(CROWDED * size.by_column * edge**2, size.voxels)
-        observations = voxels * size.observations / max(size.voxels, 1.0)
+        voxels = size.of_tile(edge)
         alone = width > 1 and 2 * width * size.by_column * edge**2 > size.voxels
-        if _bytes_of(unit, voxels, observations, soft=soft) <= budget and not alone:
+        if kind.tile(voxels, voxels * size.observations / max(size.voxels, 1.0)) <= budget and not alone:
             break
         edge //= 2
     return edge
 
 
-def map_size(task: Task, settings: Config) -> MapSize:
-    """Estimate the size of a map from a sample of its frames, evenly spaced.
+def map_sizes(task: Task, settings: Config) -> Iterator[MapSize]:
+    """Yield estimates of the size of a map, each from twice the frames of the one before, until there is no doubt.
+
+    Frames are evenly spaced. There are no more voxels than if each frame added as many as the second one of two
+    successive frames adds to the first.
+    """
+    frames, seen_by, one_in = len(task.indices), dict[int, Int32](), 0
+    for step in (8, 4, 2, 1):
+        sampled = evenly(frames, MOST_SAMPLED)[::step]
+        if len(sampled) < min(SAMPLED, frames):
+            continue
+        following = [k + 1 for k in sampled[:: -(-len(sampled) // PAIRS)] if k + 1 < frames]
+        missing = sorted({*sampled, *following} - seen_by.keys())
+        read = prefetch(lambda k: _geometry(task, settings, task.indices[k]), missing, threads=settings.threads)
+        for k, fetched in zip(missing, read, strict=True):
+            whole = voxels_in(fetched.item, settings.voxel_size)
+            one_in = one_in or max(1, len(whole) // DRAWN)
+            seen_by[k] = _drawn(whole, one_in)
+        seen = [seen_by[k] for k in sampled]
+        together = np.concatenate(seen)
+        distinct, columns = count_distinct(together), count_distinct(together[:, :2])
+        each = float(np.mean([len(own) for own in seen]))
+        new = [_count((seen_by[k - 1], seen_by[k])) - len(seen_by[k - 1]) for k in following]
+        most = each + (frames - 1) * (float(np.mean(new)) if new else 0.0)
+        voxels = max(float(distinct), min(_of_all_frames(seen, distinct, frames), most))
+        yield MapSize(one_in * voxels, one_in * frames * each, distinct / max(columns, 1))
+        if voxels <= CERTAIN * distinct:
+            return
+
+
+def _of_all_frames(seen: Sequence[Int32], distinct: int, frames: int) -> float:
+    """Return the voxels that so many frames see, from those that each of a sample sees, `distinct` together.
 
     The more frames, the fewer voxels are new: a quarter, a half and all of the sample tell by which factor the voxels
-    that another doubling of the frames adds are fewer than those which the last one added. There are no more than if
-    each frame added as many as the second one of two successive frames adds to the first.
+    that another doubling of the frames adds are fewer than those which the last one added.
     """
-
-    def seen_by(k: int) -> Int64:
-        return voxels_in(_geometry(task, settings, task.indices[k]), settings.voxel_size)
-
-    frames = len(task.indices)
-    sampled = evenly(frames, SAMPLED)
-    seen = [seen_by(k) for k in sampled]
-    together = np.concatenate(seen)
-    distinct, columns = count_distinct(together), count_distinct(together[:, :2])
     quarter, half, voxels = _count(seen[::4]), _count(seen[::2]), float(distinct)
-    factor, added, read = min((voxels - half) / max(half - quarter, 1), 2.0), voxels - half, len(sampled)
+    factor, added, read = min((distinct - half) / max(half - quarter, 1), 2.0), float(distinct - half), len(seen)
     while read < frames:
         added *= factor
         voxels += added * min(1.0, math.log2(frames / read))
         read *= 2
-    each = float(np.mean([len(own) for own in seen]))
-    pairs = [(seen[k], seen_by(sampled[k] + 1)) for k in range(0, len(sampled), 3) if sampled[k] + 1 < frames]
-    new = [_count(pair) - len(pair[0]) for pair in pairs]
-    most = each + (frames - 1) * (float(np.mean(new)) if new else 0.0)
-    return MapSize(max(float(distinct), min(voxels, most)), frames * each, distinct / max(columns, 1))
+    return voxels
 
 
-def _count(seen: Sequence[Int64]) -> int:
+def _drawn(voxels: Int64, one_in: int) -> Int32:
+    """Return the voxels above one in so many places: the same ones of every frame, and all of a column."""
+    places = voxels[:, 0] * 0x9E3779B1 + voxels[:, 1] * 0x85EBCA77  # that are drawn lie evenly, without a grid
+    drawn: Int32 = voxels[(places >> 16) % one_in == 0].astype(np.int32)
+    return drawn
+
+
+def _count(seen: Sequence[Int32]) -> int:
     return count_distinct(np.concatenate(seen)) if seen else 0
 
 

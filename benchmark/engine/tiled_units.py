@@ -95,6 +95,7 @@ class TiledUnit:
             return None
         tiles = {tile: self._results[tile] for tile in self._tiles}
         sample = MapSample.merged(self._samples) if self._samples else None
+        self._samples.clear()
         try:
             record = assembled(self._work, self._results[self._frames], tiles, sample)
         except SemstabError as error:
