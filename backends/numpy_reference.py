@@ -42,10 +42,8 @@ class _Seen(NamedTuple):
     pixels: Int64
 
 
-class NumpyReference:
-    """Fusion as the paper writes it: clear before fast; memory grows with every observation."""
-
-    keeps_log = True
+class NumpyHistory:
+    """The history H(q) of every voxel, from which a table is computed."""
 
     def __init__(self, voxel_size: float, num_classes: int, within: Extent | None = None) -> None:
         check_settings(voxel_size, num_classes)
@@ -54,38 +52,15 @@ class NumpyReference:
         self.within = within
         self._row: defaultdict[bytes, int] = defaultdict(itertools.count().__next__)  # voxel q, as bytes -> its row
         self._history: list[_Seen] = []  # frame after frame
-        self._evidence = np.zeros((0, num_classes))  # e(q), row by row, with room for more rows
-        self._op = np.zeros(0, dtype=np.int64)
-        self._total = MapTotal(num_classes)
-        self._changes: Changes | None = None
 
-    @staticmethod
-    def expected_bytes(voxels: int, observations: int, num_classes: int, soft: bool = False) -> int:
-        """Return a dictionary's entry and the evidence a voxel.
-
-        An observation is in the history, and sorted for a table.
-        """
-        return voxels * (240 + 9 * num_classes) + observations * (90 + (25 * num_classes if soft else 0))
-
-    def integrate(self, frame: Frame) -> FrameReport:
-        """Append the frame's observations to the history."""
-        started = time.perf_counter()
+    def append(self, frame: Frame) -> tuple[Int64, Observations]:
+        """Append the frame's observations to the history; return them, and the rows of their voxels."""
         check_depth(frame)
         check_frame(frame, self.num_classes)
         seen = self._observe(frame)
         rows = self._rows(seen)
-        before = self._evidence[rows]
-        after = before + seen.s_bar
-        self._evidence[rows] = after
-        self._op[rows] += 1
         self._history.append(_Seen(rows.astype(np.int32), frame.index, Evidence.of(seen.s_bar), seen.pixels))
-        change, changed = Change.between(before, after, self._op[rows], seen.pixels)
-        self._changes = Changes(seen.index, *changed)
-        return self._total.add(frame.index, change, started)
-
-    def changes(self) -> Changes | None:
-        """Return the changes by the last frame."""
-        return self._changes
+        return rows, seen
 
     def table(self) -> VoxelTable:
         """Return the map so far, from the history."""
@@ -121,15 +96,54 @@ class NumpyReference:
     def _rows(self, seen: Observations) -> Int64:
         """Return the rows of the frame's voxels, new ones added."""
         voxels = np.ascontiguousarray(seen.index, dtype=np.int64).view("V24").ravel().tolist()
-        rows = np.fromiter(map(self._row.__getitem__, voxels), dtype=np.int64, count=len(voxels))
+        return np.fromiter(map(self._row.__getitem__, voxels), dtype=np.int64, count=len(voxels))
+
+
+class NumpyReference(NumpyHistory):
+    """Fusion as the paper writes it: clear before fast; memory grows with every observation."""
+
+    keeps_log = True
+
+    def __init__(self, voxel_size: float, num_classes: int, within: Extent | None = None) -> None:
+        super().__init__(voxel_size, num_classes, within)
+        self._evidence = np.zeros((0, num_classes))  # e(q), row by row, with room for more rows
+        self._op = np.zeros(0, dtype=np.int64)
+        self._total = MapTotal(num_classes)
+        self._changes: Changes | None = None
+
+    @staticmethod
+    def expected_bytes(voxels: int, observations: int, num_classes: int, soft: bool = False) -> int:
+        """Return a dictionary's entry and the evidence a voxel.
+
+        An observation is in the history, and sorted for a table.
+        """
+        return voxels * (240 + 9 * num_classes) + observations * (90 + (25 * num_classes if soft else 0))
+
+    def integrate(self, frame: Frame) -> FrameReport:
+        """Append the frame's observations to the history, and add them to the evidence so far."""
+        started = time.perf_counter()
+        rows, seen = self.append(frame)
+        self._make_room()
+        before = self._evidence[rows]
+        after = before + seen.s_bar
+        self._evidence[rows] = after
+        self._op[rows] += 1
+        change, changed = Change.between(before, after, self._op[rows], seen.pixels)
+        self._changes = Changes(seen.index, *changed)
+        return self._total.add(frame.index, change, started)
+
+    def changes(self) -> Changes | None:
+        """Return the changes by the last frame."""
+        return self._changes
+
+    def _make_room(self) -> None:
         if len(self._row) > len(self._op):
             room = len(self._row) + len(self._row) // 4
             self._evidence.resize((room, self.num_classes), refcheck=False)  # in place: no copy is made
             self._op.resize(room, refcheck=False)
-        return rows
 
 
-class NumpySample(NumpyReference):
+class NumpySample(NumpyHistory):
     """The reference on one in `one_in` of the voxels, drawn at random by their index, through all frames.
 
     Each sample holds those of the next thinner one, so that it can become thinner while the map grows: a defect in a
@@ -140,14 +154,13 @@ class NumpySample(NumpyReference):
         super().__init__(voxel_size, num_classes, within)
         self.one_in, self._left = ONE_IN, 0
 
-    def integrate(self, frame: Frame) -> FrameReport:
+    def integrate(self, frame: Frame) -> None:
         """Append the frame's observations of the sample; make the sample thinner where it has become too large."""
-        report = super().integrate(frame)
+        self.append(frame)
         while len(self._row) - self._left > MOST:
             self.one_in *= 2
             index = np.frombuffer(b"".join(self._row), dtype=np.int64).reshape(-1, 3)
             self._left = int(np.count_nonzero(~in_sample(index.T, self.one_in)))
-        return report
 
     def table(self) -> VoxelTable:
         """Return the map of the sample so far."""

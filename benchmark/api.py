@@ -59,7 +59,7 @@ def run(
             stack.callback(scratch.remove)
         folder = scratch.path if out is None else Path(out)
         reporting = [Reporting(folder)] if report and out is not None else []
-        watching = [*observers, *reporting]
+        watching = [*reporting, *observers]  # the recording is completed beside the report
         result, causes = execute(as_config(config), folder, executor, watching, command, overwrite=overwrite)
     if result.failures:
         first = result.failures[0]
@@ -99,5 +99,5 @@ def run_study(
         >>> len(semstab.run_study(study, "study", report=False).records)
         6
     """
-    observing = [*observers, *([Reporting(out)] if report else [])]
+    observing = [*([Reporting(out)] if report else []), *observers]  # the recording is completed beside the report
     return execute(as_config(config), Path(out), executor, observing, command, overwrite=overwrite)[0]

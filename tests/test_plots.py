@@ -17,6 +17,7 @@ from records import record, study, voxels
 from wall_study import MODELS, drawn_walls, wall_study
 
 from semstab import backends
+from semstab.data.kernels import put_topmost
 from semstab.data.labels import palette
 from semstab.data.measures import SBD_MAX, VSS, measures
 from semstab.data.topdown import EMPTY, level_axes, top_down
@@ -333,3 +334,16 @@ def test_a_room_is_cut_open_beneath_its_ceiling_and_a_wall_is_seen_from_the_side
     assert (room.table.iz == 0).all()
     assert FromAbove.of(at(floor, r=0.1), (0, 0, 1)).view == "from above"
     assert FromAbove.of(at(np.stack([x, 0 * x, y], axis=1), r=0.1), (0, 0, 1)).view == "from the side"
+
+
+@given(st.integers(0, 2**31), st.booleans())
+def test_the_highest_row_of_a_cell_is_seen_and_of_equal_ones_the_last(seed, some_unknown) -> None:
+    rng = np.random.default_rng(seed)
+    rows, height = np.tile(np.arange(60), 2), rng.integers(0, 5, 60).astype(np.float64)
+    height[rng.random(60) < 0.1 * some_unknown] = np.nan
+    cells = rng.integers(0, 6, (120, 2))
+    expected, image = (np.full((6, 6), EMPTY, np.int64) for _ in range(2))
+    order = np.argsort(height[rows], kind="stable")
+    expected[tuple(cells[order].T)] = rows[order]
+    put_topmost(cells, rows, height, image)
+    np.testing.assert_array_equal(image, expected)

@@ -484,9 +484,9 @@ def test_what_goes_wrong_beside_the_loop_is_said_and_the_file_is_closed(tmp_path
         raise RuntimeError("no room")
 
     monkeypatch.setattr(voxel_maps.VoxelLogger, "finish", fail)
+    watching.unit_finished(planned(), Record("key", Variation(), summary_of(table)), table, None)
     with pytest.raises(RuntimeError, match="no room"):
-        watching.unit_finished(planned(), Record("key", Variation(), summary_of(table)), table, None)
-    watching.close()
+        watching.close()
     verify(path)
     assert set(series(read(path), r"/floor\ 1/series/map_vss/net\/x/numpy")) == {0, 1}
 

@@ -30,7 +30,17 @@ from semstab.data.measures import SBD_MAX
 from semstab.data.results import UnitName
 from semstab.engine.units import make_plan
 from semstab.errors import DataError
-from semstab.recording import Recording, camera, color_modes, drift, lacks_pictures, layout, record_finished, voxel_maps
+from semstab.recording import (
+    Recording,
+    camera,
+    color_modes,
+    drift,
+    lacks_pictures,
+    layout,
+    loops,
+    record_finished,
+    voxel_maps,
+)
 from semstab.recording.drift import DriftLog, View
 from semstab.recording.timeline import Clock, entity
 from semstab.task import read as read_frame
@@ -521,3 +531,21 @@ def by_entity(path: Path) -> dict[str, list[str]]:
         entity: sorted(repr({name: value for name, value in row.items() if "RowId" not in name}) for row in rows)
         for entity, rows in read(path).items()
     }
+
+
+def test_levels_of_drift_lie_between_their_edges() -> None:
+    edges, rng = drift.LEVEL_EDGES[1:-1], np.random.default_rng(0)
+    near = edges.astype(np.float32)
+    below, above = (np.nextafter(near, np.float32(end)) for end in (0, 1))
+    values = np.concatenate([near, below, above, np.float32([-1e-9, 1e-45, 2, 1e9]), rng.random(500, np.float32) ** 4])
+    expected = np.searchsorted(edges, values, side="right") + loops.NO_DRIFT + 1
+    assert [loops.level_of(value, edges) for value in values] == expected.tolist()
+    assert loops.level_of(np.float32(0), edges) == loops.NO_DRIFT
+    assert loops.level_of(np.float32(np.nan), edges) == loops.FIRST_SEEN
+
+
+def test_the_first_voxel_of_each_block_stands_for_it() -> None:
+    index = np.random.default_rng(1).integers(-40, 40, (2000, 3))
+    for shift in (1, 3):
+        first = np.sort(np.unique(index >> shift, axis=0, return_index=True)[1])
+        np.testing.assert_array_equal(loops.first_of_blocks(index, shift), first)

@@ -29,7 +29,17 @@ def columns_of_keys(keys: Int64, origin: npt.ArrayLike) -> dict[str, Any]:
 
 def index_of_keys(keys: Int64, origin: npt.ArrayLike) -> Int64:
     """Return voxel indices (n, 3) of packed keys (n,)."""
-    return np.stack([*columns_of_keys(keys, origin).values()], axis=1, dtype=np.int64)
+    index = np.empty((len(keys), 3), np.int64)
+    unpack_keys(keys, np.asarray(origin, np.int64) - HALF, index)
+    return index
+
+
+@serial
+def unpack_keys(keys, start, index):
+    """Unpack keys (n,) into indices (n, 3) that count from `start` (3,)."""
+    for i in range(len(keys)):
+        for axis in range(3):
+            index[i, axis] = (keys[i] >> (42 - 21 * axis) & (2 * HALF - 1)) + start[axis]
 
 
 def out_of_reach(frame: Frame, origin: npt.ArrayLike, voxel_size: float) -> DataError:

@@ -5,6 +5,9 @@ from __future__ import annotations
 from collections import deque
 from collections.abc import Callable
 from concurrent.futures import Future, ThreadPoolExecutor
+from typing import Any, TypeVar
+
+Result = TypeVar("Result")
 
 
 class Background:
@@ -17,12 +20,14 @@ class Background:
 
     def __init__(self, name: str, most_pending: int) -> None:
         self._thread, self._most_pending = ThreadPoolExecutor(1, thread_name_prefix=name), most_pending
-        self._pending: deque[Future[None]] = deque()
+        self._pending: deque[Future[Any]] = deque()
 
-    def submit(self, job: Callable[[], None]) -> None:
+    def submit(self, job: Callable[[], Result]) -> Future[Result]:
         """Submit a job, and wait while too many are pending; an error of an earlier job is raised here."""
         self._drain(self._most_pending)
-        self._pending.append(self._thread.submit(job))
+        submitted = self._thread.submit(job)
+        self._pending.append(submitted)
+        return submitted
 
     def drain(self) -> None:
         """Wait until all jobs are done; an error of a job is raised here."""

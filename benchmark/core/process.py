@@ -20,6 +20,8 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from multiprocessing.connection import Connection
 
+    import psutil
+
 
 _aside, _depth = threading.RLock(), 0
 
@@ -65,9 +67,15 @@ def available_bytes() -> int:
 
 def resident_bytes() -> int:
     """Return the memory that this process takes."""
+    return int(_process(os.getpid()).memory_info().rss)
+
+
+@functools.lru_cache(maxsize=1)
+def _process(pid: int) -> psutil.Process:
+    """Return this process, made once: a process is asked for its memory with every frame."""
     import psutil
 
-    return int(psutil.Process().memory_info().rss)
+    return psutil.Process(pid)
 
 
 def group_bytes(proc: Path, cgroups: Path) -> int | None:

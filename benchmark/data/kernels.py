@@ -51,6 +51,20 @@ def has_other(labels: Any, count: int, ignore: int) -> bool:
     return other
 
 
+@serial
+def put_topmost(cells: Any, rows: Any, height: Any, image: Any) -> None:
+    """Put into each cell of an image (H, W), negative where empty, the row that is highest, of several the last one.
+
+    - `cells`, `rows`: (m, 2) a cell and (m,) a row that covers it
+    - `height`: by row; NaN is above all
+    """
+    for k in range(len(rows)):
+        i, j, row = cells[k, 0], cells[k, 1], rows[k]
+        before = image[i, j]
+        if before < 0 or height[row] >= height[before] or math.isnan(height[row]):
+            image[i, j] = row
+
+
 # Compiled loops over rows of evidence: one pass over their entries where NumPy takes many over dense rows.
 
 

@@ -45,6 +45,8 @@ def top_down(
     The first row of cells is the farthest ahead. Where up is an axis of the world a cell is a column of voxels; else
     each voxel covers the cells that a level square of its size touches.
     """
+    from semstab.data.kernels import put_topmost
+
     right, ahead, up_axis = level_axes(up)
     plane = np.stack([centers @ ahead, centers @ right], axis=1)
     low, high = np.quantile(plane, [OUTLIERS, 1 - OUTLIERS], axis=0)
@@ -55,9 +57,8 @@ def top_down(
     inside = ((cells >= first) & (cells <= last)).all(axis=1)
     cells, rows = cells[inside] - first, rows[inside]
     height = centers @ up_axis if rank is None else rank
-    order = np.argsort(height[rows], kind="stable")  # the topmost is written last
     image = np.full(last - first + 1, EMPTY, dtype=np.int64)
-    image[tuple(cells[order].T)] = rows[order]
+    put_topmost(cells, rows, height, image)
     return image[::-1], cell
 
 

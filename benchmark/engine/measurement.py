@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 from collections.abc import Callable, Mapping
+from concurrent.futures import Future
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -62,7 +63,7 @@ def finish(live: LiveMap, stream: Stream, watch: Stopwatch) -> Work:
     if fused is not None and tile is None and not len(fused.table):
         raise no_voxels(live.task, config)
     observations, sums, sample, analysis = live.sampled_observations(), dict[str, Float64](), None, None
-    with contextlib.closing(Background("semstab-files", 1)) as beside:
+    with contextlib.closing(live.background), contextlib.closing(Background("semstab-files", 1)) as beside:
         if fused is not None and not config.statistics:  # else columns of the statistics go along
             beside.submit(partial(files.write, _map_savers(live, fused, None)))
         with watch("voxel sizes"):
@@ -78,7 +79,7 @@ def finish(live: LiveMap, stream: Stream, watch: Stopwatch) -> Work:
             trim_malloc(least=SMALL if tile is None else 0)
         result = TileResult(
             {},
-            None if fused is None else fused.checked,
+            None if fused is None or fused.checked is None else fused.checked.result(),
             sizes,
             _quality(stream),
             live.origin,
@@ -112,13 +113,16 @@ def finish(live: LiveMap, stream: Stream, watch: Stopwatch) -> Work:
 
 
 class FusedMap(NamedTuple):
-    """A map at its end, without the locations whose fused class is left out; reduced: `reduced_sums`, or empty."""
+    """A map at its end, without the locations whose fused class is left out; reduced: `reduced_sums`, or empty.
+
+    It is checked against the reference beside the statistics.
+    """
 
     table: VoxelTable
     events: Events | None
     truth: VoxelTable | None
     reduced: Float64
-    checked: Agreement | None
+    checked: Future[Agreement] | None
 
 
 def _fused_map(live: LiveMap, watch: Stopwatch) -> FusedMap:
@@ -132,10 +136,10 @@ def _fused_map(live: LiveMap, watch: Stopwatch) -> FusedMap:
         truth = None if live.truth is None else replace(live.truth.table(), classes=classes)
         reduced = np.zeros(0) if live.hard is None else reduced_sums(_left(live, live.hard.table())[0])
         live.backend = live.truth = live.hard = None
-    live.background.close()
-    with watch("reference"):
-        checked = None if live.reference is None else _checked(live, table, live.reference)
-        trim_malloc(least=SMALL if live.work.tile is None else 0)
+    checked = None
+    if live.reference is not None:
+        checked = live.background.submit(partial(_checked, live, table, live.reference, watch))
+    trim_malloc(least=SMALL if live.work.tile is None else 0)
     events = None if events is None else replace(events, classes=classes)
     return FusedMap(*_left(live, table, events), truth, reduced, checked)
 
@@ -196,12 +200,13 @@ def no_voxels(task: Task, config: Config) -> DataError:
     )
 
 
-def _checked(live: LiveMap, table: VoxelTable, reference: NumpySample) -> Agreement:
-    expected, one_in = replace(reference.table(), classes=table.classes), reference.one_in
-    some_in = [in_sample(np.stack([table.ix[s], table.iy[s], table.iz[s]]), one_in) for s in stretches(len(table))]
-    drawn = rows_of(table, np.concatenate(some_in))
-    units = (live.name, replace(live.name, backend="numpy"))
-    return replace(compare(drawn, expected, units, tolerance=live.config.tolerance), one_in=one_in)
+def _checked(live: LiveMap, table: VoxelTable, reference: NumpySample, watch: Stopwatch) -> Agreement:
+    with watch("reference"):
+        expected, one_in = replace(reference.table(), classes=table.classes), reference.one_in
+        some_in = [in_sample(np.stack([table.ix[s], table.iy[s], table.iz[s]]), one_in) for s in stretches(len(table))]
+        drawn = rows_of(table, np.concatenate(some_in))
+        units = (live.name, replace(live.name, backend="numpy"))
+        return replace(compare(drawn, expected, units, tolerance=live.config.tolerance), one_in=one_in)
 
 
 def record_of(unit: Unit, task: Task, rows: Series, result: TileResult, analysis: Analysis | None) -> Record:

@@ -35,6 +35,7 @@ def stride_of(shape: tuple[int, int], side: int = IMAGE_SIDE) -> int:
     return int(2 ** max(0, math.ceil(math.log2(max(shape) / side))))
 
 
+@functools.cache
 def over_camera(stride: int) -> rr.Transform3D:
     """Return the transform that lays a picture of every stride-th pixel over the camera's image."""
     shift = (1 - stride) / 2

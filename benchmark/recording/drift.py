@@ -12,18 +12,17 @@ import numpy as np
 import numpy.typing as npt
 import rerun as rr
 
-from semstab.core.types import Float32, Float64, Int64, Mask, UInt8
+from semstab.core.types import Float64, Int64, Mask, UInt8
 from semstab.data.frames import Frame, Intrinsics
 from semstab.data.labels import GLOW, LabelSpace, between, fixed
 from semstab.data.measures import SBD_MAX, mean_drift
 from semstab.data.results import Changes
 from semstab.data.voxels import VoxelTable
-from semstab.recording.loops import AGREES, CONTRADICTS, NO_VOXEL, draw_changes, key_of
+from semstab.recording.loops import AGREES, CONTRADICTS, FIRST_SEEN, NO_DRIFT, NO_VOXEL, draw_changes, key_of
 from semstab.recording.timeline import Clock, path
 
 # The pictures show levels of drift, in colours that no class has, and labels that contradict the map.
 
-FIRST_SEEN, NO_DRIFT = 1, 2
 LEVELS = 24
 LEVEL_EDGES = SBD_MAX * (np.arange(LEVELS + 1) / LEVELS) ** 2
 """The edges of the levels of drift, bits: finer where drift is small; the last level is open."""
@@ -34,14 +33,6 @@ PICTURES = {
 }
 """The pictures of a frame by entity, and the titles of their views. The first one is shown first: it marks labels that
 are not the dominant class that their voxel had before the frame."""
-
-
-def levels_of(drift: Float32) -> UInt8:
-    """Return the level of drift in bits (n,), NaN where a voxel is seen for the first time."""
-    level = np.searchsorted(LEVEL_EDGES[1:-1], drift, side="right") + NO_DRIFT + 1
-    level[drift == 0] = NO_DRIFT
-    level[np.isnan(drift)] = FIRST_SEEN
-    return level.astype(np.uint8)
 
 
 OVER_COLOUR, AMONG_POINTS = (0, 0, 0, 150), (150, 150, 155, 255)
@@ -94,8 +85,8 @@ class FrameChanges:
         points = np.zeros((0, 0, 3), np.float32) if frame.points is None else frame.points
         draw_changes(
             fixed(frame.depth), fixed(points), fixed(frame.valid), fixed(frame.predicted), *frame.rays,
-            fixed(frame.T_wc), self.voxel_size, packed(self.changes.index), fixed(self.changes.before),
-            levels_of(self.changes.drift), values["contradictions"], values["drift"],
+            fixed(frame.T_wc), self.voxel_size, fixed(self.changes.index), fixed(self.changes.before),
+            fixed(self.changes.drift), LEVEL_EDGES[1:-1], values["contradictions"], values["drift"],
         )  # fmt: skip
         return values
 

@@ -1,4 +1,4 @@
-"""A compiled pass over a frame's pixels: it draws what the frame changed in their voxels."""
+"""Compiled passes over a frame's pixels, which draw what it changed in their voxels, and over the voxels of a map."""
 
 from __future__ import annotations
 
@@ -11,22 +11,26 @@ from semstab.core.compiled import serial
 NO_VOXEL, AGREES, CONTRADICTS = 0, 1, 2
 """Values of a picture of contradictions, the first one of a picture of drift as well."""
 
+FIRST_SEEN, NO_DRIFT = 1, 2
+"""Further values of a picture of drift; levels of drift follow."""
+
 AXIS = 21
 """Bits of an index in a key."""
 
 
 @serial
-def draw_changes(depth, points, valid, labels, ray_x, ray_y, T, size, key, before, level, contradictions, drift):
+def draw_changes(
+    depth, points, valid, labels, ray_x, ray_y, T, size, index, before, moved, edges, contradictions, drift
+):
     """Draw the valid pixels into pictures (H, W) that hold NO_VOXEL: a label against the map's, the level of drift.
 
     - `points`: (H, W, 3) of a scan, for which rays do not count; (0, 0, 3) of an image
-    - `key`, `before`, `level`: (n,) of each voxel: its indices, see `key_of`, the map's class, the level of its drift
+    - `index`, `before`, `moved`: (n, 3) indices of each voxel, (n,) the map's class, (n,) its drift, bits
+    - `edges`: see `level_of`
     """
-    bits = 1
-    while 1 << bits <= 2 * len(key):
-        bits += 1
-    rows = np.full(1 << bits, -1, np.int32)
-    for row in range(len(key)):
+    key, rows = np.empty(len(index), np.int64), make_table(len(index))
+    for row in range(len(index)):
+        key[row] = key_of(index[row, 0], index[row, 1], index[row, 2])
         rows[find(key[row], key, rows)] = row
     H, W = depth.shape
     for v in range(H):
@@ -44,7 +48,47 @@ def draw_changes(depth, points, valid, labels, ray_x, ray_y, T, size, key, befor
             row = rows[find(key_of(np.int64(a), np.int64(b), np.int64(c)), key, rows)]
             if row >= 0:
                 contradictions[v, u] = CONTRADICTS if labels[v, u] != before[row] else AGREES
-                drift[v, u] = level[row]
+                drift[v, u] = level_of(moved[row], edges)
+
+
+@serial
+def level_of(drift, edges):
+    """Return the level of drift in bits: how many edges it reaches, which grow with the square; NaN: first seen."""
+    if np.isnan(drift):
+        return FIRST_SEEN
+    if drift == 0:
+        return NO_DRIFT
+    about = np.sqrt(max(np.float64(drift), 0.0) / edges[0])
+    reached = np.int64(min(about, np.float64(len(edges))))  # one more or less, where it is next to an edge
+    while reached < len(edges) and drift >= edges[reached]:
+        reached += 1
+    while reached > 0 and drift < edges[reached - 1]:
+        reached -= 1
+    return NO_DRIFT + 1 + reached
+
+
+@serial
+def first_of_blocks(index, shift):
+    """Return the first row of each block of 2^shift voxels an axis, ascending, of voxels (n, 3)."""
+    n, found = len(index), 0
+    key, rows, first = np.empty(n, np.int64), make_table(n), np.empty(n, np.int64)
+    for row in range(n):
+        key[row] = key_of(index[row, 0] >> shift, index[row, 1] >> shift, index[row, 2] >> shift)
+        at = find(key[row], key, rows)
+        if rows[at] < 0:
+            rows[at] = row
+            first[found] = row
+            found += 1
+    return first[:found].copy()
+
+
+@serial
+def make_table(n):
+    """Return an empty table for the rows of n keys, see `find`."""
+    bits = 1
+    while 1 << bits <= 2 * n:
+        bits += 1
+    return np.full(1 << bits, -1, np.int32)
 
 
 @serial

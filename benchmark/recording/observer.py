@@ -181,7 +181,7 @@ class Recording(Observer):
         self._unfinished: set[UnitName] = set()  # of the group
         self._logged: set[UnitName] = set()
         self._not_assessed: set[tuple[str, str]] = set()  # scenes and models
-        self._sent = 0
+        self._sent, self._outdated = 0, False  # layouts; whether maps have been finished since the last one
         self._others = "all other files are complete, and the same command makes the recording again"
 
     def run_started(self, plan: Plan, finished: Mapping[str, Record | RegionFlicker]) -> None:
@@ -193,6 +193,8 @@ class Recording(Observer):
     def group_started(self, task: Task, config: Config, backends: Mapping[UnitName, FusionBackend]) -> None:
         """Follow the map that is drawn."""
         self._end_group()
+        if self._background is not None:
+            self._background.drain()  # it lets go of the maps before
         self._unfinished = {*backends}
         self._fused = next((each for unit, each in backends.items() if unit.backend == self._drawn(task)), None)
 
@@ -291,7 +293,8 @@ class Recording(Observer):
         try:
             if self._background is not None:
                 self._background.close()
-            self._send_layout(stream)
+            if self._outdated:
+                self._send_layout(stream)
         finally:
             try:
                 flush(stream, self.target.file)
@@ -361,6 +364,7 @@ class Recording(Observer):
         def job() -> None:
             group.log_unit(stream, summary, table, tolerance, factor)
             self._scenes[summary.unit.scene].see(stream, group.task, table)
+            self._outdated = True
             if self._sent == 1:  # later layouts wait for the end: each has all scenes
                 self._send_layout(stream)
 
@@ -373,7 +377,6 @@ class Recording(Observer):
             return
         stream, background = self._opened()
         background.submit(*group.last, lambda: group.log_flips(stream, self._clock))
-        background.drain()
 
     def _send_layout(self, stream: rr.RecordingStream) -> None:
         """Send the layout; a viewer that follows the run keeps the first one."""
@@ -381,7 +384,7 @@ class Recording(Observer):
         bounds = {name: scene.bounds for name, scene in self._scenes.items()}
         layout = blueprint(self._plan, legends, bounds, self._not_assessed)
         stream.send_blueprint(layout, make_default=True, make_active=self._sent == 0 or not self.target.live)
-        self._sent += 1
+        self._sent, self._outdated = self._sent + 1, False
 
 
 # A finished run is recorded from its folder.

@@ -25,6 +25,7 @@ from semstab.data.voxels import VoxelTable
 from semstab.metrics import CATEGORY_COLORS, NOT_ASSESSED, dominant, vss
 from semstab.metrics.agreement import shared_rows
 from semstab.metrics.summary import categorise
+from semstab.recording.loops import first_of_blocks
 from semstab.report.narrative import outlying_line
 from semstab.report.ranking import answers
 from semstab.report.terminal import TEXTS, columns, row_of
@@ -144,12 +145,10 @@ def thinned(index: Int64, factor: int = 1) -> tuple[int, Int64]:
         index: (n, 3) relative to the map's origin, with which blocks are aligned.
         factor: The least edge, a power of 2.
     """
-    rows = np.arange(len(index))
-    while factor > 1 or len(rows) > MAX_VOXELS:
-        x, y, z = (index // factor - index.min(axis=0) // factor).T
-        rows = np.sort(np.unique((x << 42) ^ (y << 21) ^ z, return_index=True)[1])
-        if len(rows) <= MAX_VOXELS:
-            break
+    if factor == 1 and len(index) <= MAX_VOXELS:
+        return factor, np.arange(len(index))
+    factor = max(factor, 2)
+    while len(rows := first_of_blocks(index, factor.bit_length() - 1)) > MAX_VOXELS:
         factor *= 2
     return factor, rows
 

@@ -4,11 +4,14 @@ from __future__ import annotations
 
 import hashlib
 from collections.abc import Mapping
+from concurrent.futures import Future
+from functools import partial
 from importlib.metadata import version
 from pathlib import Path
 from types import MappingProxyType
 from typing import TYPE_CHECKING
 
+from semstab.core.background import Background
 from semstab.core.files import write_text
 from semstab.data.records import Record, RegionFlicker, Result
 from semstab.engine.observer import Observer
@@ -27,19 +30,21 @@ class Reporting(Observer):
 
     def __init__(self, folder: str | Path) -> None:
         self._folder = Path(folder)
-        self._above: dict[str, FromAbove] = {}
+        self._beside = Background("semstab-report", 0)
+        self._above: dict[str, Future[FromAbove]] = {}
 
     def unit_finished(
         self, unit: Unit, record: Record | RegionFlicker | None, table: VoxelTable | None, error: str | None
     ) -> None:
-        """Store the voxels that are seen from above, while the table is in memory."""
+        """Find the voxels that are seen from above beside the run, while the table is in memory."""
         if table is not None and isinstance(record, Record) and record.up is not None and unit.image_space:
             from semstab.report.figures.topdown import FromAbove
 
-            self._above[unit.name.slug] = FromAbove.of(table, record.up)
+            self._above[unit.name.slug] = self._beside.submit(partial(FromAbove.of, table, record.up))
 
     def run_finished(self, result: Result) -> None:
         """Write tables and report, or nothing where every unit failed."""
+        self._beside.close()
         report = self._folder / "report.html"
         if report.exists() and (self._folder / "tables").exists() and not result.manifest["units"]["computed"]:
             with report.open(encoding="utf-8", errors="replace") as page:
@@ -47,7 +52,7 @@ class Reporting(Observer):
                     return
         if result.select():
             write_tables(result, self._folder)
-            write_report(result, self._folder, self._above)
+            write_report(result, self._folder, {unit: seen.result() for unit, seen in self._above.items()})
 
 
 HEAD = 1000

@@ -53,13 +53,13 @@ def best_view(table: VoxelTable, up: npt.ArrayLike) -> tuple[Mask, Float64, str]
     right, ahead, up_axis = level_axes(up)
     every = np.ones(len(table), dtype=np.bool_)
     centers = table.centers
-    areas = [_numbered(_columns(centers, axis, table.voxel_size))[1] for axis in (up_axis, right, ahead)]
+    column, count = _numbered(_columns(centers, up_axis, table.voxel_size))
+    areas = [count, *(_numbered(_columns(centers, axis, table.voxel_size))[1] for axis in (right, ahead))]
     if max(areas[1:]) > SLENDER * areas[0]:
         return every, -right if areas[1] > areas[2] else -ahead, "from the side"
     heights = centers @ up_axis
     low, high = np.quantile(heights, [OUTLIERS, 1 - OUTLIERS])
     cut = high - LID * (high - low)
-    column, count = _numbered(_columns(centers, up_axis, table.voxel_size))
     top, bottom = (np.full(count, end) for end in (-np.inf, np.inf))
     np.maximum.at(top, column, heights)
     np.minimum.at(bottom, column, heights)
@@ -112,7 +112,7 @@ class FromAbove:
     def of(cls, table: VoxelTable, up: npt.ArrayLike) -> FromAbove:
         """Return the voxels of a map that are seen; see `best_view` and `top_down`."""
         selected, axis, view = best_view(table, up)
-        centers = rows_of(table, selected).centers
+        centers = table.centers[selected]
         rows, cell = top_down(centers, table.voxel_size, axis)
         width, height = (float(np.ptp(centers @ along)) + table.voxel_size for along in level_axes(axis)[:2])
         rows = np.where(rows == EMPTY, EMPTY, np.flatnonzero(selected)[rows])
