@@ -37,6 +37,8 @@ def test_numpy_sees_the_dense_array():
 def test_rows_are_taken_and_joined():
     parts = [SPARSE.take(np.arange(20)), SPARSE.take(np.s_[20:])]
     np.testing.assert_array_equal(Evidence.joined(parts)[:], DENSE)
+    order = np.random.default_rng(0).permutation(len(DENSE))
+    np.testing.assert_array_equal(Evidence.joined(parts, order)[:], DENSE[order])
 
 
 def test_one_pass_over_the_entries_finds_the_measures_of_dense_rows():

@@ -179,7 +179,7 @@ class Events:
             **{name: values[order] for name, values in index.items()},
             voxel=number,
             frame=np.concatenate([part.frame for part in parts])[rows],
-            evidence=Evidence.joined([part.evidence for part in parts]).take(rows),
+            evidence=Evidence.joined([part.evidence for part in parts], rows),
             pixels=np.concatenate([part.pixels for part in parts])[rows],
             voxel_size=parts[0].voxel_size,
             classes=parts[0].classes,

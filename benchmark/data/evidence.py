@@ -82,11 +82,26 @@ class Evidence(NDArrayOperatorsMixin):
         return cls(np.cumsum(np.concatenate(counts)), np.concatenate(labels), np.concatenate(weights), K)
 
     @classmethod
-    def joined(cls, parts: Sequence[Evidence]) -> Evidence:
-        """Return the rows of one after the other."""
-        counts = np.concatenate([[0], *(np.diff(part.starts) for part in parts)])
-        label, weight = (np.concatenate([getattr(part, name) for part in parts]) for name in ("label", "weight"))
-        return cls(np.cumsum(counts), label, weight, parts[0].K)
+    def joined(cls, parts: Sequence[Evidence], order: Int64 | None = None) -> Evidence:
+        """Return the rows of one after the other, or of all of them in an order (n,), for which no copy is made."""
+        counts = np.concatenate([np.diff(part.starts) for part in parts])
+        if order is None:
+            label, weight = (np.concatenate([getattr(part, name) for part in parts]) for name in ("label", "weight"))
+            return cls(_starts(counts), label, weight, parts[0].K)
+        from semstab.data.kernels import copy_rows
+
+        starts, to, done = _starts(counts[order]), np.empty_like(counts), 0
+        to[order] = starts[:-1]
+        label, weight = np.empty(starts[-1], np.uint16), np.empty(starts[-1])
+        for part in parts:
+            copy_rows(*part.bounds, to[done : done + len(part)], part.label, part.weight, label, weight)
+            done += len(part)
+        return cls(starts, label, weight, parts[0].K)
+
+    @property
+    def bounds(self) -> tuple[Int64, Int64]:
+        """(n,), (n,): the first entry of each row, and that after its last one."""
+        return self.starts[:-1], self.starts[1:]
 
     @property
     def shape(self) -> tuple[int, int]:
@@ -131,10 +146,10 @@ class Evidence(NDArrayOperatorsMixin):
             return Evidence(starts - starts[0], self.label[entries], self.weight[entries], self.K, known=known)
         from semstab.data.kernels import copy_rows
 
-        first, end = self.starts[:-1][rows], self.starts[1:][rows]
-        starts = np.concatenate([[0], np.cumsum(end - first)])
+        first, end = (bound[rows] for bound in self.bounds)
+        starts = _starts(end - first)
         label, weight = np.empty(starts[-1], np.uint16), np.empty(starts[-1])
-        copy_rows(first, *self.entries[1:], starts, label, weight)
+        copy_rows(first, end, starts[:-1], self.label, self.weight, label, weight)
         return Evidence(starts, label, weight, self.K, known=known)
 
     def only(self, labels: UInt16) -> Evidence:
@@ -219,3 +234,8 @@ class Evidence(NDArrayOperatorsMixin):
     def __array_ufunc__(self, ufunc: np.ufunc, method: str, *inputs: Any, **settings: Any) -> Any:
         dense = (np.asarray(value) if isinstance(value, Evidence) else value for value in inputs)
         return getattr(ufunc, method)(*dense, **settings)
+
+
+def _starts(counts: Int64) -> Int64:
+    """Return where each of the rows with so many entries begins, and the number of all entries: (n + 1,)."""
+    return np.concatenate([[0], np.cumsum(counts)])

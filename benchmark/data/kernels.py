@@ -93,12 +93,12 @@ def concentrate(
 
 
 @serial
-def copy_rows(first: Any, label: Any, weight: Any, starts: Any, to_label: Any, to_weight: Any) -> None:
-    """Copy the entries of rows from first (n,) on to where starts (n + 1,) say."""
+def copy_rows(first: Any, end: Any, to: Any, label: Any, weight: Any, to_label: Any, to_weight: Any) -> None:
+    """Copy the entries of rows, each from `first` to before `end` (n,), to where they begin in others, `to` (n,)."""
     for i in range(first.shape[0]):
-        for e in range(starts[i], starts[i + 1]):
-            at = first[i] + e - starts[i]
-            to_label[e], to_weight[e] = label[at], weight[at]
+        for e in range(first[i], end[i]):
+            at = to[i] + e - first[i]
+            to_label[at], to_weight[at] = label[e], weight[e]
 
 
 @serial

@@ -336,7 +336,7 @@ class VoxelTable:
             for name in OF_VOXELS
             if name != "evidence"
         }
-        evidence = Evidence.joined([part.evidence for part in parts]).take(order)
+        evidence = Evidence.joined([part.evidence for part in parts], order)
         return replace(parts[0], **columns, evidence=evidence)
 
     @classmethod

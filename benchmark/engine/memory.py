@@ -71,7 +71,7 @@ class MapMemory:
     def statistics(self, voxels: float) -> float:
         """Return the bytes that statistics take beyond the tables: columns of voxels, and a stretch of scores."""
         drawn = min(int(voxels), MOST_VOXELS)
-        return 240 * drawn + self.soft * 80 * min(self.K * drawn, STRETCH_ENTRIES)
+        return 240 * drawn + self.soft * 60 * min(self.K * drawn, STRETCH_ENTRIES)
 
     def whole(self, voxels: float, observations: float) -> float:
         """Return the bytes of a map and its tables, while they are made of it or measured."""
@@ -84,13 +84,14 @@ class MapMemory:
     def tiles(self, voxels: float, observations: float, tile_voxels: float) -> float:
         """Return the bytes of a map in tiles of at most `tile_voxels`.
 
-        That is a tile beside the voxels that are drawn from those before it, or the statistics of the voxels that are
-        drawn from all of them.
+        That is a tile beside the voxels that are drawn from those before it, these twice while they are joined, or the
+        statistics of the voxels that are drawn from all of them.
         """
         seen, drawn = observations / max(voxels, 1.0), min(voxels, MOST_VOXELS)
         held = min(voxels, 2 * drawn)
-        tile = self.tables(held, seen * held) + self.tile(tile_voxels, seen * tile_voxels)
-        return max(tile, self.tables(drawn, seen * drawn) + self.statistics(drawn))
+        parts = self.tables(held, seen * held)
+        tile = self.tile(tile_voxels, seen * tile_voxels)
+        return max(parts + tile, 2 * parts, self.tables(drawn, seen * drawn) + self.statistics(drawn))
 
 
 def log_bytes(observations: int, num_classes: int, *, soft: bool) -> int:
