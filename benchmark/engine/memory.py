@@ -71,7 +71,7 @@ class MapMemory:
     def statistics(self, voxels: float) -> float:
         """Return the bytes that statistics take beyond the tables: columns of voxels, and a stretch of scores."""
         drawn = min(int(voxels), MOST_VOXELS)
-        return 240 * drawn + self.soft * 60 * min(self.K * drawn, STRETCH_ENTRIES)
+        return 160 * drawn + self.soft * 40 * min(self.K * drawn, STRETCH_ENTRIES)
 
     def whole(self, voxels: float, observations: float) -> float:
         """Return the bytes of a map and its tables, while they are made of it or measured."""

@@ -1,6 +1,6 @@
 """Kill runs, studies, predictions, exports and conversions at random moments, half of them at their folder's birth.
 
-    python tests/faults/kills.py [COUNT [SEED [KIND...]]]       make faults: 280, 40 of each of 7 kinds
+    python tests/faults/kills.py [COUNT [SEED [KIND...]]]       make faults: 280, 35 of each of 8 kinds
 
 Each is then started again as it was, and has to leave what one without a kill leaves. Where several are at work on the
 machine, a kill may come after the end: those are counted apart. Beside these, a fifth as many are started twice at
@@ -29,6 +29,7 @@ sys.path.insert(0, str(Path(__file__).parents[1]))
 import predicted_scene
 import tiny_scene
 import tiny_study
+import video_scene
 import yaml
 
 from semstab.cli import app
@@ -97,6 +98,13 @@ def of_run(out: Path) -> Any:
     return {**found, "runs": runs}, names, not recording.exists() or is_whole(recording)
 
 
+def of_videos(out: Path) -> Any:
+    """What a run over videos leaves, file by file, without times; pages and pictures by name."""
+    files = sorted(path for path in out.rglob("*") if path.is_file())
+    told = [path.read_bytes() for path in files if path.suffix == ".csv"]
+    return json.loads((out / "summary.json").read_text()), told, [str(path.relative_to(out)) for path in files]
+
+
 def of_files(out: Path) -> Any:
     """What a conversion or a prediction leaves, file by file; manifests without times and places."""
     manifests = ("conversion.json", "predictions.json", "relabelled.json")
@@ -111,10 +119,15 @@ def kinds(base: Path) -> dict[str, tuple[Callable[[Path], Words], Callable[[Path
     """What is killed: its words for a folder, and what is compared of that."""
     wall = tiny_scene.write(base / "wall", models=("a", "b"), frames=20)
     flight = predicted_scene.write(base / "flight")
+    for name, wrong in (("one", (5, 12)), ("two", (3,)), ("three", ())):
+        video_scene.write(base / "clips" / name, wrong)
     study = base / "tiny.yaml"
     study.write_text(yaml.safe_dump(tiny_study.content(tiny_study.write(base / "walls"), backends=["numpy"])))
     common = ["--data", str(wall), "--backend", "numpy", "--quiet", "--report", "off", "--voxel-size", "0.1"]
     one = ["--data", str(wall), "--model", "a", "--backend", "numpy", "--quiet", "--report", "off", "--rerun", "off"]
+
+    videos = ["--dataset", "video", "--data", str(base / "clips"), "--quiet", "--rerun", "off"]
+    videos += ["--option", f"classes=[{','.join(video_scene.CLASSES)}]"]
 
     @functools.cache
     def fused() -> str:
@@ -128,6 +141,7 @@ def kinds(base: Path) -> dict[str, tuple[Callable[[Path], Words], Callable[[Path
             lambda out: [*common, "--tile-size", "8", "--jobs", "2", "--rerun", "off", "--out", str(out)],
             of_run,
         ),
+        "videos": (lambda out: [*videos, "--out", str(out)], of_videos),
         "study": (lambda out: ["study", str(study), "--report", "off", "--quiet", "--out", str(out)], of_run),
         "predict": (
             lambda out: ["predict", "-m", "colour-clusters", "--data", str(flight), "--out", str(out), "--quiet"],
