@@ -24,6 +24,7 @@ PACKAGES = {
     "benchmark": "semstab",
     **{folder: f"semstab/{folder}" for folder in ("backends", "models", "datasets", "configs", "conformance")},
 }
+TAG = sys.implementation.cache_tag
 Done = subprocess.CompletedProcess[str]
 SMALL = ("--option", "width=96", "--option", "height=54")
 FEW = ("--scene", "scene0", "--frames", "::8", *SMALL, "--voxel-size", "0.8")
@@ -98,7 +99,8 @@ def installed(built, tmp_path_factory: pytest.TempPathFactory) -> Path:
             if source.exists() and not target.exists():
                 target.parent.mkdir(parents=True, exist_ok=True)
                 target.symlink_to(source)
-    for words in (("install", "--quiet", "--no-deps", "--no-index", str(built[2])), ("check",)):
+    install = ("install", "--quiet", "--no-compile", "--no-deps", "--no-index", str(built[2]))
+    for words in (install, ("check",)):
         subprocess.run([sys.executable, "-m", "pip", "--python", python, *words], check=True, capture_output=True)
     take_compiled(site)
     return python.parent
@@ -107,13 +109,14 @@ def installed(built, tmp_path_factory: pytest.TempPathFactory) -> Path:
 def take_compiled(site: Path) -> None:
     """Give the installed files the time of the source's, with the code that earlier tests left compiled beside those.
 
-    test_compiled.py compiles anew where there is none.
+    Python compiles the other modules when they are imported; test_compiled.py compiles loops anew where there is none.
     """
     for folder, package in PACKAGES.items():
         for file in (SOURCE / folder).rglob("*.py"):
             there = site / package / file.relative_to(SOURCE / folder)
             shutil.copystat(file, there)
-            for code in (file.parent / "__pycache__").glob(f"{file.stem}.*.nb[ci]"):
+            kept = file.parent / "__pycache__"
+            for code in (*kept.glob(f"{file.stem}.*.nb[ci]"), *kept.glob(f"{file.stem}.{TAG}.pyc")):
                 (there.parent / "__pycache__").mkdir(exist_ok=True)
                 shutil.copy2(code, there.parent / "__pycache__")
 
