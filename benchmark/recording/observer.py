@@ -73,8 +73,11 @@ class GroupLog:
         self.last: tuple[int, float | None] = (task.indices[-1], None)
         """The number and timestamp of the last frame."""
 
-    def log(self, stream: rr.RecordingStream, frame: Frame, voxels: int, background: FrameJobs) -> None:
-        """Log the labels of a fused frame, the changes that it made to the map, and the map of so many voxels."""
+    def log(
+        self, stream: rr.RecordingStream, frame: Frame, rows: Mapping[UnitName, FrameRow], voxels: int,
+        background: FrameJobs,
+    ) -> None:  # fmt: skip
+        """Log the rows of a fused frame, its labels, the changes that it made to the map, and the map of its voxels."""
         self.last = frame.index, frame.timestamp
         drift, jobs = None, list[Callable[[], None]]()
         if self._fused is not None:
@@ -83,6 +86,8 @@ class GroupLog:
                 drift = self._drift.follow(frame, changes)
 
         def job() -> None:
+            for unit, row in rows.items():
+                timeline.log_row(stream, unit, self.task, row.cells())
             if frame.is_scan:
                 log_points(stream, path(self._scene, "camera", self.task.model), frame, drift)
             else:
@@ -207,10 +212,8 @@ class Recording(Observer):
         stream, background = self._opened()
         self._clock.set(stream, frame.index, frame.timestamp)
         group = self._group or self._begin(task, frame.T_wc[:3, 3])
-        for unit, row in rows.items():
-            timeline.log_row(stream, unit, group.task, row.cells())
         self._scenes[task.scene.name].log(stream, frame, background)
-        group.log(stream, frame, voxels, background)
+        group.log(stream, frame, rows, voxels, background)
 
     def unit_finished(
         self, unit: Unit, record: Record | RegionFlicker | None, table: VoxelTable | None, error: str | None
