@@ -278,8 +278,8 @@ def map_sizes(task: Task, settings: Config) -> Iterator[MapSize]:
             continue
         following = [k + 1 for k in sampled[:: -(-len(sampled) // PAIRS)] if k + 1 < frames]
         missing = sorted({*sampled, *following} - seen_by.keys())
-        read = prefetch(lambda k: _geometry(task, settings, task.indices[k]), missing, threads=settings.threads)
-        for k, fetched in zip(missing, read, strict=True):
+        ahead = prefetch(lambda k: _geometry(task, settings, task.indices[k]), missing, threads=settings.threads)
+        for k, fetched in zip(missing, ahead, strict=True):
             whole = voxels_in(fetched.item, settings.voxel_size)
             one_in = one_in or max(1, len(whole) // DRAWN)
             seen_by[k] = _drawn(whole, one_in)
@@ -302,11 +302,11 @@ def _of_all_frames(seen: Sequence[Int32], distinct: int, frames: int) -> float:
     that another doubling of the frames adds are fewer than those which the last one added.
     """
     quarter, half, voxels = _count(seen[::4]), _count(seen[::2]), float(distinct)
-    factor, added, read = min((distinct - half) / max(half - quarter, 1), 2.0), float(distinct - half), len(seen)
-    while read < frames:
+    factor, added, reached = min((distinct - half) / max(half - quarter, 1), 2.0), float(distinct - half), len(seen)
+    while reached < frames:
         added *= factor
-        voxels += added * min(1.0, math.log2(frames / read))
-        read *= 2
+        voxels += added * min(1.0, math.log2(frames / reached))
+        reached *= 2
     return voxels
 
 
