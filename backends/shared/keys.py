@@ -20,26 +20,24 @@ HALF = 1 << 20
 
 def columns_of_keys(keys: Int64, origin: npt.ArrayLike) -> dict[str, Any]:
     """Return the columns ix, iy, iz (n,) of packed keys (n,), which sort like them."""
-    offset = np.asarray(origin) - HALF
-    return {
-        name: ((keys >> shift & 2 * HALF - 1) + start).astype(np.int32)
-        for name, shift, start in zip(INDEX, (42, 21, 0), offset.tolist(), strict=True)
-    }
+    columns = np.empty((3, len(keys)), np.int32)
+    unpack_keys(keys, np.asarray(origin, np.int64) - HALF, columns)
+    return dict(zip(INDEX, columns, strict=True))
 
 
 def index_of_keys(keys: Int64, origin: npt.ArrayLike) -> Int64:
     """Return voxel indices (n, 3) of packed keys (n,)."""
     index = np.empty((len(keys), 3), np.int64)
-    unpack_keys(keys, np.asarray(origin, np.int64) - HALF, index)
+    unpack_keys(keys, np.asarray(origin, np.int64) - HALF, index.T)
     return index
 
 
 @serial
 def unpack_keys(keys, start, index):
-    """Unpack keys (n,) into indices (n, 3) that count from `start` (3,)."""
+    """Unpack keys (n,) into indices (3, n) that count from `start` (3,)."""
     for i in range(len(keys)):
         for axis in range(3):
-            index[i, axis] = (keys[i] >> (42 - 21 * axis) & (2 * HALF - 1)) + start[axis]
+            index[axis, i] = (keys[i] >> (42 - 21 * axis) & (2 * HALF - 1)) + start[axis]
 
 
 def out_of_reach(frame: Frame, origin: npt.ArrayLike, voxel_size: float) -> DataError:

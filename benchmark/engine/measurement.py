@@ -60,10 +60,10 @@ def finish(live: LiveMap, stream: Stream, watch: Stopwatch) -> Work:
     """
     work, config, tile, files = live.work, live.config, live.work.tile, Files(live.work.start)
     fused = _fused_map(live, watch) if work.fuses else None
-    if fused is not None and tile is None and not len(fused.table):
-        raise no_voxels(live.task, config)
     observations, sums, sample, analysis = live.sampled_observations(), dict[str, Float64](), None, None
     with contextlib.closing(live.background), contextlib.closing(Background("semstab-files", 1)) as beside:
+        if fused is not None and tile is None and not len(fused.table):
+            raise no_voxels(live.task, config)
         if fused is not None and not config.statistics:  # else columns of the statistics go along
             beside.submit(partial(files.write, _map_savers(live, fused, None)))
         with watch("voxel sizes"):

@@ -58,9 +58,9 @@ class MapMemory:
     def growing(self, voxels: float, observations: float) -> float:
         """Return the bytes of a map, of that of the ground truth or of reduced scores, and of the reference."""
         n, seen = int(voxels), int(observations)
-        both = expected_bytes(self.backend, n, seen, self.K, soft=self.soft)
-        both += (self.logged + self.soft) * expected_bytes(self.backend, n, seen, self.K)
-        return both + self.sampled * expected_bytes("numpy", n // ONE_IN, 0, self.K)
+        total = expected_bytes(self.backend, n, seen, self.K, soft=self.soft)
+        total += (self.logged + self.soft) * expected_bytes(self.backend, n, seen, self.K)
+        return total + self.sampled * expected_bytes("numpy", n // ONE_IN, 0, self.K)
 
     def tables(self, voxels: float, observations: float) -> float:
         """Return the bytes of its tables and of its log."""

@@ -53,18 +53,12 @@ def draw_changes(
 
 @serial
 def level_of(drift, edges):
-    """Return the level of drift in bits: how many edges it reaches, which grow with the square; NaN: first seen."""
+    """Return the level of drift in bits: how many of the ascending edges it reaches; NaN where a voxel is new."""
     if np.isnan(drift):
         return FIRST_SEEN
     if drift == 0:
         return NO_DRIFT
-    about = np.sqrt(max(np.float64(drift), 0.0) / edges[0])
-    reached = np.int64(min(about, np.float64(len(edges))))  # one more or less, where it is next to an edge
-    while reached < len(edges) and drift >= edges[reached]:
-        reached += 1
-    while reached > 0 and drift < edges[reached - 1]:
-        reached -= 1
-    return NO_DRIFT + 1 + reached
+    return NO_DRIFT + 1 + np.searchsorted(edges, np.float64(drift), side="right")
 
 
 @serial
