@@ -23,7 +23,7 @@ from pictures import KINDS, K, Views, field, frames, predicted, scene
 from semstab import backends
 from semstab.data.statistics import Level
 from semstab.statistics import Sampler, describe
-from semstab.statistics.accumulate import sums_of_cells
+from semstab.statistics.accumulate import sums_of_spots
 from semstab.statistics.cluster_sums import ClusterSums, value
 from semstab.statistics.intervals import estimate
 from semstab.statistics.verdict import DECIDED, LIMITS, level_probabilities
@@ -41,7 +41,7 @@ def sums(views: Views, labels: np.ndarray, stride: int = 1) -> ClusterSums:
     sampler = Sampler(K)
     for frame in frames(views, labels, stride):
         sampler.add(frame)
-    return sums_of_cells(sampler.sample())
+    return sums_of_spots(sampler.sample())
 
 
 def level_of(alpha: float) -> Level:
@@ -149,7 +149,7 @@ def shares(scenes: int, flights: int, seed: int) -> None:
                     level = max(said, key=lambda name: said[name])
                     inside = alpha.low - 1e-9 <= truth <= alpha.high + 1e-9
                     rows.append((inside, alpha.high - alpha.low, said[level], level == level_of(truth)))
-                    fine = own.fine
+                    fine = own.near
                     assert fine is not None
                     evidence = fine["evidence"].sum(axis=0)
                     chance.append(((evidence / evidence.sum()) ** 2).sum())

@@ -21,7 +21,7 @@ import numpy.typing as npt
 from semstab import backends
 from semstab.data.frames import Frame, Intrinsics
 from semstab.statistics import Sampler, krippendorff_alpha
-from semstab.statistics.accumulate import sums_of_cells
+from semstab.statistics.accumulate import sums_of_spots
 from semstab.statistics.cluster_sums import value
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tests"))
@@ -99,7 +99,7 @@ def of_cells(frames: list[Frame], stride: int) -> float:
     sampler = Sampler(K)
     for frame in frames:
         sampler.add(frame.every(stride))
-    return value(sums_of_cells(sampler.sample()), "alpha")
+    return value(sums_of_spots(sampler.sample()), "alpha")
 
 
 def of_voxels(frames: list[Frame], size: float) -> float:

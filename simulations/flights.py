@@ -12,7 +12,7 @@ from semstab.data.voxels import VoxelTable
 from semstab.statistics.accumulate import cluster_sums_of
 from semstab.statistics.agreement import consistency_posterior
 from semstab.statistics.cluster_sums import FUNCTIONALS, ClusterSums, columns_of, parts_of
-from semstab.statistics.observations import CellObservations, Views, keys_of
+from semstab.statistics.observations import SpotObservations, Views, keys_of
 
 ROUGH = 0.5
 """How abruptly a place is one on which the model errs."""
@@ -196,7 +196,7 @@ def sums_of(
 
 def sample_of(
     labels: np.ndarray, over: World, flight: Flight, rng: np.random.Generator | None = None
-) -> CellObservations:
+) -> SpotObservations:
     """Return what a sampler takes of a flight: likeliest classes of fine cells, half as wide as a voxel.
 
     A frame sees one cell of a voxel, with `rng` at borders also another one, of the next class, of which it sees more
@@ -216,7 +216,7 @@ def sample_of(
     cell = np.concatenate([voxel, voxel + len(over.index)])
     label, weight = np.concatenate([first, (first + 1) % flight.K]), np.concatenate([PIXELS - pixels, pixels])
     there = weight > 0
-    return CellObservations(
+    return SpotObservations(
         keys[cell][there], np.tile(frame, 2).astype(np.int32)[there], label.astype(np.uint16)[there],
         weight.astype(np.float64)[there], np.zeros(there.sum(), np.uint32), low, views, size, flight.K, frames=frames,
     )  # fmt: skip

@@ -7,7 +7,7 @@ import math
 import numpy as np
 
 from semstab.data.events import Events
-from semstab.statistics import CellObservations, Views
+from semstab.statistics import SpotObservations, Views
 from semstab.statistics.observations import keys_of
 
 
@@ -54,4 +54,4 @@ def cells_of(labels, K=3, index=None, centres=None, cell_size=0.125):
     centres = np.tile([0.0, 0.0, 9.0], (F, 1)) if centres is None else np.asarray(centres, float)
     views = Views(np.arange(F), centres, np.full(F, math.nan), np.full(F, cell_size))
     entries = key[cell], view.astype(np.int32), labels[cell, view].astype(np.uint16), np.ones(len(cell))
-    return CellObservations(*entries, np.zeros(len(cell), np.uint32), low, views, cell_size, K, frames=F)
+    return SpotObservations(*entries, np.zeros(len(cell), np.uint32), low, views, cell_size, K, frames=F)

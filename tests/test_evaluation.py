@@ -29,7 +29,7 @@ from semstab.report import terminal
 from semstab.report.tables import tables
 from semstab.report.tables import to_json as table_content
 from semstab.report.terminal import common_beginning, print_summary
-from semstab.statistics import CellObservations, MapSample, analyse, describe
+from semstab.statistics import SpotObservations, MapSample, analyse, describe
 from semstab.statistics.correctness import ACCURACY
 
 MODELS = ("a", "b", "gt")
@@ -51,9 +51,9 @@ def ran(tmp_path_factory):
     return base / "run", printed, json.loads((base / "run" / "summary.json").read_text())
 
 
-def saved(run: Path, model: str) -> tuple[VoxelTable, Events, CellObservations]:
+def saved(run: Path, model: str) -> tuple[VoxelTable, Events, SpotObservations]:
     name = f"wall__{model}__numpy.parquet"
-    cells = CellObservations.load(run / "observations" / name)
+    cells = SpotObservations.load(run / "observations" / name)
     return VoxelTable.load(run / "voxels" / name), Events.load(run / "events" / name), cells
 
 
@@ -121,7 +121,7 @@ def test_without_asking_there_is_what_the_map_alone_tells(tmp_path) -> None:
     result = semstab.run(configure(root, events=True), out=tmp_path / "run", report=False)
     (entry,) = result.runs
     table = VoxelTable.load(tmp_path / "run" / "voxels" / f"{entry.unit.slug}.parquet")
-    cells = CellObservations.load(tmp_path / "run" / "observations" / f"{entry.unit.slug}.parquet")
+    cells = SpotObservations.load(tmp_path / "run" / "observations" / f"{entry.unit.slug}.parquet")
     assert to_json(entry.statistics) == to_json(describe(table, cells=cells, name="a"))
     assert entry.statistics.drift.trend is None
     assert result.comparisons == ()

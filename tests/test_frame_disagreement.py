@@ -20,7 +20,7 @@ from semstab.recording.voxel_maps import agreement_report
 from semstab.report.page import render
 from semstab.report.tables import tables
 from semstab.report.terminal import screen
-from semstab.statistics import CellObservations, Views
+from semstab.statistics import SpotObservations, Views
 from semstab.statistics.frame_disagreement import (
     LoneDisagreement,
     largest_deviate,
@@ -43,7 +43,7 @@ def cells(places):
     key, low = keys_of(index)
     views = Views.of([[10 * t, t, 0.0, 0.0, np.nan, 1.0] for t in range(int(view.max()) + 1)])
     n = len(key)
-    return CellObservations(
+    return SpotObservations(
         key, view.astype(np.int32), label.astype(np.uint16), np.ones(n), np.zeros(n, np.uint32), low, views, 1.0, K=3
     )
 

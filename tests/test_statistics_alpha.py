@@ -17,8 +17,8 @@ from striped_floor import K, flight, fused, numbered, sampled
 from semstab import backends
 from semstab.datasets import open_dataset
 from semstab.errors import DataError
-from semstab.statistics import CellObservations, Sampler, Views, describe, disagreement, psa
-from semstab.statistics.accumulate import sums_of_cells
+from semstab.statistics import SpotObservations, Sampler, Views, describe, disagreement, psa
+from semstab.statistics.accumulate import sums_of_spots
 from semstab.statistics.cluster_sums import value
 from semstab.statistics.intervals import estimate
 from semstab.statistics.loops.observations import hash_row
@@ -28,7 +28,7 @@ DATA = Path(os.environ.get("SEMSTAB_DATA", Path(__file__).parents[2] / "shared/d
 
 
 def alpha_of(frames):
-    return estimate(sums_of_cells(sampled(frames)), "alpha").value
+    return estimate(sums_of_spots(sampled(frames)), "alpha").value
 
 
 # --- Definition -------------------------------------------------------------------------------------------------------
@@ -65,9 +65,9 @@ def test_alpha_is_its_definition(options):
     there[10:30, 20:50] = False
     frames[1] = dataclasses.replace(frames[1], labels=np.where(there, frames[1].labels, 255).astype(np.uint8))
     fine, coarse = cell_alpha(frames, 0.125), cell_alpha(frames, 0.25)
-    sums = sums_of_cells(sampled(frames))
-    assert (sums.fine.voxel_size, sums.coarse.voxel_size) == (0.125, 0.25)
-    assert value(sums.fine, "voxel_alpha") == pytest.approx(fine, abs=1e-9)
+    sums = sums_of_spots(sampled(frames))
+    assert (sums.near.voxel_size, sums.far.voxel_size) == (0.125, 0.25)
+    assert value(sums.near, "voxel_alpha") == pytest.approx(fine, abs=1e-9)
     assert value(sums, "alpha") == pytest.approx(2 * fine - coarse, abs=1e-9)
 
 
@@ -145,7 +145,7 @@ def test_a_frame_that_says_the_same_again_is_no_further_view(flown):
     once, more = sampled(frames), sampled(flown(frames))
     assert len(once.views) == len(more.views) == 16
     assert more.frames > once.frames == 16
-    one, other = (estimate(sums_of_cells(cells), "alpha") for cells in (once, more))
+    one, other = (estimate(sums_of_spots(cells), "alpha") for cells in (once, more))
     assert other == one
 
 
@@ -323,17 +323,17 @@ def test_a_sampler_that_saw_no_frame_has_an_empty_sample():
 def test_a_sample_comes_back_from_its_file(tmp_path):
     cells = dataclasses.replace(sampled(flight(4, flicker=0.2), budget=5000), classes=("a", "b", "c"))
     cells.save(tmp_path / "cells.parquet")
-    back = CellObservations.load(tmp_path / "cells.parquet")
+    back = SpotObservations.load(tmp_path / "cells.parquet")
     assert entries(back) == entries(cells)
     for name in ("drawn", "view", "label", "weight"):
         np.testing.assert_array_equal(getattr(back, name), getattr(cells, name))
     for name in ("cell_size", "K", "share", "classes", "frames"):
         assert getattr(back, name) == getattr(cells, name)
     np.testing.assert_array_equal(back.views.rows(), cells.views.rows())
-    assert value(sums_of_cells(back), "alpha") == value(sums_of_cells(cells), "alpha")
+    assert value(sums_of_spots(back), "alpha") == value(sums_of_spots(cells), "alpha")
     (tmp_path / "other.parquet").write_bytes(b"no")
     with pytest.raises(DataError, match="not a file of sampled observations"):
-        CellObservations.load(tmp_path / "other.parquet")
+        SpotObservations.load(tmp_path / "other.parquet")
 
 
 def test_a_sample_stays_when_more_frames_come():

@@ -18,7 +18,7 @@ from semstab.data.measures import Measure, dominant, entropy, margin, registered
 from semstab.errors import DataError
 from semstab.metrics.agreement import rows_of
 from semstab.statistics import class_agreement, correctness, expected_sbd, krippendorff_alpha, psa
-from semstab.statistics.accumulate import cluster_sums_of, sums_of_cells
+from semstab.statistics.accumulate import cluster_sums_of, sums_of_spots
 from semstab.statistics.agreement import consistency_posterior
 from semstab.statistics.cluster_sums import (
     FUNCTIONALS,
@@ -99,16 +99,16 @@ def stripes(voxel_size=0.3, **options):
     return cluster_sums_of(backend.table(), backend.events(), cells=cells), cells
 
 
-def test_the_sums_of_cells_give_alpha_back():
+def test_the_sums_of_spots_give_alpha_back():
     whole, cells = stripes()
     fine, coarse = (cells.observations(times) for times in (1, 2))
     expected = [krippendorff_alpha(log.table()) for log in (fine, coarse)]
-    assert [value(part, "voxel_alpha") for part in (whole.fine, whole.coarse)] == pytest.approx(expected)
+    assert [value(part, "voxel_alpha") for part in (whole.near, whole.far)] == pytest.approx(expected)
     assert value(whole, "alpha") == pytest.approx(2 * expected[0] - expected[1])
     by_class = [[row.voxel_alpha for row in class_agreement(log.table(), log)] for log in (fine, coarse)]
     for k in range(K):
         assert value(whole, "alpha", k) == pytest.approx(2 * by_class[0][k] - by_class[1][k])
-    alone = sums_of_cells(cells)
+    alone = sums_of_spots(cells)
     assert value(alone, "alpha") == pytest.approx(value(whole, "alpha"))
     assert np.isnan(value(alone, "psa"))
 
@@ -116,17 +116,17 @@ def test_the_sums_of_cells_give_alpha_back():
 def test_without_cells_there_is_no_alpha():
     table, log, _ = flight()
     sums = cluster_sums_of(table, log)
-    assert (sums.fine, sums.coarse) == (None, None)
+    assert (sums.near, sums.far) == (None, None)
     assert np.isnan(value(sums, "alpha"))
     assert not np.isnan(value(sums, "voxel_alpha"))
 
 
-def test_sums_of_cells_become_coarser_with_those_of_the_map():
+def test_sums_of_spots_become_coarser_with_those_of_the_map():
     whole, _ = stripes()
     larger = whole.coarsened(2 * whole.edge, 4)
-    assert larger.fine.edge == larger.coarse.edge == larger.edge == 2 * whole.edge
-    assert larger.fine.cells < whole.fine.cells
-    assert larger.fine.step == whole.fine.step == 1
+    assert larger.near.edge == larger.far.edge == larger.edge == 2 * whole.edge
+    assert larger.near.cells < whole.near.cells
+    assert larger.near.step == whole.near.step == 1
     for key in ("alpha", "voxel_alpha"):
         assert value(larger, key) == pytest.approx(value(whole, key))
 
@@ -136,12 +136,12 @@ def test_sums_of_two_maps_are_aligned_with_their_cells():
     one, other = stripes()[0].coarsened(2.0, 2), stripes(seed=1)[0].coarsened(4.0, 1)
     a, b = aligned(one.coarsened(2.0, 0), other)
     assert (a.edge, a.step, b.edge, b.step) == (4.0, 0, 4.0, 0)
-    for part in (a.fine, a.coarse, b.fine, b.coarse):
+    for part in (a.near, a.far, b.near, b.far):
         assert (part.edge, part.step) == (4.0, 1)
     assert [value(a, "alpha"), value(b, "alpha")] == pytest.approx([value(one, "alpha"), value(other, "alpha")])
     without = cluster_sums_of(flight()[0]).coarsened(4.0, 0)
     a, b = aligned(replace(without, voxel_size=0.3), other)
-    assert (a.fine, np.isnan(value(a, "alpha"))) == (None, True)
+    assert (a.near, np.isnan(value(a, "alpha"))) == (None, True)
     assert value(b, "alpha") == pytest.approx(value(other, "alpha"))
 
 
@@ -149,12 +149,12 @@ def test_a_file_holds_a_map_and_its_fine_and_coarse_cells(tmp_path):
     whole, _ = stripes()
     whole.save(tmp_path / "sums.parquet")
     back = ClusterSums.load(tmp_path / "sums.parquet")
-    for part, own in zip((back, back.fine, back.coarse), (whole, whole.fine, whole.coarse), strict=True):
+    for part, own in zip((back, back.near, back.far), (whole, whole.near, whole.far), strict=True):
         for name in ("cell", "frame", "columns"):
             np.testing.assert_array_equal(getattr(part, name), getattr(own, name))
         for name in ("edge", "step", "voxel_size", "K", "classes", "truth", "fused"):
             assert getattr(part, name) == getattr(own, name)
-    assert (back.voxel_size, back.fine.voxel_size, back.coarse.voxel_size) == (0.3, 0.125, 0.25)
+    assert (back.voxel_size, back.near.voxel_size, back.far.voxel_size) == (0.3, 0.125, 0.25)
     assert value(back, "alpha") == value(whole, "alpha")
 
 
@@ -206,7 +206,7 @@ def test_an_older_file_is_read_without_its_cells(tmp_path, schema):
         about.pop("fused")
     pq.write_table(content.replace_schema_metadata({"semstab": json.dumps(about)}), tmp_path / "old.parquet")
     back = ClusterSums.load(tmp_path / "old.parquet")
-    assert (back.fine, back.coarse) == (None, None)
+    assert (back.near, back.far) == (None, None)
     np.testing.assert_array_equal(back.columns, whole.columns)
     assert (back.step, back.voxel_size, back.fused) == (1, 0.3, 0 if schema == 2 else 8)
     assert value(back, "voxel_alpha") == value(whole, "voxel_alpha")

@@ -15,7 +15,7 @@ from semstab.core.files import read_json, write_json
 from semstab.core.json_form import from_json, to_json
 from semstab.core.types import THESE_FRAMES, THIS_SCENE
 from semstab.data.contrast import ModelComparison
-from semstab.data.statistics import UNKNOWN, CellAgreement, ClassAlpha, HeadlineStatistics, Interval, MapStatistics
+from semstab.data.statistics import UNKNOWN, SpotAgreement, ClassAlpha, HeadlineStatistics, Interval, MapStatistics
 from semstab.data.voxels import VoxelTable
 from semstab.errors import ConfigError, DataError
 from semstab.metrics import sbd
@@ -213,7 +213,7 @@ def judged(low, high, wrong=UNKNOWN, voxels=5000, **cells):
         "largest_class": "grass", "largest_share": 0.5, "labelled": 1.0, "classes": (),
     } | cells  # fmt: skip
     return verdict(
-        "net", headline=replace(numbers, wrong_of_consistent=wrong), cells=CellAgreement(**own), voxels=voxels,
+        "net", headline=replace(numbers, wrong_of_consistent=wrong), cells=SpotAgreement(**own), voxels=voxels,
         share=0.5,
     )  # fmt: skip
 

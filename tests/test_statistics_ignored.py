@@ -12,7 +12,7 @@ from striped_floor import K, flight, fused, sampled
 
 from semstab.data.contrast import ComparedObservations
 from semstab.statistics import compare_models
-from semstab.statistics.accumulate import sums_of_cells
+from semstab.statistics.accumulate import sums_of_spots
 from semstab.statistics.cluster_sums import value
 from semstab.statistics.paired_differences import common_observations, psa_bounds, stratum_counts, thin_share
 
@@ -134,7 +134,7 @@ def bold_and_shy(hardest):
 @pytest.mark.parametrize("hardest", [at_borders, anew_in_each_frame])
 def test_a_model_that_leaves_the_hardest_out_is_not_more_stable(hardest):
     bold, shy = bold_and_shy(hardest)
-    apart = [value(sums_of_cells(sampled(frames)), "alpha") for frames in (bold, shy)]
+    apart = [value(sums_of_spots(sampled(frames)), "alpha") for frames in (bold, shy)]
     assert apart[1] - apart[0] > 0.05  # each on its own observations
     found = compared(bold=bold, shy=shy)
     row = of_alpha(found)

@@ -38,7 +38,7 @@ def sums_from(labels, side, voxel_size=0.125):
 
 def moved(sums, by):
     """The same map, elsewhere."""
-    further = {name: part and moved(part, by) for name, part in (("fine", sums.fine), ("coarse", sums.coarse))}
+    further = {name: part and moved(part, by) for name, part in (("fine", sums.near), ("coarse", sums.far))}
     return dataclasses.replace(sums, cell=sums.cell + np.array(by, np.int32), **further)
 
 
@@ -72,7 +72,7 @@ def test_no_error_seen_is_not_no_error_and_next_to_nothing_is_nowhere():
     assert alpha.value == alpha.high == of_voxels.value == of_voxels.high == psa.high == 1
     assert psa.low == pytest.approx(0.025 ** (1 / 100))
     assert of_voxels.low == pytest.approx(1 - (1 - psa.low) / 0.5, abs=0.01)
-    assert sums.edge == sums.fine.edge == sums.coarse.edge
+    assert sums.edge == sums.near.edge == sums.far.edge
     assert alpha.low == pytest.approx(1 - 2 * (1 - of_voxels.low))  # that of fine cells counts twice
     # Of 150 classes so few voxels may be stable that the square of their number is none any more
     rng = np.random.default_rng(0)

@@ -30,7 +30,7 @@ from semstab.engine.units import Unit, make_plan
 from semstab.engine.work import Start, Work, jobs_of
 from semstab.errors import ConfigError, DataError
 from semstab.metrics import SelfConsistency, VideoConsistency, compare, compensated_flicker, flicker_percent, summarise
-from semstab.statistics import CellObservations, compare_models
+from semstab.statistics import SpotObservations, compare_models
 from semstab.task import read
 
 
@@ -340,7 +340,7 @@ def test_the_base_models_are_compared_where_statistics_are_wanted(root, tmp_path
     (found,) = result.comparisons
     maps = {record.unit.model: record.table() for record in result.select()}
     truth = maps.pop("gt")
-    cells = {own.unit.model: CellObservations.load(own.observations_file) for own in result.select()}
+    cells = {own.unit.model: SpotObservations.load(own.observations_file) for own in result.select()}
     cells.pop("gt")
     expected = compare_models(maps, truth=truth, observations=cells, scene="wall")
     assert to_json(found) == to_json(expected)

@@ -13,7 +13,7 @@ import semstab
 from semstab.core.json_form import from_json, to_json
 from semstab.data.statistics import MapStatistics
 from semstab.report.narrative import warnings
-from semstab.statistics import cell_agreement
+from semstab.statistics import spot_agreement
 
 ROAD, GRASS, CAR, PERSON = range(4)
 
@@ -69,7 +69,7 @@ def test_nothing_is_said_where_most_disagreement_is_elsewhere() -> None:
 
 def test_nothing_is_said_where_alpha_leaves_no_disagreement(monkeypatch) -> None:
     """Alpha of cells without a size may come out as 1 where there are few, though their labels differ."""
-    monkeypatch.setattr(cell_agreement, "value", lambda sums, key: 1.2)
+    monkeypatch.setattr(spot_agreement, "value", lambda sums, key: 1.2)
     assert fused().record().statistics.cells.moving is None
 
 

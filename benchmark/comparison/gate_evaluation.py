@@ -238,7 +238,7 @@ def _of_all_alpha(rule: Rule) -> bool:
 
 def _is_nearly_one_class(sums: ClusterSums | None) -> bool:
     """Return whether the verdict on the map is 'uninformative'."""
-    return sums is not None and sums.fine is not None and chance_of(sums.fine) * LEAST_CLASSES > 1
+    return sums is not None and sums.near is not None and chance_of(sums.near) * LEAST_CLASSES > 1
 
 
 def _same_frames(new: Entry, base: Entry) -> bool:

@@ -24,7 +24,7 @@ from semstab.statistics.cluster_sums import ClusterSums
 from semstab.statistics.correctness import join_truth
 from semstab.statistics.drift import expected_sbd
 from semstab.statistics.model_comparison import Region, Regions, common_voxels, coverage_of, held, share_of
-from semstab.statistics.observations import CellObservations
+from semstab.statistics.observations import SpotObservations
 from semstab.statistics.paired_differences import SharedObservations, compared_observations
 
 NEAR = 1e-3
@@ -168,7 +168,7 @@ def _by_voxels(entries: Sequence[Entry], regions: Regions) -> Common:
     tables, share = tuple(common.tables.values()), common.share
     label = None if common.truth is None else join_truth(tables[0], common.truth).label
     sums = tuple(
-        replace(_sums(table, label), fine=entry.sums.fine, coarse=entry.sums.coarse)
+        replace(_sums(table, label), near=entry.sums.near, far=entry.sums.far)
         for table, entry in zip(tables, entries, strict=True)
     )
     millions = len(tables[0]) / share / 1e6
@@ -183,7 +183,7 @@ def _with_observations(common: Common, names: Sequence[str], records: Sequence[R
         return replace(common, notes=(OTHER_OBSERVATIONS, *common.notes), same_frames=False, frames_differ=True)
     shared, pixels = _compared(names, samples)
     cells = shared.sums.values()
-    sums = (replace(part, fine=of.fine, coarse=of.coarse) for part, of in zip(common.sums, cells, strict=True))
+    sums = (replace(part, near=of.near, far=of.far) for part, of in zip(common.sums, cells, strict=True))
     notes, logs = _fewer_frames(samples), tuple(shared.logs.values())
     return replace(
         common, basis="observations", notes=(*common.notes, *notes, *pixels), sums=tuple(sums), logs=logs,
@@ -191,14 +191,14 @@ def _with_observations(common: Common, names: Sequence[str], records: Sequence[R
     )  # fmt: skip
 
 
-def _observations_of_the_same_frames(records: Sequence[Record]) -> list[CellObservations]:
+def _observations_of_the_same_frames(records: Sequence[Record]) -> list[SpotObservations]:
     """Return the sampled observations of runs; none where one run has none, or other frames."""
     files = [file for record in records if (file := record.observations_file) is not None and file.is_file()]
-    samples = [CellObservations.load(file) for file in files]
+    samples = [SpotObservations.load(file) for file in files]
     return samples if len(samples) == len(records) and _same_frames(samples) else []
 
 
-def _compared(names: Iterable[str], samples: Sequence[CellObservations]) -> tuple[SharedObservations, tuple[str, ...]]:
+def _compared(names: Iterable[str], samples: Sequence[SpotObservations]) -> tuple[SharedObservations, tuple[str, ...]]:
     """Return the observations that all runs made, and notes on them.
 
     Where their pixels have different sizes, the pixels that a run left without a label are unknown.
@@ -228,7 +228,7 @@ def on_common_observations(
     if not shared.compared.observations:
         return None
     alike = [
-        replace(entry, small=(replace(entry.sums, fine=of.fine, coarse=of.coarse), entry.flicker))
+        replace(entry, small=(replace(entry.sums, near=of.near, far=of.far), entry.flicker))
         for entry, of in zip(runs, shared.sums.values(), strict=True)
     ]
     return alike, shared.compared, notes
@@ -254,7 +254,7 @@ def _sums(table: VoxelTable, label: Int64 | None) -> ClusterSums:
     return cluster_sums_of(table, None, label, sbd_excess=sbd(table) - expected_sbd(table))
 
 
-def _same_frames(observations: Sequence[CellObservations]) -> bool:
+def _same_frames(observations: Sequence[SpotObservations]) -> bool:
     """Return whether frames of one index were taken from one position, and flights share most frames."""
     first, *others = (each.views for each in observations)
     for other in others:
@@ -266,7 +266,7 @@ def _same_frames(observations: Sequence[CellObservations]) -> bool:
     return True
 
 
-def _fewer_frames(observations: Sequence[CellObservations]) -> tuple[str, ...]:
+def _fewer_frames(observations: Sequence[SpotObservations]) -> tuple[str, ...]:
     """Return a note where a run left out frames that others have."""
     if len({each.frames for each in observations}) == 1:
         return ()

@@ -125,7 +125,7 @@ class Ignored:
 
     Attributes:
         missing: Share of their pixels.
-        psa_low, psa_high: Bounds of the agreement of two views in a cell, whatever the missing observations would have
+        psa_low, psa_high: Bounds of the agreement of two views of a spot, whatever the missing observations would have
             been (Manski 1990): the worst case, and the best.
         alpha: By the convention that what is left out agrees as by chance: alpha of what it labelled, times the share
             of pairs of views of which it labelled both.
@@ -140,16 +140,16 @@ class Ignored:
 
 @dataclass(frozen=True)
 class ComparedObservations:
-    """The compared observations: the cells that all models labelled in a view, each with the same weight.
+    """The compared observations: the spots that all models labelled in a view, each with the same weight.
 
     Attributes:
-        cells, observations: Sampled ones that they are of.
+        spots, observations: The ones that they are of.
         order: Order of the models by alpha on these observations, the best first.
         order_ignored: The same by that convention.
         bounded: Whether the bounds of the agreement keep the order of the models, whatever was left out.
     """
 
-    cells: int
+    spots: int
     observations: int
     ignored: tuple[Ignored, ...]
     order: tuple[str, ...]
@@ -179,7 +179,7 @@ class ModelComparison:
 # The differences between runs; JSON has the names of the fields. Undefined numbers are NaN.
 
 Basis = Literal["observations", "voxels", "cubes", "flights"]
-"""The unit of pairing: observations (a cell in a view) that all made; voxels that all saw twice or more; cubes,
+"""The unit of pairing: observations (a spot in a view) that all made; voxels that all saw twice or more; cubes,
 each map with all its voxels; nothing, each flight by itself."""
 
 

@@ -33,7 +33,7 @@ from semstab.metrics import FrameQualityMeter, VideoMeter, flicker_percent
 from semstab.metrics.image_space import ImageSpaceMeter
 from semstab.pixels.scans import pictured
 from semstab.statistics import Sampler
-from semstab.statistics.observations import CellObservations
+from semstab.statistics.observations import SpotObservations
 from semstab.statistics.voxel_sizes import SizeSample
 from semstab.task import Task, prepare, truth_task
 
@@ -160,7 +160,7 @@ class LiveMap:
         """The classes whose locations are left out of the map."""
         return [self.task.mapping.target.classes.index(name) for name in self.config.exclude.classes]
 
-    def sampled_observations(self) -> CellObservations | None:
+    def sampled_observations(self) -> SpotObservations | None:
         """Return the sampled observations, without the locations that are left out."""
         if self.sampler is None:
             return None

@@ -40,7 +40,7 @@ from semstab.metrics.agreement import rows_of
 from semstab.metrics.image_space import PICTURED, ImageSpaceMeter, lone_picture, picture_arrays
 from semstab.metrics.summary import TableSums
 from semstab.metrics.up_axis import estimate_up
-from semstab.statistics import Analysis, CellObservations, MapSample, analyse
+from semstab.statistics import Analysis, MapSample, SpotObservations, analyse
 from semstab.statistics.agreement import alpha_of, alpha_sums, ratio_of
 from semstab.statistics.verdict import Limits
 from semstab.task import Task, read
@@ -174,7 +174,7 @@ def _left(live: LiveMap, table: VoxelTable, events: Events | None = None) -> tup
     return table.rows(keep), None if events is None else events.rows(keep)
 
 
-def analyse_sample(task: Task, config: Config, sample: MapSample, observations: CellObservations | None) -> Analysis:
+def analyse_sample(task: Task, config: Config, sample: MapSample, observations: SpotObservations | None) -> Analysis:
     """Return the statistics of a map; its true labels are right, and bound how far geometry lets labels agree."""
     return analyse(
         sample, observations, name=task.model, edges=config.strata, critical=config.critical_classes,
@@ -274,7 +274,7 @@ def _savers(
     live: LiveMap,
     stream: Stream,
     fused: FusedMap | None,
-    observations: CellObservations | None,
+    observations: SpotObservations | None,
     sample: MapSample | None,
     analysis: Analysis | None,
 ) -> Savers:
@@ -318,7 +318,7 @@ def _map_savers(live: LiveMap, fused: FusedMap, analysis: Analysis | None) -> Sa
     return savers
 
 
-def unit_savers(task: Task, rows: Series, observations: CellObservations | None, analysis: Analysis | None) -> Savers:
+def unit_savers(task: Task, rows: Series, observations: SpotObservations | None, analysis: Analysis | None) -> Savers:
     """Return the files of a unit that do not depend on tiles: its time series, and what statistics rest on."""
     slug = task.units[0].slug
     of_frames = {} if analysis is None else analysis.of_frames()

@@ -26,7 +26,7 @@ from semstab.engine.units import Plan, must_agree
 from semstab.engine.work import Work
 from semstab.metrics import compare
 from semstab.metrics.agreement import together
-from semstab.statistics import CellObservations, ModelComparison, claimed_together
+from semstab.statistics import ModelComparison, SpotObservations, claimed_together
 from semstab.statistics.model_comparison import Region, Regions, compare_regions
 
 
@@ -141,7 +141,7 @@ def _comparisons(config: Config, records: Sequence[Record], tables: Tables) -> I
         there = [record for record in base if record.unit.scene == scene]
         if len(there) > 1:
             files = {record.unit.model: record.observations_file for record in there}
-            loaded = {name: CellObservations.load(file) for name, file in files.items() if file and file.exists()}
+            loaded = {name: SpotObservations.load(file) for name, file in files.items() if file and file.exists()}
             regions, observations = _regions_of(there, config, tables), loaded if len(loaded) == len(there) else None
             of_labels = {record.unit.model: record.summary.reduced is None for record in there}
             if (compared := _compared_maps(scene, regions, observations, of_labels)) is not None:
@@ -149,7 +149,7 @@ def _comparisons(config: Config, records: Sequence[Record], tables: Tables) -> I
 
 
 def _compared_maps(
-    scene: str, regions: Regions, observations: Mapping[str, CellObservations] | None, of_labels: Mapping[str, bool]
+    scene: str, regions: Regions, observations: Mapping[str, SpotObservations] | None, of_labels: Mapping[str, bool]
 ) -> ModelComparison | None:
     """Return the comparison of a scene's maps in the label space that most have; None without two such maps.
 

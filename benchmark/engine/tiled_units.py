@@ -35,7 +35,7 @@ from semstab.engine.work import Job, Start, UnitTile, Work
 from semstab.errors import SemstabError
 from semstab.metrics.agreement import together
 from semstab.metrics.summary import TableSums
-from semstab.statistics import Analysis, CellObservations, MapSample
+from semstab.statistics import Analysis, MapSample, SpotObservations
 from semstab.statistics.sample import MOST_VOXELS
 
 GUESS = 4
@@ -147,7 +147,7 @@ def assembled(
         raise no_voxels(task, config)
     rows = joined_series(frames.series, [tile.series for tile in tiles])
     seen = folder / tasks[0].folder / f"{tasks[0].size}_{TILE_OBSERVATIONS}"
-    observations = CellObservations.load(seen) if seen.exists() else None
+    observations = SpotObservations.load(seen) if seen.exists() else None
     analysis = None
     if sample is not None:  # sums in the order of the tiles, not in that of their ends
         sample = dataclasses.replace(sample, summary=sums)

@@ -208,20 +208,20 @@ def _require_consistent(path: Path, model: str, scene: str, entry: Entry) -> Non
     """Raise DataError where a stated number does not follow from the sums, or the level not from the numbers."""
     statistics, sums = entry.summary.statistics, entry.sums
     assert statistics is not None
-    own, cells, repeated = statistics.headline, statistics.cells, statistics.repeated
+    own, spots, repeated = statistics.headline, statistics.spots, statistics.repeated
     stated: dict[str, tuple[float, float]] = {
         key: (interval.value, value(sums, key))
         for key, interval in (("alpha", own.alpha), ("psa", own.psa), *(_of_truth(own) if sums.truth else ()))
         if not interval.undecided
     }
-    if cells is not None and sums.fine is not None:
-        stated["chance"] = cells.chance, chance_of(sums.fine)
-        for row in cells.classes:
+    if spots is not None and sums.near is not None:
+        stated["chance"] = spots.chance, chance_of(sums.near)
+        for row in spots.classes:
             stated[f"alpha of {row.name}"] = row.alpha.value, value(sums, "alpha", entry.classes.index(row.name))
     for key, (number, follows) in stated.items():
         if not math.isclose(number, follows, abs_tol=ALIKE) and not (math.isnan(number) and math.isnan(follows)):
             raise DataError(f"{path}: {scene}: {key} is stated as {number:.6g}, but its sums give {follows:.6g}")
-    follow = verdict(model, headline=own, cells=cells, voxels=repeated.voxels, share=repeated.share)
+    follow = verdict(model, headline=own, spots=spots, voxels=repeated.voxels, share=repeated.share)
     if statistics.verdict.level != follow.level:
         level = statistics.verdict.level
         raise DataError(f"{path}: {scene}: the level is stated as '{level}', but its numbers give '{follow.level}'")

@@ -24,8 +24,8 @@ from semstab.errors import ConfigError, DataError
 from semstab.metrics import compensated_flicker, summarise
 from semstab.online.frames import as_array
 from semstab.online.summary import Summary
-from semstab.statistics import CellObservations, MapSample, Sampler, Views, analyse, psa
-from semstab.statistics.accumulate import sums_of_cells
+from semstab.statistics import MapSample, Sampler, SpotObservations, Views, analyse, psa
+from semstab.statistics.accumulate import sums_of_spots
 from semstab.statistics.cluster_sums import value
 from semstab.statistics.sampler import BUDGET
 
@@ -41,14 +41,14 @@ class State:
 
     Attributes:
         updates: (n,) how often a further frame moved the belief of each voxel.
-        cells: The sampled observations from which alpha is computed; None without alpha.
+        spots: The sampled observations from which alpha is computed; None without alpha.
         one_in: The table holds one in so many voxels.
     """
 
     frames: int
     table: VoxelTable
     updates: Int64
-    cells: CellObservations | None
+    spots: SpotObservations | None
     flicker: tuple[float, int]
     one_in: int
 
@@ -62,8 +62,8 @@ class State:
         a, b = (state._thinned(one_in) for state in (self, other))
         table, updates = _added(a.table, b.table, a.updates, b.updates)
         flicker = self.flicker[0] + other.flicker[0], self.flicker[1] + other.flicker[1]
-        cells = None if a.cells is None or b.cells is None else _joined(a.cells, b.cells)
-        return State(self.frames + other.frames, table, updates, cells, flicker, one_in)
+        spots = None if a.spots is None or b.spots is None else _joined(a.spots, b.spots)
+        return State(self.frames + other.frames, table, updates, spots, flicker, one_in)
 
     def _thinned(self, one_in: int) -> State:
         if one_in == self.one_in:
@@ -76,14 +76,14 @@ class State:
         table = self._table()
         whole, sample = summarise(table), MapSample.draw(table).table.measured()
         alpha = math.nan
-        if self.cells is not None and len(self.cells):
-            alpha = min(value(sums_of_cells(self.cells), "alpha"), 1.0)
+        if self.spots is not None and len(self.spots):
+            alpha = min(value(sums_of_spots(self.spots), "alpha"), 1.0)
         numbers = alpha, whole.recurrent[VSS], whole[SBD], mean(psa(sample)), self._flicker, whole.recurrent.share
         return dict(zip(Summary.NAMES, map(float, numbers), strict=True))
 
     def summary(self) -> Summary:
         """Return the numbers of a run of these frames."""
-        analysis = analyse(MapSample.draw(self._table()), self.cells)
+        analysis = analyse(MapSample.draw(self._table()), self.spots)
         return Summary.of(self.frames, analysis.table, analysis.summary, self._flicker)
 
     def _table(self) -> VoxelTable:
@@ -357,16 +357,19 @@ def _added(a: VoxelTable, b: VoxelTable, updates_a: Int64, updates_b: Int64) -> 
     ), updates  # fmt: skip
 
 
-def _joined(a: CellObservations, b: CellObservations) -> CellObservations:
-    """Return the observations of both, in the blocks that are in both samples; frames are numbered anew."""
-    size, share = max(a.cell_size, b.cell_size), min(a.share, b.share)
-    later = dataclasses.replace(b, view=b.view + np.int32(len(a.views)))
+def _joined(a: SpotObservations, b: SpotObservations) -> SpotObservations:
+    """Return the answers of both, each for its own spots; frames are numbered again, those of b after those of a."""
+    share = min(a.share, b.share)
+    a, b = a.within(share), b.within(share)
+    while len(a) + len(b) > BUDGET:
+        share //= 2
+        a, b = a.within(share), b.within(share)
+    later = dataclasses.replace(b, spot=b.spot + np.int32(len(a.point)), view=b.view + np.int32(len(a.views)))
     views = Views.joined([a.views, b.views])
     views = dataclasses.replace(views, frame=np.arange(len(views)))
-    both = CellObservations.joined(
-        [each.only(each.drawn < share) for each in (a.coarsened(size), later.coarsened(size))]
-    )
-    while len(both) > BUDGET:
-        share //= 2
-        both = both.only(both.drawn < share)
-    return dataclasses.replace(both, views=views, share=share, frames=a.frames + b.frames)
+    both = SpotObservations.stacked([a, later])
+    point, drawn = np.concatenate([a.point, b.point]), np.concatenate([a.drawn, b.drawn])
+    return dataclasses.replace(
+        both, point=point, drawn=drawn, views=views, share=share, spacing=max(a.spacing, b.spacing),
+        frames=a.frames + b.frames,
+    )  # fmt: skip

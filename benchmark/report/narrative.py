@@ -56,7 +56,7 @@ def warnings(result: Result) -> Iterator[str]:
                 f"{_name(run, result)}: {run.frames_empty} of {run.frames} frames have no pixel with both depth and"
                 " a label: semstab-bench check"
             )
-        cells = None if run.statistics is None else run.statistics.cells
+        cells = None if run.statistics is None else run.statistics.spots
         if cells is not None and 2 * cells.views <= cells.frames:
             yield (
                 f"{_name(run, result)}: {cells.frames} frames show {cells.views} distinct views: the camera stands"
@@ -138,9 +138,9 @@ def outlying_line(outlying: OutlyingFrames, of: str = "", *, most: int = MOST_FR
 def not_assessed(run: UnitSummary) -> str:
     """Return why agreement does not assess a map: nearly all of it is one class; '' where it does."""
     statistics = run.statistics
-    if statistics is None or statistics.cells is None or statistics.verdict.level != "uninformative":
+    if statistics is None or statistics.spots is None or statistics.verdict.level != "uninformative":
         return ""
-    share, name = statistics.cells.largest_share, statistics.cells.largest_class
+    share, name = statistics.spots.largest_share, statistics.spots.largest_class
     return f"uninformative: {nearly_all(share)} of the observations of {run.unit.model} are {name}"
 
 
@@ -167,8 +167,8 @@ def _suspicions(record: Record) -> Iterator[str]:
     statistics, recall = record.statistics, record.image_space.edge_recall
     if statistics is None or statistics.verdict.level not in ("stable", "usable"):
         return
-    if statistics.cells is not None and statistics.cells.labelled < LIMITS.labelled:
-        missing = f"{1 - statistics.cells.labelled:.0%} of the locations have no label in most frames"
+    if statistics.spots is not None and statistics.spots.labelled < LIMITS.labelled:
+        missing = f"{1 - statistics.spots.labelled:.0%} of the locations have no label in most frames"
         yield f"{missing}; what has no label cannot flicker"
     if recall < LEAST_RECALL and record.unit.model != GROUND_TRUTH:
         yield (
@@ -179,7 +179,7 @@ def _suspicions(record: Record) -> Iterator[str]:
 
 def _traffic(record: Record) -> Iterator[str]:
     """Yield a warning where most disagreement is at classes that move, and frames agree much better without them."""
-    cells = None if record.statistics is None else record.statistics.cells
+    cells = None if record.statistics is None else record.statistics.spots
     if cells is None or (moving := cells.moving) is None or moving.disagreement < MOSTLY_MOVING:
         return
     yield (

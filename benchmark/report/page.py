@@ -299,7 +299,7 @@ def _classes(records: Sequence[Record], colors: Mapping[str, int]) -> str:
     shown: dict[str, bool] = {}
     for record in records:
         statistics, name = record.statistics, record.unit.model
-        for of_class in () if statistics is None or statistics.cells is None else statistics.cells.classes:
+        for of_class in () if statistics is None or statistics.spots is None else statistics.spots.classes:
             if not math.isnan(of_class.alpha.value):
                 rows.setdefault(of_class.name, []).append((colors[name], name, of_class.alpha))
                 shown[of_class.name] = (

@@ -21,7 +21,7 @@ from semstab.report.means import by_model
 from semstab.statistics.agreement import ALPHA
 from semstab.statistics.cluster_sums import ClusterSums, value
 from semstab.statistics.intervals import difference, mean_of, scope_of
-from semstab.statistics.observations import CellObservations
+from semstab.statistics.observations import SpotObservations
 from semstab.statistics.paired_differences import compared_observations, holm
 
 Value = TypeVar("Value")
@@ -188,6 +188,6 @@ def _is_uninformative(record: Record) -> bool:
 
 def _common_sums(files: Files) -> Mapping[str, ClusterSums]:
     """Return the sums of the observations that all models of a scene with the same classes made."""
-    loaded = {name: CellObservations.load(file) for name, file, _ in files}
+    loaded = {name: SpotObservations.load(file) for name, file, _ in files}
     names = sharing_classes({name: each.classes for name, each in loaded.items()})
     return compared_observations({name: loaded[name] for name in names}).sums if names else {}

@@ -50,7 +50,7 @@ class Run:
         """
         rows: list[dict[str, Any]] = []
         for unit in (each for each in self.result.runs if each.statistics is not None):
-            cells = None if unit.statistics is None else unit.statistics.cells
+            cells = None if unit.statistics is None else unit.statistics.spots
             rows += [
                 {
                     "scene": unit.unit.scene, "model": unit.unit.model, "backend": unit.unit.backend, "class": row.name,

@@ -18,7 +18,7 @@ from semstab.statistics.drift import expected_sbd, flips, trends
 from semstab.statistics.geometry import ceiling, losses, rendered
 from semstab.statistics.map_statistics import Analysis, analyse, describe
 from semstab.statistics.model_comparison import compare_models, coverage, paired
-from semstab.statistics.observations import CellObservations, Views
+from semstab.statistics.observations import SpotObservations, Views
 from semstab.statistics.paired_differences import claimed_together, standardised
 from semstab.statistics.sample import MapSample
 from semstab.statistics.sampler import Sampler
@@ -26,12 +26,12 @@ from semstab.statistics.verdict import verdict
 
 __all__ = [
     "Analysis",
-    "CellObservations",
     "Estimate",
     "MapSample",
     "ModelComparison",
     "Reliability",
     "Sampler",
+    "SpotObservations",
     "Views",
     "analyse",
     "ceiling",

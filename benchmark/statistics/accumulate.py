@@ -35,7 +35,7 @@ from semstab.statistics.cluster_sums import (
     width,
 )
 from semstab.statistics.intervals import estimate
-from semstab.statistics.observations import CellObservations
+from semstab.statistics.observations import SpotObservations
 
 # Cubes of space over any set of voxels, and intervals for these frames of any statistic of their sums.
 
@@ -114,7 +114,7 @@ def cluster_sums_of(
     events: Events | None = None,
     true_label: Int64 | None = None,
     *,
-    cells: CellObservations | None = None,
+    spots: SpotObservations | None = None,
     sbd_excess: Float64 | None = None,
     edge: float | None = None,
     cubes: Cubes | None = None,
@@ -126,7 +126,7 @@ def cluster_sums_of(
         table: The map.
         events: Its log; without it a location counts as a whole, and the frames are unknown.
         true_label: (n,) the true class of each voxel, -1 where it is not known.
-        cells: The labels of sampled cells, from which alpha follows.
+        spots: Labels that views give spots, from which alpha follows.
         sbd_excess: (n,) SBD of each voxel less that in random order, NaN where that is not known.
         edge: Edge of the cubes in metres, a power of 2, where several maps must have the same; the smallest that
             leaves at most MOST_CELLS by default.
@@ -145,42 +145,36 @@ def cluster_sums_of(
         whole = _sums_of_log(events, cubes, dominant(table), true_label, likely)
     whole = _with_frameless_sums(whole, table, cubes, true_label, sbd_excess)
     whole = whole.coarsened(whole.edge, whole.step)  # one row for each cube and group of frames, in order
-    return whole if cells is None else with_cells(whole, cells)
+    return whole if spots is None else with_spots(whole, spots)
 
 
-def with_cells(whole: ClusterSums, cells: CellObservations, edge: float | None = None) -> ClusterSums:
-    """Return the sums with sums of sampled cells: fine cells, and coarse cells twice as wide, of scans the same ones.
+def with_spots(whole: ClusterSums, spots: SpotObservations, edge: float | None = None) -> ClusterSums:
+    """Return the sums with sums of spots: of their first answers, and of the second ones.
 
     Args:
         whole: Sums of the map.
-        cells: Labels of sampled cells.
-        edge: Edge of the cubes of the cells in metres, a power of 2; the smallest that leaves at most MOST_CELLS by
+        spots: Labels that views give spots.
+        edge: Edge of the cubes of the spots in metres, a power of 2; the smallest that leaves at most MOST_CELLS by
             default, whatever the voxels of the map.
     """
-    parts = []
-    for times in (1, 1) if cells.sparse else (2, 1):  # cubes that hold whole coarse cells hold whole fine ones
-        log = cells.observations(times * cells.coarsening)
-        cubes = Cubes.of_log(log, edge)
-        edge = cubes.edge
-        part_sums = _sums_of_log(log, cubes)
-        parts.append(replace(part_sums, classes=whole.classes))
-    step = max(part.step for part in parts)
-    coarse, fine = (part.coarsened(part.edge, step) for part in parts)
-    return replace(whole, fine=fine, coarse=coarse)
+    near, far = spots.logs()
+    cubes = Cubes.of_log(near[0], edge)
+    parts = [replace(_sums_of_log(log, cubes, square=square), classes=whole.classes) for log, square in (near, far)]
+    return replace(whole, near=parts[0], far=parts[1])
 
 
-def sums_of_cells(cells: CellObservations, edge: float | None = None) -> ClusterSums:
-    """Return sums of sampled cells alone, without a map.
+def sums_of_spots(spots: SpotObservations, edge: float | None = None) -> ClusterSums:
+    """Return sums of spots alone, without a map.
 
     Args:
-        cells: Labels of sampled cells.
+        spots: Labels that views give spots.
         edge: Edge of the cubes in metres, a power of 2; the smallest that leaves at most MOST_CELLS by default.
     """
     none, frame = np.zeros((0, 3), np.int32), np.zeros(0, np.int32)
-    slices = layout(cells.K, truth=False)
+    slices = layout(spots.K, truth=False)
     columns = np.zeros((0, width(slices)))
-    empty = ClusterSums(none, frame, columns, slices, cells.cell_size, 0, cells.cell_size, cells.classes)
-    return with_cells(empty, cells, edge)
+    empty = ClusterSums(none, frame, columns, slices, spots.spacing, 0, spots.spacing, spots.classes)
+    return with_spots(empty, spots, edge)
 
 
 def _sums_of_log(
@@ -189,8 +183,12 @@ def _sums_of_log(
     fused: Int64 | None = None,
     true_label: Int64 | None = None,
     likely: Float64 | None = None,
+    square: Float64 | None = None,
 ) -> ClusterSums:
-    """Return the sums by cube and group of frames of the locations of a log, whose dominant classes are `fused`."""
+    """Return the sums by cube and group of frames of the locations of a log, whose dominant classes are `fused`.
+
+    square (m,) is the squared distance of each observation from its location, metres^2.
+    """
     from semstab.core.compiled import in_chunks
     from semstab.statistics.loops.clusters import add_influences
 
@@ -211,6 +209,10 @@ def _sums_of_log(
         add_influences, order, bounds, (events.starts, events.ends), longest, events.evidence.entries, K, group, own,
         label, consistent, FirstColumns.of(K, truth=truth), len(groups), sums,
     )  # fmt: skip
+    if square is not None:
+        counted = np.flatnonzero(cubes.at[events.voxel] >= 0)
+        at = cubes.at[events.voxel[counted]].astype(np.int64) * len(groups) + group[counted]
+        sums[:, slices["square"].start] = np.bincount(at, square[counted], len(sums))
     rows = np.flatnonzero(sums[:, slices["observations"].start])
     cell, frame = np.divmod(rows, max(len(groups), 1))
     return ClusterSums(

@@ -1,24 +1,33 @@
-"""Agreement beyond chance of two observations of a cell by their distance: time, angle, range and baseline.
+"""Agreement beyond chance of two views of a spot by their distance: time, angle, range and baseline.
 
 One number of a map averages over all pairs of frames, so that it depends on the flight as much as on the model.
 """
 
 from __future__ import annotations
 
+import dataclasses
 import itertools
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from typing import Any
 
 import numpy as np
 
-from semstab.core.types import Float64, Int64
+from semstab.core.types import Float64, Int64, UInt16
 from semstab.data.events import Events
 from semstab.data.statistics import UNKNOWN, Correlogram, LagBin
 from semstab.statistics.agreement import alpha_of
-from semstab.statistics.cluster_sums import ALPHA_SUMS, MOST_GROUPS, ClusterSums, Functional, cubes_of, side_by_side
+from semstab.statistics.cluster_sums import (
+    ALPHA_SUMS,
+    MOST_GROUPS,
+    SPOTS,
+    ClusterSums,
+    Functional,
+    cubes_of,
+    side_by_side,
+)
 from semstab.statistics.intervals import confidence_intervals, scope_of, spec_of
-from semstab.statistics.observations import CellObservations
+from semstab.statistics.observations import SpotObservations
 
 STANDARD = (5.0, 15.0)
 """Degrees between the viewing directions at which alpha is stated: a baseline of a tenth to a quarter of the range."""
@@ -40,46 +49,46 @@ EDGES: dict[str, tuple[float, ...]] = {
 AXES = EDGES | {"standard": STANDARD}
 
 
-PAIRED_ALPHA = Functional(ALPHA_SUMS, alpha_of, -1.0, 1.0, "agreement", pairs=ALPHA_SUMS[:2])
+PAIRED_ALPHA = Functional(ALPHA_SUMS, alpha_of, -1.0, 1.0, "agreement", pairs=ALPHA_SUMS[:2], parts=SPOTS)
 """Alpha of pairs of observations: neither has half of its agreement with the other one for itself alone."""
 
 
 BINS = tuple((axis, *edges) for axis, limits in AXES.items() for edges in itertools.pairwise(limits))
 
 
-def correlogram(cells: CellObservations) -> Correlogram:
-    """Return alpha of fine cells in bins of the distance of two observations.
+def correlogram(spots: SpotObservations) -> Correlogram:
+    """Return alpha in bins of the distance of two views of a spot.
 
-    Observations of a cell that are 1, 2, 4, 8, ... apart are paired, so that the cost is linear. Chance is that of
-    the pairs in the bin. Bands are at CONFIDENCE, for this scene flown again where the bin has enough frames for that,
-    else for these frames.
+    Views of a spot that are 1, 2, 4, 8, ... apart are paired, so that the cost is linear. Chance is that of the pairs in
+    the bin. Bands are at CONFIDENCE, for this scene flown again where the bin has enough frames for that, else for
+    these frames.
     """
-    from semstab.statistics.loops.pairs import add_pairs
-
-    seen = cells.observations()
-    labels = np.unique(seen.evidence.label)  # the other classes change nothing
+    (seen, near), (beside, far) = spots.logs()
+    labels = np.unique(np.concatenate([seen.evidence.label, beside.evidence.label]))  # the other classes change nothing
     cubes, of, edge = _cubes(seen)
-    step, most = 1, min(MOST_GROUPS, max(1, MOST_SUMS // (max(len(cubes), 1) * (3 + len(labels)))))
+    step, most = 1, min(MOST_GROUPS, max(1, MOST_SUMS // (max(len(cubes), 1) * (4 + len(labels)))))
     while len(frames := np.unique(seen.frame // step)) > most:
         step *= 2
     group = np.searchsorted(frames, seen.frame // step)
     keys, cluster = np.unique(of[seen.voxel].astype(np.int64) * len(frames) + group, return_inverse=True)
     cube, group = np.divmod(keys, max(len(frames), 1))
-    sums = np.zeros((len(BINS) + 1, len(keys), 3 + len(labels)))  # see `ALPHA_SUMS`
-    log = seen.evidence.only(labels).entries
     pairs, distance = np.zeros((2, len(BINS) + 1))
-    for first, second, apart in _pairs(cells, seen):
+    by_lag = []
+    for first, second, apart in _pairs(spots, seen):
         bins = _bins(apart)
         pairs += np.bincount(bins.ravel(), minlength=len(pairs))
         distance += np.bincount(bins.ravel(), weights=apart.ravel(), minlength=len(pairs))
-        add_pairs(first, second, bins, cluster, log, sums)
-    columns = side_by_side(dict(zip(ALPHA_SUMS, (1, 1, 1, len(labels)), strict=True)))
+        by_lag.append((first, second, bins))
+    sums = [_sums(log, labels, square, by_lag, cluster, len(keys)) for log, square in ((seen, near), (beside, far))]
+    columns = side_by_side(dict(zip((*ALPHA_SUMS, "square"), (1, 1, 1, len(labels), 1), strict=True)))
     rows, specs = [], []
     for k in np.flatnonzero(pairs[:-1] >= LEAST_PAIRS):
-        some = np.flatnonzero(sums[k, :, 1])
+        some = np.flatnonzero(sums[0][k, :, 1])
         if len(np.unique(cube[some])) < LEAST_CUBES:
             continue
-        of_bin = ClusterSums(cubes[cube[some]], frames[group[some]], sums[k, some], columns, edge, step)
+        where = cubes[cube[some]], frames[group[some]]
+        first_answers, second_answers = (ClusterSums(*where, each[k, some], columns, edge, step) for each in sums)
+        of_bin = dataclasses.replace(first_answers, near=first_answers, far=second_answers)
         specs.append(spec_of(of_bin, PAIRED_ALPHA, scope=scope_of(of_bin, key=PAIRED_ALPHA)))
         rows.append((k, float(distance[k] / pairs[k]), int(pairs[k])))
     of_axis: dict[str, tuple[LagBin, ...]] = dict.fromkeys(AXES, ())
@@ -90,6 +99,22 @@ def correlogram(cells: CellObservations) -> Correlogram:
     return Correlogram(**of_axis, standard=standard)
 
 
+Lag = tuple[Int64, Int64, Int64]
+
+
+def _sums(
+    log: Events, labels: UInt16, square: Float64, by_lag: Sequence[Lag], cluster: Int64, clusters: int
+) -> Float64:
+    """Return the sums (bins + 1, clusters, 4 + K) of pairs: those of `ALPHA_SUMS`, then squared distances."""
+    from semstab.statistics.loops.pairs import add_pairs
+
+    sums = np.zeros((len(BINS) + 1, clusters, 4 + len(labels)))
+    entries = log.evidence.only(labels).entries
+    for first, second, bins in by_lag:
+        add_pairs(first, second, bins, cluster, entries, square, sums)
+    return sums
+
+
 def _cubes(seen: Events) -> tuple[Any, Any, float]:
     index = seen.ix, seen.iy, seen.iz
     cubes, of, edge = cubes_of(index, seen.voxel_size)
@@ -98,12 +123,12 @@ def _cubes(seen: Events) -> tuple[Any, Any, float]:
     return cubes, of, edge
 
 
-def _pairs(cells: CellObservations, seen: Events) -> Iterator[tuple[Int64, Int64, Float64]]:
+def _pairs(spots: SpotObservations, seen: Events) -> Iterator[tuple[Int64, Int64, Float64]]:
     """Yield the pairs (m,) of observations with lags of 1, 2, 4 and so on.
 
     Lag by lag, the third array has their distance (m, 5) along `AXES`.
     """
-    rank, centre = cells.views.rank(seen.frame), cells.views.centre
+    rank, centre = spots.views.rank(seen.frame), spots.views.centre
     index = np.stack([seen.ix, seen.iy, seen.iz], axis=1)
     ray = centre[rank] - ((index + 0.5) * seen.voxel_size)[seen.voxel]
     distance = np.linalg.norm(ray, axis=1)

@@ -1,7 +1,6 @@
 """Which frames stand alone: at places where the views before and after them agree, they give another class.
 
-A place is a block of the sample (`Sampler`), 4 x 4 x 4 cells; its class in a view is the one that most of the view's
-labelled pixels there have. The neighbours of a view at a place are the NEIGHBOURS other views that saw it next before
+A place is a spot of the sample (`Sampler`). The neighbours of a view at a place are the NEIGHBOURS other views that saw it next before
 and after. A frame next to a bad one is not blamed: its neighbours do not agree with each other where the bad one errs.
 """
 
@@ -16,8 +15,7 @@ import numpy as np
 from semstab.core.types import Float64, Int64, Mask
 from semstab.data.events import Events
 from semstab.data.statistics import FrameDisagreement, OutlyingFrames
-from semstab.statistics.loops import CELLS
-from semstab.statistics.observations import CellObservations
+from semstab.statistics.observations import SpotObservations
 
 NEIGHBOURS = 4
 """Most other views that a view is held against at a place: half of them before it, half after it, or the nearest."""
@@ -61,7 +59,7 @@ class LoneDisagreement:
         return self.share - self.null
 
 
-def lone_disagreement(cells: CellObservations) -> LoneDisagreement:
+def lone_disagreement(spots: SpotObservations) -> LoneDisagreement:
     """Return how often each frame disagrees with all of its neighbours at a place, while these agree.
 
     x_vt = 1 where view t of place v stands alone, else 0. If the T_v views of a place are exchangeable, x_vt has the
@@ -71,7 +69,7 @@ def lone_disagreement(cells: CellObservations) -> LoneDisagreement:
 
     is 0 in the mean, however hard the places are that frame t sees, and however often they were seen.
     """
-    log = cells.observations(CELLS)
+    log = spots.observations()
     voxel, alone = log.voxel.astype(np.int64), stands_alone(log)
     T, total = np.bincount(voxel)[voxel], np.bincount(voxel, alone)[voxel]
     several = LEAST_VIEWS <= T

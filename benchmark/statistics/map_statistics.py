@@ -33,7 +33,6 @@ from semstab.metrics.agreement import shared_rows
 from semstab.metrics.summary import STRATA, groups_of
 from semstab.statistics.accumulate import Cubes, cluster_sums_of
 from semstab.statistics.agreement import class_agreement_of, class_sums, consistency_posterior, shares_of
-from semstab.statistics.cell_agreement import cell_agreement
 from semstab.statistics.cluster_sums import ClusterSums, Functional
 from semstab.statistics.correctness import (
     MIOU,
@@ -64,12 +63,13 @@ from semstab.statistics.drift import expected_sbd
 from semstab.statistics.frame_disagreement import LoneDisagreement, lone_disagreement, outlying_frames
 from semstab.statistics.geometry import losses
 from semstab.statistics.intervals import confidence_intervals, estimate, headline_specs, scope_of, spec_of
-from semstab.statistics.observations import CellObservations
+from semstab.statistics.observations import SpotObservations
 from semstab.statistics.ranges import range_agreement
 from semstab.statistics.sample import MapSample
+from semstab.statistics.spot_agreement import spot_agreement
 from semstab.statistics.verdict import LIMITS, Limits, verdict
 
-SCHEMA = 2
+SCHEMA = 3
 
 
 @dataclass(frozen=True, eq=False)
@@ -83,7 +83,7 @@ class Analysis:
         sample: The voxels that the statistics rest on.
         shares: Number of locations with each share of the dominant class: see `consistency_posterior`.
         drawn: Columns (n,) of the voxels of the sample that need its log or its true labels.
-        lone: How often each frame stands alone; None without sampled cells.
+        lone: How often each frame stands alone; None without spots.
     """
 
     summary: MapStatistics
@@ -136,7 +136,7 @@ def describe(
     truth: VoxelTable | None = None,
     *,
     limit: VoxelTable | None = None,
-    cells: CellObservations | None = None,
+    spots: SpotObservations | None = None,
     name: str = "",
     seed: int = 0,
     edges: Sequence[int] = STRATA,
@@ -154,12 +154,12 @@ def describe(
         DataError: If events, truth or limit do not belong to the table.
     """
     sample = MapSample.draw(table, events, truth, edges=edges)
-    return analyse(sample, cells, limit=limit, name=name, seed=seed, edges=edges, critical=critical).summary
+    return analyse(sample, spots, limit=limit, name=name, seed=seed, edges=edges, critical=critical).summary
 
 
 def analyse(
     sample: MapSample,
-    cells: CellObservations | None = None,
+    spots: SpotObservations | None = None,
     *,
     limit: VoxelTable | None = None,
     name: str = "",
@@ -177,7 +177,7 @@ def analyse(
 
     Args:
         sample: The map, or a sample of it, with its log and the ground truth.
-        cells: Labels of sampled cells, taken of the same frames by a `Sampler`; without them there is no alpha and no
+        spots: Labels that views give spots, taken of the same frames by a `Sampler`; without them there is no alpha and no
             verdict.
         limit: The map of view-independent labels; the ground truth's where it is not given.
         name: Name of the model, for the verdict.
@@ -199,7 +199,7 @@ def analyse(
     locations = location_sums(table, columns, cubes)
     true_label = None if truth is None else truth.label
     sums = cluster_sums_of(
-        table, events, true_label, cells=cells, sbd_excess=columns["sbd_excess"], cubes=cubes, consistent=consistent
+        table, events, true_label, spots=spots, sbd_excess=columns["sbd_excess"], cubes=cubes, consistent=consistent
     )
     drawn, log = log_sums(sample, cubes)
     if log is not None:
@@ -214,12 +214,12 @@ def analyse(
     means = _means(locations, sums, scope)
     flips = FlippingSums.of(table, consistent, cubes).flipping(table.classes)
     lone, outlying = None, None
-    if cells is not None:
-        lone = lone_disagreement(cells)
-        outlying = outlying_frames(lone, len(cells.views), name=frame_name)
-    agreement_of_cells = None if cells is None else cell_agreement(cells, sums, table, scope, critical, limits)
+    if spots is not None:
+        lone = lone_disagreement(spots)
+        outlying = outlying_frames(lone, len(spots.views), name=frame_name)
+    agreement_of_spots = None if spots is None else spot_agreement(spots, sums, table, scope, critical, limits)
     stability = verdict(
-        name or "model", headline=headline, cells=agreement_of_cells, flips=flips, voxels=repeats, share=repeated.share,
+        name or "model", headline=headline, spots=agreement_of_spots, flips=flips, voxels=repeats, share=repeated.share,
         limits=limits,
     )  # fmt: skip
     summary = MapStatistics(
@@ -229,15 +229,15 @@ def analyse(
         agreement=_agreement(means, class_agreement_of(class_sums(table, events), table.classes)),
         flipping=flips,
         headline=headline,
-        cells=agreement_of_cells,
-        correlogram=None if cells is None else correlogram(cells),
+        spots=agreement_of_spots,
+        correlogram=None if spots is None else correlogram(spots),
         drift=_drift(repeats, means, locations, log),
         uncertainty=EntropyParts(means["entropy"], means["entropy_within"], means["entropy_between"]),
         geometry=None if limit is None else losses(table, limit),
         correctness=None if truth is None else _correctness(table, truth, consistent, sums, edges, headline),
         strata=_strata(whole, table, columns, edges),
         outlying_frames=outlying,
-        ranges=None if cells is None else range_agreement(cells, scope, limits),
+        ranges=None if spots is None else range_agreement(spots, scope, limits),
     )  # fmt: skip
     return Analysis(summary, whole, sums, sample, shares, drawn, lone)
 

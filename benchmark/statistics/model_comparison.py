@@ -18,11 +18,18 @@ from semstab.data.voxels import VoxelTable
 from semstab.errors import ConfigError
 from semstab.metrics.agreement import require_same_grid, shared_rows
 from semstab.statistics.agreement import ALPHA, PSA, VOXEL_ALPHA, alpha_columns, alpha_of, ratio_of
-from semstab.statistics.cluster_sums import FUNCTIONALS, ClusterSums, Statistic, columns_of, distinct_rows
+from semstab.statistics.cluster_sums import (
+    FUNCTIONALS,
+    ClusterSums,
+    Statistic,
+    alpha_of_spots,
+    columns_of,
+    distinct_rows,
+)
 from semstab.statistics.correctness import ACCURACY, join_truth
 from semstab.statistics.drift import streams
 from semstab.statistics.intervals import estimate, scope_of
-from semstab.statistics.observations import CellObservations
+from semstab.statistics.observations import SpotObservations
 from semstab.statistics.paired_differences import (
     EDGES,
     OnCommonLocations,
@@ -99,7 +106,7 @@ def paired(
     truth: VoxelTable | None = None,
     *,
     logs: Mapping[str, Events] | None = None,
-    cells: Mapping[str, ClusterSums] | None = None,
+    spots: Mapping[str, ClusterSums] | None = None,
     seed: int = 0,
 ) -> Paired:
     """Compare models by alpha of common observations, and voxel by voxel where all of them observed at least twice.
@@ -111,51 +118,51 @@ def paired(
         tables: The maps.
         truth: The map of the ground truth labels; without it there is no accuracy.
         logs: The logs of the tables: with them other numbers are for this scene flown again, else for these frames.
-        cells: Sums of each model's common observations; without them there is no alpha.
+        spots: Sums of each model's common observations; without them there is no alpha.
         seed: Seed of the resamples.
     """
     rows = repeated_rows(tables)
     columns, statistics = _columns(tables, rows, truth)
     common = OnCommonLocations.of(tables, rows, truth, logs or {})
-    of_cells = cells or {}
+    of_spots = spots or {}
     values: dict[str, dict[str, Estimate]] = {}
-    if of_cells:
+    if of_spots:
         values[ALPHA.key] = {
-            name: estimate(sums, ALPHA.key, scope=scope_of(sums)).ends for name, sums in of_cells.items()
+            name: estimate(sums, ALPHA.key, scope=scope_of(sums)).ends for name, sums in of_spots.items()
         }
     for measure, statistic in statistics.items():
         own = columns[measure]
         values[measure.key] = {
             name: UNDEFINED if common is None else common.value(measure, name, own[name], statistic) for name in tables
         }
-    rankings = [_ranking(ALPHA, _alpha_of_cells, _by_cube(of_cells), seed)] if of_cells else []
+    rankings = [_ranking(ALPHA, _alpha_of_spots, _by_cube(of_spots), seed)] if of_spots else []
     for measure, statistic in statistics.items():
         sums = {name: np.zeros((0, own.shape[1])) if common is None else common.cubes.sums(own)
                 for name, own in columns[measure].items()}  # fmt: skip
         rankings.append(_ranking(measure, statistic, sums, seed))
-    paired_rows = differences(columns, statistics, common, of_cells)
+    paired_rows = differences(columns, statistics, common, of_spots)
     cubes = 0 if common is None else common.cubes.count
     return Paired(ALPHA.key, len(rows[0]), cubes, values, paired_rows, tuple(rankings))
 
 
-def _by_cube(cells: Mapping[str, ClusterSums]) -> dict[str, Float64]:
-    """Return sums (G, 2 C) over the cubes that hold cells of any model, fine and coarse ones side by side."""
-    parts = {name: [own for own in (sums.fine, sums.coarse) if own is not None] for name, sums in cells.items()}
+def _by_cube(spots: Mapping[str, ClusterSums]) -> dict[str, Float64]:
+    """Return sums (G, 2 C) over the cubes that hold spots of any model, of first and second answers side by side."""
+    parts = {name: [own for own in (sums.near, sums.far) if own is not None] for name, sums in spots.items()}
     cubes, row = distinct_rows(np.concatenate([own.cell for each in parts.values() for own in each]))
     ends, result = iter(np.split(row, np.cumsum([len(own.cell) for each in parts.values() for own in each]))), {}
     for name, each in parts.items():
         sums = []
         for own in each:
-            columns = columns_of(own, FUNCTIONALS[ALPHA.key])
+            columns = np.hstack([columns_of(own, FUNCTIONALS[ALPHA.key]), own["square"]])
             sums.append(np.zeros((len(cubes), columns.shape[1])))
             np.add.at(sums[-1], next(ends), columns)
         result[name] = np.hstack(sums)
     return result
 
 
-def _alpha_of_cells(sums: Float64) -> Float64:
-    """Return alpha (...,) from sums (..., 2 C) of fine cells and of coarse ones."""
-    return FUNCTIONALS[ALPHA.key].of_parts(np.split(sums, 2, axis=-1))
+def _alpha_of_spots(sums: Float64) -> Float64:
+    """Return alpha (...,) from sums (..., 2 C) of first and of second answers."""
+    return alpha_of_spots(*np.split(sums, 2, axis=-1))
 
 
 def _columns(
@@ -228,7 +235,7 @@ def compare_models(
     events: Mapping[str, Events] | None = None,
     truth: VoxelTable | None = None,
     *,
-    observations: Mapping[str, CellObservations] | None = None,
+    observations: Mapping[str, SpotObservations] | None = None,
     scene: str = "",
     seed: int = 0,
 ) -> ModelComparison:
@@ -254,7 +261,7 @@ def compare_models(
 def compare_regions(
     regions: Regions,
     *,
-    observations: Mapping[str, CellObservations] | None = None,
+    observations: Mapping[str, SpotObservations] | None = None,
     mixed: bool = False,
     scene: str = "",
     seed: int = 0,
@@ -290,8 +297,8 @@ def compare_regions(
 def _paired(regions: Regions, shared: SharedObservations | None, seed: int) -> Paired:
     """Compare on common observations, and on the common voxels with all observations of each map."""
     common = common_voxels(regions)
-    cells = None if shared is None else shared.sums
-    return paired(common.tables, common.truth, logs=common.events, cells=cells, seed=seed)
+    spots = None if shared is None else shared.sums
+    return paired(common.tables, common.truth, logs=common.events, spots=spots, seed=seed)
 
 
 MOST = 1 << 22

@@ -1,11 +1,10 @@
-"""Labels of sampled cells, frame by frame: alpha, its intervals and comparisons follow from them."""
+"""Labels that views give spots of the surface: alpha, its intervals and comparisons follow from them."""
 
 from __future__ import annotations
 
 import dataclasses
 import json
-import math
-from collections.abc import Callable, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -15,7 +14,7 @@ import numpy.typing as npt
 
 from semstab.core import arrays
 from semstab.core.files import atomic_path, parse_json
-from semstab.core.types import Float64, Int32, Int64, UInt16, UInt32
+from semstab.core.types import Float32, Float64, Int32, Int64, Mask, UInt16, UInt32
 from semstab.data import parquet
 from semstab.data.events import Events
 from semstab.data.evidence import Evidence
@@ -23,56 +22,6 @@ from semstab.data.measures import dominant, mean
 from semstab.data.voxels import index_columns
 from semstab.errors import DataError
 from semstab.statistics.cluster_sums.index import distinct_rows
-from semstab.statistics.loops import CELLS, SHIFTS, SPAN, WITHIN
-
-Voxel = tuple[int, int, int]
-
-
-def cells_of(key: Int64, low: Voxel) -> Int64:
-    """Return indices (n, 3) of the cells with these keys, which begin at block `low`."""
-    cells = np.empty((len(key), 3), np.int64)
-    for axis, (shift, first, digit) in enumerate(zip(SHIFTS, low, WITHIN, strict=True)):
-        voxel = ((key >> shift) & (SPAN - 1)) + first
-        cells[:, axis] = CELLS * voxel + ((key >> digit) & (CELLS - 1))
-    return cells
-
-
-def keys_of(cells: Int64) -> tuple[Int64, Voxel]:
-    """Return keys (n,) of cells (n, 3), and the block at which they begin.
-
-    Raises:
-        DataError: If the cells span too much.
-    """
-    key, low = np.zeros(len(cells), np.int64), [0, 0, 0]
-    for axis, (shift, digit) in enumerate(zip(SHIFTS, WITHIN, strict=True)):
-        voxel = cells[:, axis] // CELLS
-        low[axis] = int(voxel.min()) if len(voxel) else 0
-        key |= (_near(voxel - low[axis]) << shift) | ((cells[:, axis] % CELLS) << digit)
-    return key, (low[0], low[1], low[2])
-
-
-def alike(keys: Sequence[Int64], lows: Sequence[Voxel]) -> tuple[list[Int64], Voxel]:
-    """Return keys of several samples that all begin at the same block, the lowest of all, and that block.
-
-    Raises:
-        DataError: If the samples span too much.
-    """
-    if len({*lows}) == 1:
-        return list(keys), lows[0]
-    low, moved = [0, 0, 0], list(keys)
-    for axis, shift in enumerate(SHIFTS):
-        voxels = [((key >> shift) & (SPAN - 1)) + own[axis] for key, own in zip(keys, lows, strict=True)]
-        low[axis] = min((int(voxel.min()) for voxel in voxels if len(voxel)), default=0)
-        for k, voxel in enumerate(voxels):
-            moved[k] = moved[k] + ((_near(voxel - low[axis]) - (voxel - lows[k][axis])) << shift)
-    return moved, (low[0], low[1], low[2])
-
-
-def _near(voxel: Int64) -> Int64:
-    if voxel.max(initial=0) >= SPAN:
-        raise DataError(f"the observations span more than {SPAN} blocks of cells; leave out far depth")
-    return voxel
-
 
 # The views from which the frames of a sample were taken.
 
@@ -131,178 +80,177 @@ class Views:
         return np.asarray(order[np.searchsorted(self.frame, frame, sorter=order)], np.int64)
 
 
-COLUMNS = "key", "view", "label", "weight", "drawn"
-"""Columns of entries."""
+TYPES: Mapping[str, type[np.generic]] = {
+    "spot": np.int32, "view": np.int32, "label": np.uint16, "neighbour": np.uint16, "near": np.float32,
+    "far": np.float32,
+}  # fmt: skip
+"""Columns of answers."""
 
-SCHEMA = 4
-Entries = tuple[Int64, Int32, UInt16, Float64]
+COLUMNS = tuple(TYPES)
+
+SCHEMA = 5
+
+PARTS = 64
+"""Parts of a coarse cell's edge in which the place of a spot is told in a log."""
 
 
 @dataclass(frozen=True, eq=False)
-class CellObservations:
-    """Labels of the pixels of sampled cells, view by view: an entry (m,) for each cell, view and class.
+class SpotObservations:
+    """Answers of views for spots of the surface: a row (m,) for each spot and frame.
 
-    Cells are cubes about as wide as a pixel's footprint, so that two views of one cell see the same spot; they do not
-    depend on the voxels of a map. A block of CELLS cells along each edge is the unit of sampling.
+    A spot is a point of the surface, one in a coarse cell; it does not depend on the voxels of a map. The answer of a
+    frame is the label of the pixel which the spot falls into. A second answer, of a pixel next to it on the same
+    surface, tells how agreement falls with the distance of the points that answer: at a border of two classes the first
+    one is wrong if the pixel's centre and the spot lie on different sides.
 
     Attributes:
-        key: (m,) int64 of the cell, see `keys_of`.
+        spot: (m,) int32 row of `point`.
         view: (m,) int32 row of `views`.
-        label: (m,) uint16 class; K for pixels with depth that have no label.
-        weight: (m,) pixels.
-        drawn: (m,) uint32 hash of the block; blocks below `share` are in the sample.
-        low: Block at which keys begin.
+        label: (m,) uint16 class; K for pixels that have no label.
+        neighbour: (m,) uint16 class of the second answer; the first one if no pixel next to it shows the surface.
+        near, far: (m,) float32 squared distances of the two pixels' centres from the spot, across the ray, metres^2.
+        point: (n, 3) spots in metres.
+        drawn: (n,) uint32 hash of the spot's coarse cell; cells below `share` are in the sample.
         views: Distinct views, in order of integration.
-        cell_size: Edge of a cell in metres, a power of 2.
+        spacing: Edge of a coarse cell in metres, a power of 2.
         K: Number of classes.
-        share: Sampled share of the blocks, times 2^32.
+        share: Sampled share of the coarse cells, times 2^32.
         classes: Names of the classes.
         frames: Number of frames, of which some may share a view.
-        sparse: Whether views are scans: their points lie apart, so that fine and coarse cells that two of them meet lie
-            at other ranges, and alpha is that of fine cells, without extrapolation.
     """
 
-    key: Int64
+    spot: Int32
     view: Int32
     label: UInt16
-    weight: Float64
+    neighbour: UInt16
+    near: Float32
+    far: Float32
+    point: Float64
     drawn: UInt32
-    low: Voxel
     views: Views
-    cell_size: float
+    spacing: float
     K: int
     share: int = 1 << 32
     classes: tuple[str, ...] = ()
     frames: int = 0
-    sparse: bool = False
 
     def __len__(self) -> int:
-        return len(self.key)
+        return len(self.spot)
 
     @property
     def cell(self) -> Int64:
-        """(m, 3) index of the cell: floor(point / cell_size)."""
-        return cells_of(self.key, self.low)
+        """(n, 3) coarse cell of each spot: floor(point / spacing)."""
+        return np.floor(self.point / self.spacing).astype(np.int64)
 
     @property
-    def coarsening(self) -> int:
-        """Return how many cells of the sample make the edge of a fine cell, by the views' median footprint: 1 or 2.
+    def distance(self) -> Float64:
+        """(m,) metres from the spot to the centre of the view that answers."""
+        distance: Float64 = np.linalg.norm(self.point[self.spot] - self.views.centre[self.view], axis=1)
+        return distance
 
-        A fine cell is one to two footprints wide; two of them make the edge of a coarse one, which a block holds whole.
-        """
-        footprint = float(np.median(self.views.footprint)) if len(self.views) else self.cell_size
-        return int(min(max(2.0 ** math.ceil(math.log2(footprint / self.cell_size)), 1.0), CELLS // 2))
-
-    def coarsened(self, cell_size: float) -> CellObservations:
-        """Return the sample with larger cells, whose edge in metres is a power of 2, and with blocks of these."""
-        from semstab.statistics.loops.observations import hash_row
-
-        if cell_size == self.cell_size or not len(self):
-            return dataclasses.replace(self, cell_size=cell_size)
-        cell = self.cell // round(cell_size / self.cell_size)
-        (key, low), drawn = keys_of(cell), np.empty(len(self), np.uint32)
-        hash_row(*np.ascontiguousarray((cell // CELLS).T.astype(np.int32)), drawn)
-        larger = dataclasses.replace(self, key=key, drawn=drawn, low=low, cell_size=cell_size)
-        return larger.only(drawn < np.uint64(self.share))
-
-    def labelled(self) -> CellObservations:
-        """Return the entries of pixels that have a label."""
+    def labelled(self) -> SpotObservations:
+        """Return the answers that are a class."""
         return self.only(self.label < self.K)
 
     def labelled_share(self) -> float:
-        """Return the share of the cells seen by two views that have a label in at least half of their observations."""
-        seen, of = distinct_rows(np.stack([self._number(self.cell // CELLS), self.view], axis=1))
-        pixels, own = (np.bincount(of, w) for w in (self.weight, self.weight * (self.label < self.K)))
+        """Return the share of the spots seen by two views that have a label in at least half of these views."""
+        seen, of = distinct_rows(np.stack([self.spot, self.view], axis=1))
+        answers, labelled = np.bincount(of), np.bincount(of, self.label < self.K)
         _, of = np.unique(seen[:, 0], return_inverse=True)
-        frames, labelled = np.bincount(of), np.bincount(of, 2 * own >= pixels)
-        return mean((2 * labelled >= frames)[frames >= 2].astype(np.float64))
+        views, with_label = np.bincount(of), np.bincount(of, 2 * labelled >= answers)
+        return mean((2 * with_label >= views)[views >= 2].astype(np.float64))
 
-    def without(self, classes: Sequence[int]) -> CellObservations:
-        """Return the entries of coarse cells whose fused class is none of these."""
+    def without(self, classes: Sequence[int]) -> SpotObservations:
+        """Return the answers for spots whose dominant class is none of these."""
         if not len(classes) or not len(self):
             return self
-        log = self.observations(self.coarsening * 2)
-        retained = np.stack([log.ix, log.iy, log.iz], axis=1)[~np.isin(dominant(log.table()), classes)]
-        _, of = np.unique(np.concatenate([retained, self.cell // (2 * self.coarsening)]), axis=0, return_inverse=True)
-        return self.only(np.isin(of.ravel()[len(retained) :], of.ravel()[: len(retained)]))
+        log, order, _ = self._log(self.label)
+        left_out = np.zeros(len(self.point), np.bool_)
+        left_out[order] = np.isin(dominant(log.table()), classes)
+        return self.only(~left_out[self.spot])
 
-    def only(self, rows: Any) -> CellObservations:
-        """Return some of the entries."""
-        return self._each(lambda column: column[rows])
-
-    def copied(self) -> CellObservations:
-        """Return a copy with its own memory."""
-        return self._each(np.copy)
-
-    def _each(self, change: Callable[[Any], Any]) -> CellObservations:
-        columns: dict[str, Any] = {name: change(getattr(self, name)) for name in COLUMNS}
+    def only(self, rows: Any) -> SpotObservations:
+        """Return some of the answers."""
+        columns: dict[str, Any] = {name: getattr(self, name)[rows] for name in COLUMNS}
         return dataclasses.replace(self, **columns)
 
-    @classmethod
-    def joined(cls, parts: Sequence[CellObservations]) -> CellObservations:
-        """Return the entries of several samples, with all else from the first."""
-        keys, low = alike([part.key for part in parts], [part.low for part in parts])
-        columns: dict[str, Any] = {
-            name: np.concatenate([getattr(part, name) for part in parts]) for name in COLUMNS[1:]
-        }
-        return dataclasses.replace(parts[0], key=np.concatenate(keys), **columns, low=low)
-
-    def observations(self, coarsening: int | None = None) -> Events:
-        """Return the log of cells: the shares of classes among a view's labelled pixels in each cell.
-
-        Args:
-            coarsening: How many cells of the sample make an edge of a cell of the log; that of fine cells by default.
-        """
-        from semstab.statistics.loops.observations import observe
-
-        times = self.coarsening if coarsening is None else coarsening
-        own = self.labelled()
-        cell = own.cell // times
-        number = own._number(cell)
-        order = np.lexsort((own.view, number))
-        number, view, label, weight = number[order], own.view[order], own.label[order], own.weight[order]
-        n = len(number)
-        first, of, starts = np.empty(n, np.int64), np.empty(n, np.int32), np.empty(n + 1, np.int64)
-        pixels, share, text = np.empty(n), np.empty(n), np.empty(n, np.uint16)
-        n, m = observe(number, view, label, weight, self.K, first, of, pixels, starts, text, share)
-        first, of = first[:n], of[:n]
-        at = order[first[np.flatnonzero(np.diff(of, prepend=-1))]]
-        return Events(
-            **index_columns(cell[at]),
-            voxel=of,
-            frame=self.views.frame.astype(np.int32)[view[first]],
-            evidence=Evidence(starts[: n + 1], text[:m], share[:m], self.K),
-            pixels=np.rint(pixels[:n]).astype(np.int32),
-            voxel_size=times * self.cell_size,
-            classes=self.classes,
+    def within(self, share: int) -> SpotObservations:
+        """Return the answers for the spots of a smaller share of the coarse cells."""
+        drawn = self.drawn < share
+        number = np.cumsum(drawn, dtype=np.int32) - 1
+        some = self.only(drawn[self.spot])
+        return dataclasses.replace(
+            some, spot=number[some.spot], point=self.point[drawn], drawn=self.drawn[drawn], share=share
         )
 
-    @staticmethod
-    def _number(cell: Int64) -> Int64:
-        """Return the numbers (n,) of cells (n, 3) in lexical order, equal for equal cells."""
-        low = cell.min(axis=0, initial=np.iinfo(np.int64).max)
-        size = cell.max(axis=0, initial=np.iinfo(np.int64).min) - low + 1
-        x, y, z = (cell - low).T
-        return np.asarray((x * size[1] + y) * size[2] + z, np.int64)
+    @classmethod
+    def stacked(cls, parts: Sequence[SpotObservations]) -> SpotObservations:
+        """Return the answers of several samples of the same spots, with all else from the first."""
+        columns: dict[str, Any] = {name: np.concatenate([getattr(part, name) for part in parts]) for name in COLUMNS}
+        return dataclasses.replace(parts[0], **columns)
+
+    def observations(self) -> Events:
+        """Return the log of spots: the class that a view gives each of them, by the first answers."""
+        return self._log(self.label)[0]
+
+    def logs(self) -> tuple[tuple[Events, Float64], tuple[Events, Float64]]:
+        """Return the logs of the first and of the second answers, each with (m,) squared distances, metres^2."""
+        near, far = self._log(self.label, self.near), self._log(self.neighbour, self.far)
+        return (near[0], near[2]), (far[0], far[2])
+
+    def _log(self, label: UInt16, square: Float32 | None = None) -> tuple[Events, Int64, Float64]:
+        """Return a log of these labels, (n,) the spot of each of its voxels, and (m,) squared distances.
+
+        A spot is a voxel of a PARTS-th of a coarse cell: none of two spots is in one.
+        """
+        from semstab.statistics.loops.spots import observe
+
+        rows = np.flatnonzero(self.label < self.K)
+        spots, spot = np.unique(self.spot[rows], return_inverse=True)
+        place = np.floor(self.point[spots] * (PARTS / self.spacing)).astype(np.int64)
+        index, of = distinct_rows(place)
+        number = of[spot]
+        order = np.lexsort((self.view[rows], number))
+        rows, number = rows[order], number[order]
+        view, n = self.view[rows], len(rows)
+        first, voxel, starts = np.empty(n, np.int64), np.empty(n, np.int32), np.empty(n + 1, np.int64)
+        share, text = np.empty(n), np.empty(n, np.uint16)
+        n, m = observe(number, view, label[rows], self.K, first, voxel, starts, text, share)
+        first = first[:n]
+        at = np.empty(len(index), np.int64)
+        at[of] = spots
+        log = Events(
+            **index_columns(index),
+            voxel=voxel[:n],
+            frame=self.views.frame.astype(np.int32)[view[first]],
+            evidence=Evidence(starts[: n + 1], text[:m], share[:m], self.K),
+            pixels=np.ones(n, np.int32),
+            voxel_size=self.spacing / PARTS,
+            classes=self.classes,
+        )
+        squares = np.zeros(n) if square is None else square[rows[first]].astype(np.float64)
+        return log, at, squares
 
     def save(self, path: str | Path) -> None:
-        """Write Parquet, atomically."""
+        """Write Parquet, atomically: a row for each spot, with lists of its answers."""
         import pyarrow as pa
         import pyarrow.parquet as pq
 
-        columns = dict(zip("xyz", self.cell.astype(np.int32).T, strict=True))
-        columns |= {name: getattr(self, name) for name in COLUMNS[1:]}
-        about = {name: getattr(self, name) for name in ("cell_size", "K", "share", "classes", "frames", "sparse")}
-        content = pa.table({name: arrays.column(values) for name, values in columns.items()})
-        text = json.dumps({"schema": SCHEMA, "kind": "CellObservations", **about, "views": self.views.rows().tolist()})
+        order = np.argsort(self.spot, kind="stable")
+        ends = np.concatenate([[0], np.cumsum(np.bincount(self.spot, minlength=len(self.point)))]).astype(np.int32)
+        columns = dict(zip("xyz", map(arrays.column, self.point.T), strict=True)) | {"drawn": arrays.column(self.drawn)}
+        for name in COLUMNS[1:]:
+            values = arrays.column(getattr(self, name)[order])
+            columns[name] = pa.ListArray.from_arrays(arrays.column(ends), values)
+        about = {name: getattr(self, name) for name in ("spacing", "K", "share", "classes", "frames")}
+        content = pa.table(columns)
+        text = json.dumps({"schema": SCHEMA, "kind": "SpotObservations", **about, "views": self.views.rows().tolist()})
         with atomic_path(path) as temporary, pq.ParquetWriter(temporary, content.schema, compression="zstd") as file:
             file.write_table(content)
-            file.add_key_value_metadata(
-                {"semstab": text}
-            )  # metadata of a schema is written twice, and copied more often
+            file.add_key_value_metadata({"semstab": text})  # metadata of a schema would be written twice
 
     @classmethod
-    def load(cls, path: str | Path) -> CellObservations:
+    def load(cls, path: str | Path) -> SpotObservations:
         """Read a file that `save` wrote.
 
         Raises:
@@ -312,10 +260,65 @@ class CellObservations:
             with parquet.opened(path) as file:
                 content = file.read()
             about = parse_json((content.schema.metadata or {})[b"semstab"])
-            if (about.pop("kind"), about.pop("schema")) != ("CellObservations", SCHEMA):
-                raise DataError("it is of another kind, or of another version that sampled other cells; run it again")
+            if (about.pop("kind"), about.pop("schema")) != ("SpotObservations", SCHEMA):
+                raise DataError("it is of another kind or version; run it again")
             views = Views.of(about.pop("views"))
             about["classes"] = tuple(about["classes"])
-            x, y, z, view, label, weight, drawn = map(arrays.values_of, content.columns)
-            key, low = keys_of(np.stack([x, y, z], axis=1).astype(np.int64))
-            return cls(key, view, label, weight, drawn, low, views, **about)
+            point = np.stack([arrays.values_of(content.column(name)) for name in "xyz"], axis=1)
+            lists = {name: content.column(name).combine_chunks() for name in COLUMNS[1:]}
+            counts = {name: np.asarray(each.value_lengths()) for name, each in lists.items()}
+            answers = counts["view"].astype(np.int64)
+            if not all(np.array_equal(answers, count) for count in counts.values()):
+                raise DataError("the lists of a spot's answers have different lengths")
+            columns: dict[str, Any] = {
+                name: np.asarray(each.flatten()).astype(TYPES[name]) for name, each in lists.items()
+            }
+            columns["spot"] = np.repeat(np.arange(len(answers), dtype=np.int32), answers)
+            drawn = arrays.values_of(content.column("drawn")).astype(np.uint32)
+            read = cls(**columns, point=point.astype(np.float64), drawn=drawn, views=views, **about)
+            read._require_sound()
+            return read
+
+    def _require_sound(self) -> None:
+        """Raise DataError if a number is one that no sample has."""
+        if len(self) and not (self.view.min() >= 0 and self.view.max() < len(self.views)):
+            raise DataError("a view that is not there")
+        if len(self) and max(self.label.max(), self.neighbour.max()) > self.K:
+            raise DataError(f"a label above {self.K}")
+        if not (np.isfinite(self.point).all() and 0 < self.spacing < np.inf):
+            raise DataError("a spot without a place")
+        if np.abs(self.point).max(initial=0.0) * PARTS / self.spacing > 2**31:
+            raise DataError("a spot that lies too far away")
+
+
+def same_spots(samples: Sequence[SpotObservations]) -> list[SpotObservations]:
+    """Return the answers for the spots that all samples have, numbered alike, with the views of all numbered alike.
+
+    Samples of the same frames have the same spots. Of other frames of one flight they have other points of the same
+    coarse cells: those of one cell are taken for one spot.
+    """
+    share, spacing = min(sample.share for sample in samples), max(sample.spacing for sample in samples)
+    views = Views.joined([sample.views for sample in samples])
+    views = views.take(np.sort(np.unique(views.frame, return_index=True)[1]))
+    samples = [sample.within(share) for sample in samples]
+    cells = [np.floor(sample.point / spacing).astype(np.int64) for sample in samples]
+    distinct, of = distinct_rows(np.concatenate(cells))
+    firsts = []
+    for own in np.split(of, np.cumsum([len(cell) for cell in cells])[:-1]):
+        first = np.full(len(distinct), -1, np.int64)
+        first[own[::-1]] = np.arange(len(own))[::-1]
+        firsts.append(first)
+    common: Mask = np.all([first >= 0 for first in firsts], axis=0)
+    same = []
+    for sample, first in zip(samples, firsts, strict=True):
+        number = np.full(len(sample.point), -1, np.int32)
+        number[first[common]] = np.arange(np.count_nonzero(common), dtype=np.int32)
+        some = sample.only(number[sample.spot] >= 0)
+        rank = views.rank(sample.views.frame)
+        same.append(
+            dataclasses.replace(
+                some, spot=number[some.spot], view=rank[some.view].astype(np.int32), views=views, spacing=spacing,
+                point=samples[0].point[firsts[0][common]], drawn=samples[0].drawn[firsts[0][common]],
+            )
+        )  # fmt: skip
+    return same

@@ -22,13 +22,13 @@ from semstab.data.statistics import UNDEFINED, UNKNOWN, Estimate, Interval
 from semstab.data.voxels import VoxelTable
 from semstab.errors import ConfigError, DataError
 from semstab.metrics.agreement import observations, require_same_grid, rows_of
-from semstab.statistics.accumulate import Cubes, cluster_sums_of, sums_of_cells
+from semstab.statistics.accumulate import Cubes, cluster_sums_of, sums_of_spots
 from semstab.statistics.agreement import ALPHA, ONE_HOT, PSA, VOXEL_ALPHA, psa
 from semstab.statistics.cluster_sums import ClusterSums, Statistic, mean_functional
 from semstab.statistics.cluster_sums import value as value_of
 from semstab.statistics.correctness import ACCURACY, join_truth
 from semstab.statistics.intervals import difference, estimate, scope_of
-from semstab.statistics.observations import CellObservations, Views
+from semstab.statistics.observations import SpotObservations, same_spots
 
 Rows = Int64
 
@@ -88,12 +88,12 @@ def differences(
     columns: Mapping[Quantity, Mapping[str, Float64]],
     statistics: Mapping[Quantity, Statistic],
     common: OnCommonLocations | None,
-    cells: Mapping[str, ClusterSums],
+    spots: Mapping[str, ClusterSums],
 ) -> tuple[PairedDifference, ...]:
-    """Return the differences of each measure and pair of models; only alpha is tested, from the sums of cells."""
+    """Return the differences of each measure and pair of models; only alpha is tested, from the sums of spots."""
     result = [
-        _row(ALPHA, a, b, difference(cells[a], cells[b], ALPHA.key), tested=True)
-        for a, b in itertools.combinations(cells, 2)
+        _row(ALPHA, a, b, difference(spots[a], spots[b], ALPHA.key), tested=True)
+        for a, b in itertools.combinations(spots, 2)
     ]
     for measure, own in columns.items():
         for a, b in itertools.combinations(own, 2):
@@ -243,72 +243,57 @@ class CommonObservations:
     """Models of one scene with their common observations.
 
     Attributes:
-        shared: For each model the observations of cells of which all models labelled every pixel.
-        ignoring: For each model the observations that any model made, with one more class, the last, for the pixels
-            that the model did not label.
-        missing: Share of the pixels of these observations that the model did not label.
+        shared: For each model the answers for spots and views to which all models gave a label.
+        ignoring: For each model the answers that any model gave, with one more class, the last, for those that the model
+            left without a label.
+        missing: Share of these answers that the model left without a label.
     """
 
-    shared: tuple[CellObservations, ...]
-    ignoring: tuple[CellObservations, ...]
+    shared: tuple[SpotObservations, ...]
+    ignoring: tuple[SpotObservations, ...]
     missing: tuple[float, ...]
 
 
-def common_observations(models: Sequence[CellObservations]) -> CommonObservations:
-    """Return the common observations of samples of the same frames.
+def common_observations(models: Sequence[SpotObservations]) -> CommonObservations:
+    """Return the common observations of samples.
 
     Raises:
         DataError: If they differ in K.
     """
     if len({sample.K for sample in models}) > 1:
         raise DataError("samples with different classes cannot be compared; fuse both alike")
-    size = max(sample.cell_size for sample in models)
-    models = _of_the_same_blocks([sample.coarsened(size) for sample in models])
+    models = same_spots(models)
     of, first = _numbered(models)
-    pixels, silent = np.zeros((2, len(models), len(first)))
+    labelled, silent = np.zeros((2, len(models), len(first)))
     for k, (own, sample) in enumerate(zip(of, models, strict=True)):
-        labelled = sample.label < sample.K
-        pixels[k] = np.bincount(own, sample.weight * labelled, len(first))
-        silent[k] = np.bincount(own, sample.weight * ~labelled, len(first))
-    common: Mask = (pixels > 0).all(axis=0) & (silent == 0).all(axis=0)
-    most = pixels.max(axis=0)
-    locations = CellObservations.joined(models).only(first)
+        labelled[k] = np.bincount(own[sample.label < sample.K], minlength=len(first))
+        silent[k] = np.bincount(own[sample.label == sample.K], minlength=len(first))
+    common: Mask = (labelled > 0).all(axis=0) & (silent == 0).all(axis=0)
+    most = labelled.max(axis=0)
+    asked = SpotObservations.stacked(models).only(first)
     shared, ignoring = [], []
-    for sample, own, seen in zip(models, of, pixels, strict=True):
+    for sample, own, seen in zip(models, of, labelled, strict=True):
         shared.append(sample.only(common[own]))
-        ignoring.append(_filled(sample.labelled(), locations, most - seen))
+        ignoring.append(_filled(sample.labelled(), asked, most - seen))
     total = most.sum()
-    missing = tuple(float(1 - seen.sum() / total) if total else math.nan for seen in pixels)
+    missing = tuple(float(1 - seen.sum() / total) if total else math.nan for seen in labelled)
     return CommonObservations(tuple(shared), tuple(ignoring), missing)
 
 
-def _of_the_same_blocks(models: Sequence[CellObservations]) -> list[CellObservations]:
-    """Return the blocks that are in all samples by their hash, with the views of all numbered alike."""
-    share = min(sample.share for sample in models)
-    views = Views.joined([sample.views for sample in models])
-    views = views.take(np.sort(np.unique(views.frame, return_index=True)[1]))
-    same = []
-    for sample in models:
-        left = sample.only(sample.drawn < share)
-        rank = views.rank(sample.views.frame)
-        same.append(dataclasses.replace(left, view=rank[left.view].astype(np.int32), views=views, share=share))
-    return same
-
-
-def _numbered(models: Sequence[CellObservations]) -> tuple[list[Int64], Int64]:
-    """Return the number of each entry's observation, alike in all models, and one entry of each observation."""
-    F = max((len(sample.views) for sample in models), default=1)
-    all_of_them = CellObservations.joined(models)
-    _, cell = np.unique(all_of_them.key, return_inverse=True)
-    _, first, of = np.unique(cell * F + all_of_them.view, return_index=True, return_inverse=True)
+def _numbered(models: Sequence[SpotObservations]) -> tuple[list[Int64], Int64]:
+    """Return the number of each answer's observation, alike in all models, and one answer of each observation."""
+    views = max((len(sample.views) for sample in models), default=1)
+    key = np.concatenate([sample.spot.astype(np.int64) * views + sample.view for sample in models])
+    _, first, of = np.unique(key, return_index=True, return_inverse=True)
     return np.split(of, np.cumsum([len(sample) for sample in models])[:-1]), first
 
 
-def _filled(sample: CellObservations, locations: CellObservations, ignored: Float64) -> CellObservations:
-    """Return a model's entries, with a further class for the pixels `ignored` of each of the locations."""
-    label = np.full(len(locations), sample.K, np.uint16)
-    further = dataclasses.replace(locations, label=label, weight=ignored).only(ignored > 0)
-    return dataclasses.replace(CellObservations.joined([sample, further]), K=sample.K + 1, classes=())
+def _filled(sample: SpotObservations, asked: SpotObservations, ignored: Float64) -> SpotObservations:
+    """Return a model's answers, with a further class for the answers that it `ignored` (n,) of each observation."""
+    further = asked.only(np.repeat(np.arange(len(asked)), ignored.astype(np.int64)))
+    none = np.full(len(further), sample.K, np.uint16)
+    further = dataclasses.replace(further, label=none, neighbour=none)
+    return dataclasses.replace(SpotObservations.stacked([sample, further]), K=sample.K + 1, classes=())
 
 
 def psa_bounds(log: Events) -> tuple[float, float]:
@@ -323,7 +308,7 @@ def psa_bounds(log: Events) -> tuple[float, float]:
 
 
 def pairs_labelled(log: Events) -> float:
-    """Return the share of the pairs of two views of a cell of which neither is the last class, cells by their views."""
+    """Return the share of the pairs of two views of a spot of which neither is the last class, spots by their views."""
     op = np.bincount(log.voxel)
     return (
         float(np.average(_pairs(log, 1 - log.evidence[:, -1:]), weights=op[op >= 2])) if (op >= 2).any() else math.nan
@@ -331,7 +316,7 @@ def pairs_labelled(log: Events) -> float:
 
 
 def _pairs(log: Events, shares: Float64) -> Float64:
-    """Return the mean of s . s' (v,) over the pairs of observations of each cell with two or more, shares (m, C)."""
+    """Return the mean of s . s' (v,) over the pairs of observations of each spot with two or more, shares (m, C)."""
     starts = log.starts
     T = np.diff(np.append(starts, len(log))).astype(np.float64)
     again = T >= 2
@@ -343,14 +328,14 @@ def _pairs(log: Events, shares: Float64) -> Float64:
 
 @dataclass(frozen=True, eq=False)
 class SharedObservations:
-    """Sums of each model's common observations, their logs by fine cells, and the comparison itself."""
+    """Sums of each model's common observations, their logs, and the comparison itself."""
 
     sums: Mapping[str, ClusterSums]
     logs: Mapping[str, Events]
     compared: ComparedObservations
 
 
-def compared_observations(samples: Mapping[str, CellObservations]) -> SharedObservations:
+def compared_observations(samples: Mapping[str, SpotObservations]) -> SharedObservations:
     """Return the observations that all models made, and how their order depends on those that some left out."""
     names = list(samples)
     both = common_observations([samples[name] for name in names])
@@ -359,18 +344,18 @@ def compared_observations(samples: Mapping[str, CellObservations]) -> SharedObse
     sums: dict[str, ClusterSums] = {}
     edge: float | None = None
     for name, own in shared.items():
-        sums[name] = sums_of_cells(own, edge)
-        fine = sums[name].fine
-        edge = None if fine is None else fine.edge
+        sums[name] = sums_of_spots(own, edge)
+        near = sums[name].near
+        edge = None if near is None else near.edge
     ignored = []
     for name, missing in zip(names, both.missing, strict=True):
-        log, alpha = ignoring[name].observations(), value_of(sums_of_cells(samples[name]), ALPHA.key)
+        log, alpha = ignoring[name].observations(), value_of(sums_of_spots(samples[name]), ALPHA.key)
         ignored.append(Ignored(name, missing, *psa_bounds(log), min(alpha, 1.0) * pairs_labelled(log)))
     first = next(iter(logs.values()))
     bounds = {row.model: (row.psa_low, row.psa_high) for row in ignored}
     by_psa = sorted(names, key=lambda name: -mean(psa(logs[name].table())))
     compared = ComparedObservations(
-        cells=len(first.ix),
+        spots=len(first.ix),
         observations=len(first),
         ignored=tuple(ignored),
         order=tuple(sorted(names, key=lambda name: -value_of(sums[name], ALPHA.key))),

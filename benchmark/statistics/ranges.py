@@ -9,9 +9,9 @@ import numpy as np
 
 from semstab.core.types import THIS_SCENE, Float64, Scope
 from semstab.data.statistics import UNKNOWN, RangeAgreement, RangeStratum
-from semstab.statistics.accumulate import sums_of_cells
+from semstab.statistics.accumulate import sums_of_spots
 from semstab.statistics.intervals import estimate, scope_of
-from semstab.statistics.observations import CellObservations
+from semstab.statistics.observations import SpotObservations
 from semstab.statistics.verdict import LIMITS, Limits
 
 EDGES: Float64 = np.array([m * 10.0**e for e in range(-1, 4) for m in (1, 1.5, 2, 3, 5, 7)])
@@ -21,34 +21,33 @@ LEAST_ENTRIES, LEAST_SHARE = 2000, 0.02
 """The least entries of a stratum, and their share in all; a smaller one is joined with the next."""
 
 LEAST_SEEN_TWICE = 200
-"""The least number of cells that two views saw from a range, for its alpha to be reported."""
+"""The least number of spots that two views saw from a range, for its alpha to be reported."""
 
 
 def range_agreement(
-    cells: CellObservations, scope: Scope = THIS_SCENE, limits: Limits = LIMITS
+    spots: SpotObservations, scope: Scope = THIS_SCENE, limits: Limits = LIMITS
 ) -> RangeAgreement | None:
-    """Return alpha by range, from sampled cells; None where all were seen from about one distance.
+    """Return alpha by range, from spots; None where all were seen from about one distance.
 
-    The range of an observation is the distance of the cell from its view's centre. A stratum has the observations that
-    were made in it: two of one cell count together where both fall into it.
+    The range of an answer is the distance of the spot from its view's centre. A stratum has the answers that were given
+    in it: two of one spot count together where both fall into it.
     """
-    if not len(cells):
+    if not len(spots):
         return None
-    at = (cells.cell + 0.5) * cells.cell_size
-    distance = np.linalg.norm(at - cells.views.centre[cells.view], axis=1)
+    distance = spots.distance
     edges = _edges(distance)
     if len(edges) < 3:
         return None
     strata = []
     for low, high in itertools.pairwise(edges):
-        within = cells.only((distance >= low) & (distance < high))
-        sums = sums_of_cells(within)
-        fine = sums.fine
-        assert fine is not None
-        seen_twice = round(float(fine["voxels"].sum()))
+        within = spots.only((distance >= low) & (distance < high))
+        sums = sums_of_spots(within)
+        near = sums.near
+        assert near is not None
+        seen_twice = round(float(near["voxels"].sum()))
         enough = seen_twice >= LEAST_SEEN_TWICE
         alpha = estimate(sums, "alpha", scope=scope_of(sums, scope)) if enough else UNKNOWN
-        strata.append(RangeStratum(low, high, len(within) / len(cells), seen_twice, alpha))
+        strata.append(RangeStratum(low, high, len(within) / len(spots), seen_twice, alpha))
     return RangeAgreement(tuple(strata), limits.usable, *_reliable(strata, limits.usable))
 
 

@@ -1,11 +1,14 @@
-"""A sample of cells, as wide as a pixel's footprint, with the labels that each view gives them.
+"""Spots of the surface, and the labels that each view gives them.
 
-A cell is in the sample by a hash of the block that holds it, so that all models of a flight sample the same cells.
-Memory is bounded: whenever there are too many entries, every second block is dropped.
+A spot is a point of the surface: one in each coarse cell that a frame shows, at a place that depth alone decides. Each
+later frame answers for all spots that it sees, near or far, with the label of the pixel that a spot falls into. So
+spots are even over the surface, and a spot has as many answers as views see it. All models of a flight are asked at the
+same spots. Memory is bounded: if there are too many answers, every second spot is dropped, by a hash of its cell.
 """
 
 from __future__ import annotations
 
+import functools
 import hashlib
 import math
 from dataclasses import dataclass
@@ -15,32 +18,54 @@ import numpy as np
 import numpy.typing as npt
 
 from semstab.core.arrays import Rows
-from semstab.core.types import Float64, Int64, UInt16, UInt32
+from semstab.core.types import Float64, Int64, UInt16
 from semstab.data.frames import Frame
 from semstab.data.labels import fixed
-from semstab.statistics.loops import CELLS, SPAN
-from semstab.statistics.observations import VIEW, CellObservations, Views
+from semstab.statistics.observations import COLUMNS, TYPES, VIEW, SpotObservations, Views
 
 BUDGET = 1 << 19
-"""Most entries (cell, view, class)."""
+"""Most answers (spot, view)."""
+
+MOST_SPOTS = 1 << 17
+"""Most spots, of which many may have been seen once."""
+
+MOST_NEW = 1 << 16
+"""Most spots that one frame adds."""
+
+LOOKED_AT = 40_000
+"""Blocks of pixels, about, in which new spots are looked for."""
+
+APART = 2.0
+"""Edge of a coarse cell, in distances of the pixels in which new spots are looked for, or more."""
 
 SIDE = 640
-"""Most pixels on a side: every n-th pixel of each axis of a larger frame is taken, or every n-th point of a scan."""
+"""Most pixels on a side of the labels by which frames that repeat another are found."""
 
 FEW = 4
 """The median depth is taken of every FEW-th pixel of each axis."""
 
-REACH = SPAN // 2
-"""Blocks from the first camera within which there is a sample."""
+REACH = 1 << 20
+"""Coarse cells from the first camera within which there are spots."""
 
-RISE = 8.0
-"""Growth of the median footprint beyond the cells from which on the sample begins anew, as after a take-off."""
+CHANGE = 8.0
+"""Growth or fall of the median footprint from which on the sample begins again, as after a take-off."""
 
 STILL = 1.0
 """Pixels by which no point of an image moves while a camera stands still."""
 
-TYPES = np.int64, np.int32, np.uint16, np.float64, np.uint32
-"""Types of the columns of entries."""
+SIGMAS, LEAST, MOST = 4.0, 0.002, 0.05
+"""A pixel shows a spot if their depths differ by at most so many standard deviations of how they differ in the flight,
+which depth noise and errors of poses cause; the least and the most of this tolerance, relative."""
+
+GATE, ENOUGH = 0.05, 50
+"""That standard deviation is taken of differences up to this, relative, if a frame has at least so many."""
+
+SLACK = 0.25
+"""Share of the slope of inverse depth in a pixel that is added: surfaces are curved."""
+
+SPARSE, DENSE = 0.3, 0.1
+"""Share of an image's pixels that have depth below which depth is sparse, as a LiDAR's in an image is; and share of the
+labels at pixels without depth from which on labels are read where a spot falls, not at the next pixel with depth."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -60,48 +85,96 @@ class Anchor:
         return self.focal * (angle + moved) <= STILL
 
 
-class Sampler:
-    """Takes frames one by one, as they are fused; `sample` returns the entries so far.
+@dataclass(frozen=True, eq=False)
+class Sparse:
+    """Sparse depth: points by direction, and an image of their numbers.
 
-    The first frame sets the size of the cells: the power of 2 next above the median footprint of its pixels. Frames
-    that a standing camera takes are one view, and so are frames with the same pose and the same labels.
+    Attributes:
+        grid: (rows, columns) int32 the nearest point in each pixel, -1 without any.
+        u, v, w: (n,) image coordinates and inverse depth, or inverse range of a scan; w is 0 for invalid points.
+        camera: Focal lengths and principal point in pixels; of a scan, pixels in a radian.
+        around: Whether columns close a circle.
+        reach: Pixels to each side in which points around a place are looked for.
+        spacing: Of the points, in pixels of an image, or in distances of a scan's points; pixels: in pixels of the grid.
+        labels: (n,) uint16 labels of the points; None if the image has labels in all pixels.
+    """
+
+    grid: npt.NDArray[np.int32]
+    u: Float64
+    v: Float64
+    w: Float64
+    camera: tuple[float, float, float, float]
+    around: bool
+    reach: int
+    spacing: float
+    pixels: float
+    labels: UInt16 | None = None
+
+    @property
+    def arrays(self) -> tuple[Any, ...]:
+        """The grid and the points, in the order of compiled loops."""
+        return self.grid, self.u, self.v, self.w
+
+
+class Sampler:
+    """Takes frames one by one, as they are fused; `sample` returns the answers so far.
+
+    The first frame sets the size of the coarse cells, a power of 2. Frames that a standing camera takes are one view,
+    and so are frames with the same pose and the same labels.
 
     Args:
         num_classes: K, the number of classes.
-        budget: Most entries of a sample.
+        budget: Most answers of a sample.
     """
 
     def __init__(self, num_classes: int, budget: int = BUDGET) -> None:
         self.K, self.budget = num_classes, budget
-        self._cell_size = math.nan
-        self._origin: Int64 = np.zeros(3, np.int64)
-        self._columns: tuple[npt.NDArray[Any], ...] = tuple(np.empty(budget, dtype) for dtype in TYPES)
+        self._edge = math.nan
+        self._low: Int64 = np.zeros(3, np.int64)
+        self._columns: dict[str, npt.NDArray[Any]] = {}
         self._views = Rows(VIEW)
-        self._frames, self._sparse = 0, False
+        self._frames = 0
         self._anchor: Anchor | None = None
         self._seen: dict[bytes, Anchor] = {}
+        self._errors: list[float] = []
+        self._known = 0
         self._clear()
 
     def _clear(self) -> None:
-        self._share, self._entries = 1 << 32, 0
+        self._share, self._answers, self._spots = 1 << 32, 0, 0
+        self._point, self._hash = np.empty((1 << 12, 3)), np.empty(1 << 12, np.uint32)
+        self._table = np.full(1 << 14, -1, np.int64)
+        self._columns = {name: np.empty(1 << 14, dtype) for name, dtype in TYPES.items()}
 
     def add(self, frame: Frame) -> None:
-        """Add the labels of a frame's pixels with depth in sampled cells."""
+        """Add the answers of a frame."""
         self._frames += 1
-        self._sparse = self._sparse or frame.is_scan
-        frame = frame.within(SIDE)
-        with_depth = frame.valid if frame.unlabelled is None else frame.valid | frame.unlabelled
-        if not with_depth.any():
+        few = frame.depth[::FEW, ::FEW]
+        few = few[(few > 0) & (few < np.inf)]
+        if not len(few):
+            few = frame.depth[(frame.depth > 0) & (frame.depth < np.inf)]
+        sparse = _sparse(frame, self.K)
+        spacing = _stride(frame.shape) if sparse is None else sparse.spacing
+        view = self._view_of(frame, float(np.median(few)), spacing) if len(few) else None
+        if view is None:
             return
-        labels = np.where(frame.valid, frame.predicted, self.K).astype(np.uint16)
-        few = frame.depth[::FEW, ::FEW][with_depth[::FEW, ::FEW]]  # a median of a few pixels is as good
-        view = self._view_of(frame, labels, float(np.median(few if len(few) else frame.depth[with_depth])))
-        if view is not None:
-            self._take(view, *self._drawn(frame, with_depth, labels))
+        self._known = self._spots
+        T, seed = fixed(frame.T_wc), (frame.index + 1) * 0x9E3779B9 & 0xFFFFFFFF
+        if sparse is None:
+            self._find(frame, T, seed)
+            self._take(view, *self._answers_of_image(frame, T, seed))
+        else:
+            self._find_in_points(sparse, T, seed)
+            self._take(view, *self._answers_of_points(frame, sparse, T, seed))
 
-    def _view_of(self, frame: Frame, labels: UInt16, depth: float) -> int | None:
-        """Return the view of a frame, which may be a new one; None where the frame repeats another."""
-        same = self._seen.get(digest := hashlib.blake2b(labels.tobytes(), digest_size=16).digest())
+    def _view_of(self, frame: Frame, depth: float, spacing: float) -> int | None:
+        """Return the view of a frame, which may be a new one; None if the frame repeats another.
+
+        depth is the median; new spots are looked for in pixels that lie `spacing` pixels apart.
+        """
+        small = frame.predicted[:: max(1, -(-frame.shape[0] // SIDE)), :: max(1, -(-frame.shape[1] // SIDE))]
+        digest = hashlib.blake2b(np.ascontiguousarray(small).tobytes(), digest_size=16).digest()
+        same = self._seen.get(digest)
         if same is not None and same.sees_alike(frame):
             return None
         if self._anchor is not None and self._anchor.sees_alike(frame):
@@ -111,49 +184,211 @@ class Sampler:
         centre, when = frame.T_wc[:3, 3], math.nan if frame.timestamp is None else frame.timestamp
         self._views.append([frame.index, *centre.tolist(), when, depth / focal])
         footprint = float(np.median(self._views.table()[:, -1]))
-        if not footprint <= RISE * self._cell_size:
-            self._cell_size = 2.0 ** math.ceil(math.log2(footprint))
-            self._origin = np.floor(centre / (CELLS * self._cell_size)).astype(np.int64)
+        edge = 2.0 ** math.ceil(math.log2(APART * spacing * footprint))
+        if not self._edge / CHANGE < edge < self._edge * CHANGE:
+            self._edge = edge
+            self._low = np.floor(centre / edge).astype(np.int64) - REACH
             self._clear()
         return self._anchor.view
 
-    def _drawn(self, frame: Frame, with_depth: Any, labels: UInt16) -> tuple[Int64, UInt16, Float64, UInt32]:
-        """Return cells, labels, pixels and hashes of the frame's entries."""
-        from semstab.statistics.loops.observations import draw, grouped
+    # --- New spots ----------------------------------------------------------------------------------------------------
 
-        H, W = frame.shape
-        ray_x, ray_y = frame.rays
-        points = np.zeros((0, 0, 3), np.float32) if frame.points is None else frame.points
-        cell, drawn, label = np.empty(H * W, np.int64), np.empty(H * W, np.uint32), np.empty(H * W, np.uint16)
-        n = draw(
-            fixed(frame.depth), fixed(points), fixed(with_depth), labels, ray_x, ray_y, fixed(frame.T_wc),
-            CELLS * self._cell_size, self._share, self._origin, REACH, cell, drawn, label,
+    def _find(self, frame: Frame, T: Float64, seed: int) -> None:
+        """Add spots in an image with dense depth."""
+        from semstab.statistics.loops.spots import new_in_image
+
+        (H, W), stride = frame.shape, _stride(frame.shape)
+        blocks = -(-H // stride) * -(-W // stride)
+        where = self._edge, self._share, self._low, stride, _factor(blocks), seed
+        self._new(lambda *room: new_in_image(fixed(frame.depth), _camera(frame), T, *where, *room))
+
+    def _find_in_points(self, sparse: Sparse, T: Float64, seed: int) -> None:
+        """Add spots among the points of sparse depth."""
+        from semstab.statistics.loops.spots import new_in_points
+
+        place = sparse.camera, sparse.around, sparse.reach, sparse.pixels
+        where = self._allowed(), T, self._edge, self._share, self._low, _factor(len(sparse.w)), seed
+        self._new(lambda *room: new_in_points(*sparse.arrays, *place, *where, *room))
+
+    def _new(self, find: Any) -> None:
+        """Add the spots that a loop finds, at most MOST_NEW."""
+        while 2 * (self._spots + MOST_NEW) > len(self._table):
+            self._table = self._rebuilt(2 * len(self._table))
+        if self._spots + MOST_NEW > len(self._hash):
+            room = max(2 * len(self._hash), self._spots + MOST_NEW)
+            self._point, self._hash = _longer(self._point, room), _longer(self._hash, room)
+        end = self._spots + MOST_NEW
+        self._spots += find(self._table, self._point[self._spots : end], self._hash[self._spots : end])
+
+    def _rebuilt(self, size: int) -> Int64:
+        """Return a table of the coarse cells of all spots."""
+        from semstab.statistics.loops.spots import fill
+
+        table = np.full(size, -1, np.int64)
+        fill(self._point[: self._spots], self._edge, self._low, table)
+        return table
+
+    # --- Answers ------------------------------------------------------------------------------------------------------
+
+    def _allowed(self) -> float:
+        """Return the tolerance of depth, relative: it follows from the flight's own differences so far."""
+        sigma = float(np.median(self._errors)) if self._errors else LEAST
+        return min(max(SIGMAS * sigma, LEAST), MOST)
+
+    def _learn(self, earlier: int, spot: npt.NDArray[np.int32], error: Float64) -> None:
+        """Take how much a frame's depth differs at the spots that it did not find itself."""
+        seen = np.abs(error[(spot < earlier) & (np.abs(error) < GATE)])
+        if len(seen) >= ENOUGH:
+            self._errors.append(float(np.median(seen)) / 0.6745)
+
+    def _answers_of_image(self, frame: Frame, T: Float64, seed: int) -> tuple[Any, ...]:
+        from semstab.statistics.loops.spots import answer, project
+
+        n, camera = self._spots, _camera(frame)
+        spot, (x, y, error, room) = np.empty(n, np.int32), np.empty((4, n))
+        n = project(self._point[:n], fixed(frame.depth), camera, T, spot, x, y, error, room)
+        spot, x, y, error, room = spot[:n], x[:n], y[:n], error[:n], room[:n]
+        self._learn(self._known, spot, error)
+        out = np.empty(n, np.int32), np.empty(n, np.uint16), np.empty(n, np.uint16), np.empty((n, 2), np.float32)
+        m = answer(
+            spot, x, y, error, room, self._allowed(), SLACK, fixed(frame.depth), *_labels(frame), self.K, camera,
+            seed, *out,
         )  # fmt: skip
-        near = slice(n) if cell[:n].min(initial=0) >= 0 else np.flatnonzero(cell[:n] >= 0)
-        cell, drawn, label = cell[near], drawn[near], label[near]
-        pixels = np.empty(len(cell))
-        m = grouped(cell, label, drawn, pixels)
-        return cell[:m], label[:m], pixels[:m], drawn[:m]
+        return tuple(column[:m] for column in out)
 
-    def _take(self, view: int, cell: Int64, label: UInt16, weight: Float64, drawn: UInt32) -> None:
-        """Add entries of a view; drop every second block while they are too many."""
-        while self._entries + np.count_nonzero(drawn < self._share) > self.budget:
-            self._share //= 2
-            rows = np.flatnonzero(self._columns[-1][: self._entries] < self._share)
-            for column in self._columns:
-                column[: len(rows)] = column[rows]
-            self._entries = len(rows)
-        some = np.flatnonzero(drawn < self._share)
-        end = self._entries + len(some)
-        taken: tuple[npt.NDArray[Any], ...] = cell, np.full(len(drawn), view), label, weight, drawn
-        for column, values in zip(self._columns, taken, strict=True):
-            column[self._entries : end] = values[some]
-        self._entries = end
+    def _answers_of_points(self, frame: Frame, sparse: Sparse, T: Float64, seed: int) -> tuple[Any, ...]:
+        from semstab.statistics.loops.spots import answer_image_sparse, answer_points, project_sparse
 
-    def sample(self, classes: tuple[str, ...] = ()) -> CellObservations:
-        """Return a copy of the sample so far."""
-        x, y, z = (self._origin - REACH).tolist()
-        key, view, label, weight, drawn = (column[: self._entries].copy() for column in self._columns)
-        size = self._cell_size if len(self._views) else 1.0
-        own = (key, view, label, weight, drawn, (x, y, z), Views.of(self._views.table().copy()), size, self.K)
-        return CellObservations(*own, self._share, classes, self._frames, self._sparse)
+        n = self._spots
+        spot, nearest, (x, y, error, room) = np.empty(n, np.int32), np.empty(n, np.int64), np.empty((4, n))
+        place = sparse.camera, sparse.around, sparse.reach
+        n = project_sparse(self._point[:n], *sparse.arrays, *place, T, spot, x, y, error, room, nearest)
+        spot, x, y, error, room, nearest = spot[:n], x[:n], y[:n], error[:n], room[:n], nearest[:n]
+        self._learn(self._known, spot, error)
+        out = np.empty(n, np.int32), np.empty(n, np.uint16), np.empty(n, np.uint16), np.empty((n, 2), np.float32)
+        if sparse.labels is None:
+            m = answer_image_sparse(
+                spot,
+                x,
+                y,
+                error,
+                self._allowed(),
+                *_labels(frame),
+                self.K,
+                sparse.w,
+                nearest,
+                sparse.camera,
+                seed,
+                *out,
+            )
+        else:
+            m = answer_points(
+                spot, x, y, error, room, self._allowed(), *sparse.arrays, sparse.labels, nearest, *place, seed, *out
+            )
+        return tuple(column[:m] for column in out)
+
+    def _take(self, view: int, spot: Any, label: UInt16, far: UInt16, square: Any) -> None:
+        """Add the answers of a view; drop every second spot while there are too many of them."""
+        end = self._answers + len(spot)
+        if end > len(self._columns["spot"]):
+            self._columns = {name: _longer(each, max(2 * len(each), end)) for name, each in self._columns.items()}
+        values = spot, np.full(len(spot), view), label, far, square[:, 0], square[:, 1]
+        for name, own in zip(COLUMNS, values, strict=True):
+            self._columns[name][self._answers : end] = own
+        self._answers = end
+        while self._answers > self.budget or self._spots > MOST_SPOTS:
+            self._halve()
+
+    def _halve(self) -> None:
+        self._share //= 2
+        left = self._hash[: self._spots] < self._share
+        number = np.cumsum(left, dtype=np.int32) - 1
+        rows = np.flatnonzero(left[self._columns["spot"][: self._answers]])
+        for name, column in self._columns.items():
+            column[: len(rows)] = number[column[rows]] if name == "spot" else column[rows]
+        self._answers, n = len(rows), int(left.sum())
+        self._point[:n], self._hash[:n] = self._point[: self._spots][left], self._hash[: self._spots][left]
+        self._spots = n
+        self._table = self._rebuilt(len(self._table))
+
+    def sample(self, classes: tuple[str, ...] = ()) -> SpotObservations:
+        """Return a copy of the sample so far, without the pixels that are left out."""
+        counted = np.flatnonzero(self._columns["label"][: self._answers] <= self.K)
+        answers: dict[str, Any] = {name: column[counted] for name, column in self._columns.items()}
+        return SpotObservations(
+            **answers,
+            point=self._point[: self._spots].copy(),
+            drawn=self._hash[: self._spots].copy(),
+            views=Views.of(self._views.table().copy()),
+            spacing=self._edge if len(self._views) else 1.0,
+            K=self.K,
+            share=self._share,
+            classes=classes,
+            frames=self._frames,
+        )
+
+
+def _longer(array: npt.NDArray[Any], length: int) -> npt.NDArray[Any]:
+    """Return an array with room for more rows."""
+    longer = np.empty((length, *array.shape[1:]), array.dtype)
+    longer[: len(array)] = array
+    return longer
+
+
+def _camera(frame: Frame) -> tuple[float, float, float, float]:
+    K = frame.intrinsics
+    return K.fx, K.fy, K.cx, K.cy
+
+
+def _labels(frame: Frame) -> tuple[Any, Any]:
+    """Return the labels, and the mask of pixels without a label, (0, 0) if there is none."""
+    return fixed(frame.predicted), fixed(np.zeros((0, 0), np.bool_) if frame.unlabelled is None else frame.unlabelled)
+
+
+def _stride(shape: tuple[int, int]) -> int:
+    """Return the distance of the pixels in which new spots are looked for."""
+    return max(1, round(math.sqrt(shape[0] * shape[1] / LOOKED_AT)))
+
+
+@functools.lru_cache(maxsize=64)
+def _factor(total: int) -> int:
+    """Return a step near the golden section of a number, with which all numbers below it are met once."""
+    step = max(1, round(total * 0.6180339887))
+    while math.gcd(step, total) > 1:
+        step += 1
+    return step
+
+
+def _sparse(frame: Frame, K: int) -> Sparse | None:
+    """Return the points of a scan, or of an image with sparse depth; None of an image with dense depth."""
+    from semstab.statistics.loops.spots import directions, drawn
+
+    if frame.points is not None:
+        points = fixed(frame.points.reshape(-1, 3))
+        u, v, w = np.zeros((3, len(points)))
+        if not frame.ray_angle > 0:
+            return None
+        columns = max(8, round(4 * math.pi / frame.ray_angle))  # half a distance of the points wide
+        unit = 2 * math.pi / columns
+        directions(points, unit, u, v, w)
+        grid = np.empty((math.ceil(math.pi / unit) + 1, columns), np.int32)
+        drawn(u, v, w, grid)
+        labels = frame.predicted.reshape(-1).astype(np.uint16)
+        unlabelled = np.False_ if frame.unlabelled is None else frame.unlabelled.reshape(-1)
+        labels = np.where(labels < K, labels, np.where(unlabelled, K, K + 1)).astype(np.uint16)
+        return Sparse(grid, u, v, w, (1 / unit, 1 / unit, 0.0, 0.0), True, 5, 1.0, 2.0, labels)
+    valid = (frame.depth > 0) & (frame.depth < np.inf)
+    if not 0 < (n := int(np.count_nonzero(valid))) < SPARSE * valid.size:
+        return None
+    row, column = np.nonzero(valid)
+    spacing = math.sqrt((np.ptp(row) + 1) * (np.ptp(column) + 1) / n)
+    u, v, w = column.astype(np.float64), row.astype(np.float64), 1.0 / frame.depth[valid].astype(np.float64)
+    grid = np.full(valid.shape, -1, np.int32)
+    grid[valid] = np.arange(n, dtype=np.int32)
+    here = frame.predicted < K
+    dense = np.count_nonzero(here & ~valid) > DENSE * np.count_nonzero(here)
+    unlabelled = np.False_ if frame.unlabelled is None else frame.unlabelled[valid]
+    labels = frame.predicted[valid].astype(np.uint16)
+    labels = np.where(labels < K, labels, np.where(unlabelled, K, K + 1)).astype(np.uint16)
+    reach = min(max(math.ceil(1.6 * spacing), 2), 12)
+    return Sparse(grid, u, v, w, _camera(frame), False, reach, spacing, spacing, None if dense else labels)

@@ -7,7 +7,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 
 from semstab.core.types import THIS_SCENE
-from semstab.data.statistics import CellAgreement, Flipping, HeadlineStatistics, Interval, Level, StabilityVerdict
+from semstab.data.statistics import Flipping, HeadlineStatistics, Interval, Level, SpotAgreement, StabilityVerdict
 from semstab.statistics.intervals import LEAST_FRAMES, probability_above
 
 
@@ -37,14 +37,14 @@ PROBABLE = 0.9
 """A class is named as unstable from this probability on."""
 
 LEAST_CLASSES = 1.07
-"""Effective number of classes (`CellAgreement.effective_classes`) below which agreement tells almost nothing of a map:
+"""Effective number of classes (`SpotAgreement.effective_classes`) below which agreement tells almost nothing of a map:
 where 97 % of it are one class, any two observations agree with a probability of .94, however good the labels are."""
 
 DANGEROUS = 0.05
 """Largest share of the consistent locations that may be wrong."""
 
-LEAST_CELLS, LEAST_CUBES = 100, 16
-"""Cells that two views saw or more, and cubes of space that hold them, below which there is no verdict: both are the
+LEAST_SPOTS, LEAST_CUBES = 100, 16
+"""Spots that two views saw or more, and cubes of space that hold them, below which there is no verdict: both are the
 same whatever the voxels of the map, of which as many have to be seen twice."""
 
 ADVICE: dict[Level, str] = {
@@ -61,7 +61,7 @@ ADVICE: dict[Level, str] = {
 ACTED_ON, LEAST_FLIPS = ("stable", "usable"), 0.001
 """Levels at which labels are acted on, and the least share of locations that flip that is reported."""
 
-NO_CELLS = "no cells were sampled; give the observations of a `Sampler`"
+NO_SPOTS = "no spots were sampled; give the observations of a `Sampler`"
 TOO_FEW_VOXELS = "its map has too few locations to act on; use smaller voxels, or frames that overlap more"
 STILL = "the camera stood still: all frames show one view"
 
@@ -78,7 +78,7 @@ def verdict(
     model: str,
     *,
     headline: HeadlineStatistics,
-    cells: CellAgreement | None,
+    spots: SpotAgreement | None,
     flips: Flipping | None = None,
     voxels: int,
     share: float,
@@ -89,30 +89,30 @@ def verdict(
     Args:
         model: Its name.
         headline: Numbers of the map.
-        cells: The observations that alpha rests on; without them there is no verdict.
+        spots: The observations that alpha rests on; without them there is no verdict.
         flips: Locations about which frames do not agree: a few of them do not show in a mean.
         voxels: Voxels with OP >= 2.
         share: Their share of all voxels.
         limits: Limits of the levels.
     """
     support = f"{voxels} locations seen twice or more, {share:.0%} of the map"
-    if reason := _missing(cells, voxels):
+    if reason := _missing(spots, voxels):
         return StabilityVerdict("no verdict", math.nan, f"{model}: no verdict, {reason}; {support}")
-    assert cells is not None
+    assert spots is not None
     probabilities = level_probabilities(headline.alpha, limits)
-    level, probability = _level(headline, cells, probabilities)
-    silent = cells.labelled < limits.labelled
+    level, probability = _level(headline, spots, probabilities)
+    silent = spots.labelled < limits.labelled
     if silent and level == "stable":
         level, probability = "usable", probabilities["usable"] + probability
     wrong = headline.wrong_of_consistent
-    same = cells.agreeing(headline.alpha.value)
-    parts = [_alpha(headline.alpha, cells), f"two views see the same class at {same:.0%} of the spots"]
+    same = spots.agreeing(headline.alpha.value)
+    parts = [_alpha(headline.alpha, spots), f"two views see the same class at {same:.0%} of the spots"]
     if level == "uninformative":
-        parts.insert(0, f"{cells.largest_share:.0%} of the observations are {cells.largest_class}")
+        parts.insert(0, f"{spots.largest_share:.0%} of the observations are {spots.largest_class}")
     if not math.isnan(wrong.low):
         parts.append(f"{wrong.value:.0%} of the consistent locations are wrong ({wrong.low:.0%} to {wrong.high:.0%})")
     if silent:
-        parts.append(f"{1 - cells.labelled:.0%} of the locations have no label in most frames")
+        parts.append(f"{1 - spots.labelled:.0%} of the locations have no label in most frames")
     if flips is not None and level in ACTED_ON:
         parts += _flips(flips)
     how_sure = "" if math.isnan(probability) or level == "undecided" else f" ({probability:.0%})"
@@ -121,21 +121,21 @@ def verdict(
     return StabilityVerdict(level, probability, line)
 
 
-def _missing(cells: CellAgreement | None, voxels: int) -> str:
+def _missing(spots: SpotAgreement | None, voxels: int) -> str:
     """Return why there is no verdict; empty where there is one."""
-    if cells is None:
-        return NO_CELLS
-    if cells.views < 2 <= cells.frames:
+    if spots is None:
+        return NO_SPOTS
+    if spots.views < 2 <= spots.frames:
         return STILL
-    if cells.cells < LEAST_CELLS or cells.cubes < LEAST_CUBES:
+    if spots.spots < LEAST_SPOTS or spots.cubes < LEAST_CUBES:
         return ADVICE["no verdict"]
-    return TOO_FEW_VOXELS if voxels < LEAST_CELLS else ""
+    return TOO_FEW_VOXELS if voxels < LEAST_SPOTS else ""
 
 
 def _level(
-    headline: HeadlineStatistics, cells: CellAgreement, probabilities: Mapping[Level, float]
+    headline: HeadlineStatistics, spots: SpotAgreement, probabilities: Mapping[Level, float]
 ) -> tuple[Level, float]:
-    if cells.effective_classes < LEAST_CLASSES:
+    if spots.effective_classes < LEAST_CLASSES:
         return "uninformative", math.nan
     level = max(probabilities, key=lambda name: probabilities[name])
     if math.isnan(probabilities[level]):
@@ -153,10 +153,10 @@ def _for(basis: Interval) -> str:
     return f"for these frames alone ({reason})"
 
 
-def _alpha(alpha: Interval, cells: CellAgreement) -> str:
+def _alpha(alpha: Interval, spots: SpotAgreement) -> str:
     """Return 'alpha 0.71 (0.69 to 0.73), probably unstable: car (98%)'."""
     chance = ", no better than chance" if alpha.value < 0 else ""
-    unstable = [row for row in cells.critical_classes[:3] if row.unstable >= PROBABLE]
+    unstable = [row for row in spots.critical_classes[:3] if row.unstable >= PROBABLE]
     named = ", ".join(f"{row.name} ({row.unstable:.0%})" for row in unstable)
     classes = f", probably unstable: {named}" if named else ""
     return f"alpha {alpha.value:.2f} ({alpha.low:.2f} to {alpha.high:.2f}){chance}{classes}"

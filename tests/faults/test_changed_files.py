@@ -19,11 +19,11 @@ from semstab.engine import load_result
 from semstab.errors import DataError
 from semstab.report.figures.maps import Overview
 from semstab.report.saved_run import read_series
-from semstab.statistics import CellObservations
+from semstab.statistics import SpotObservations
 from semstab.statistics.cluster_sums import ClusterSums
 
 LOADERS = {
-    "voxels": VoxelTable.load, "truth": VoxelTable.load, "events": Events.load, "observations": CellObservations.load,
+    "voxels": VoxelTable.load, "truth": VoxelTable.load, "events": Events.load, "observations": SpotObservations.load,
     "sums": ClusterSums.load, "frames": read_series, "overview": Overview.load,
 }  # fmt: skip
 

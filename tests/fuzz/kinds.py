@@ -60,7 +60,7 @@ from semstab.predict.folder import PredictionFolder
 from semstab.report.figures.maps import Overview
 from semstab.report.tables import tables
 from semstab.report.terminal import print_summary
-from semstab.statistics import CellObservations
+from semstab.statistics import SpotObservations
 from semstab.statistics.acceptance import AcceptanceThresholds
 from semstab.statistics.cluster_sums import ClusterSums
 
@@ -240,7 +240,7 @@ def of_results(folder: Path) -> Iterator[Kind]:
     first: dict[str, Read] = {
         "voxels/*.parquet": VoxelTable.load,
         "events/*.parquet": Events.load,
-        "observations/*.parquet": CellObservations.load,
+        "observations/*.parquet": SpotObservations.load,
         "sums/*.parquet": ClusterSums.load,
         "overview/*.npz": Overview.load,
         "units/*.json": lambda file: from_json(Record, read_json(file), file),

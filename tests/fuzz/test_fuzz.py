@@ -29,7 +29,7 @@ from semstab.models.names import class_names
 from semstab.models.segearth_ov import read_prompts
 from semstab.report.figures.maps import Overview
 from semstab.report.saved_run import read_series
-from semstab.statistics import CellObservations
+from semstab.statistics import SpotObservations
 from semstab.statistics.cluster_sums import ClusterSums
 
 EACH = 8
@@ -201,7 +201,7 @@ def test_no_exceptions_name_is_told() -> None:
 def test_json_nested_too_deeply_is_refused_wherever_it_stands(tmp_path) -> None:
     deep = b"[" * 100_000
     pq.write_table(pa.table({"x": [1]}).replace_schema_metadata({"semstab": deep}), tmp_path / "a.parquet")
-    for load in (VoxelTable.load, CellObservations.load, ClusterSums.load):
+    for load in (VoxelTable.load, SpotObservations.load, ClusterSums.load):
         with pytest.raises(DataError, match=r"a\.parquet: "):
             load(tmp_path / "a.parquet")
     with pytest.raises(ValueError, match="nested too deeply"):

@@ -4,7 +4,6 @@ Undefined numbers are NaN; a section that could not be computed is None.
 """
 
 from semstab.data.statistics.agreement import (
-    CellAgreement,
     ClassAgreement,
     ClassAlpha,
     Correlogram,
@@ -13,6 +12,7 @@ from semstab.data.statistics.agreement import (
     MovingClasses,
     RangeAgreement,
     RangeStratum,
+    SpotAgreement,
 )
 from semstab.data.statistics.correctness import Correctness, CorrectnessStatistics, Losses, Quadrants, Reliability
 from semstab.data.statistics.drift import DriftStatistics, Flipping, FlipRates, FrameDisagreement, OutlyingFrames, Trend
@@ -33,7 +33,6 @@ __all__ = [
     "ORDER_KNOWN",
     "UNDEFINED",
     "UNKNOWN",
-    "CellAgreement",
     "ClassAgreement",
     "ClassAlpha",
     "Correctness",
@@ -59,6 +58,7 @@ __all__ = [
     "RangeStratum",
     "Reliability",
     "Repeated",
+    "SpotAgreement",
     "StabilityVerdict",
     "StratumStatistics",
     "Trend",

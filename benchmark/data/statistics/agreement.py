@@ -1,4 +1,4 @@
-"""Agreement of frames on voxels, of views on sampled cells, by range and by distance between observations."""
+"""Agreement of frames on voxels, of views at spots, by range and by distance between observations."""
 
 from __future__ import annotations
 
@@ -87,14 +87,14 @@ class RangeStratum:
     Attributes:
         low, high: Ends of the range in metres; the high one is not part of it.
         share: Share of all sampled observations.
-        cells: Cells that two views saw from there.
+        spots: Spots that two views saw from there.
         alpha: Alpha of these observations.
     """
 
     low: float
     high: float
     share: float
-    cells: int
+    spots: int
     alpha: Interval
 
 
@@ -147,12 +147,12 @@ class RangeAgreement:
 
 
 @dataclass(frozen=True)
-class CellAgreement:
-    """The observations that alpha rests on: labels of sampled cells, about as wide as a pixel's footprint.
+class SpotAgreement:
+    """The observations that alpha rests on: labels that views give spots of the surface.
 
     Attributes:
-        cell_size: Edge of a fine cell in metres.
-        cells: Fine cells that two views saw or more.
+        spacing: Edge in metres of the coarse cells that have a spot each.
+        spots: Spots that two views saw or more.
         cubes: Cubes of space that hold them.
         frames: Frames that were fused.
         views: Distinct views among them: a camera that stands still has one.
@@ -163,8 +163,8 @@ class CellAgreement:
         moving: The classes that move, where much of the disagreement is theirs; else None.
     """
 
-    cell_size: float
-    cells: int
+    spacing: float
+    spots: int
     cubes: int
     frames: int
     views: int
@@ -181,7 +181,7 @@ class CellAgreement:
         return 1 / self.chance if self.chance > 0 else math.nan
 
     def agreeing(self, alpha: float) -> float:
-        """Return the share of the spots at which two views see the same class, as an alpha of these cells has it."""
+        """Return the share of the spots at which two views see the same class, as an alpha of these spots has it."""
         return 1 - (1 - alpha) * (1 - self.chance)
 
     @property
@@ -193,7 +193,7 @@ class CellAgreement:
 
 @dataclass(frozen=True)
 class LagBin:
-    """Pairs of observations of a cell that are `low` to `high` apart, `mean` in the mean.
+    """Pairs of observations of a spot that are `low` to `high` apart, `mean` in the mean.
 
     Attributes:
         alpha: Of these pairs, beyond their own chance.

@@ -8,7 +8,7 @@ from typing import Literal
 
 from semstab.core.json_form import INLINE
 from semstab.data.measures import MeasureMeans
-from semstab.data.statistics.agreement import CellAgreement, Correlogram, FrameAgreement, RangeAgreement
+from semstab.data.statistics.agreement import Correlogram, FrameAgreement, RangeAgreement, SpotAgreement
 from semstab.data.statistics.correctness import CorrectnessStatistics, Losses
 from semstab.data.statistics.drift import DriftStatistics, Flipping, OutlyingFrames
 from semstab.data.statistics.intervals import Interval, short
@@ -57,7 +57,7 @@ class HeadlineStatistics:
     """The numbers that a verdict rests on, with intervals for the same scene flown again.
 
     If frames are not known, or too few to tell, the intervals are for these frames, as their `scope` says. alpha is
-    of sampled cells, NaN without them; psa and vss are of voxels, at OP >= 2 and OP >= 3; the last two are undefined
+    of spots, NaN without them; psa and vss are of voxels, at OP >= 2 and OP >= 3; the last two are undefined
     without ground truth.
     """
 
@@ -112,7 +112,7 @@ class MapStatistics:
     agreement: FrameAgreement
     flipping: Flipping | None
     headline: HeadlineStatistics
-    cells: CellAgreement | None
+    spots: SpotAgreement | None
     correlogram: Correlogram | None
     drift: DriftStatistics
     uncertainty: EntropyParts
@@ -132,8 +132,8 @@ class MapStatistics:
 
     @property
     def agreeing(self) -> float:
-        """The share of the spots at which two views see the same class; NaN without sampled cells."""
-        return math.nan if self.cells is None else self.cells.agreeing(self.headline.alpha.value)
+        """The share of the spots at which two views see the same class; NaN without spots."""
+        return math.nan if self.spots is None else self.spots.agreeing(self.headline.alpha.value)
 
     @property
     def order_known(self) -> bool:

@@ -11,13 +11,13 @@ from semstab.data.records import Record, Result
 from semstab.data.statistics import (
     CONFIDENCE,
     UNDEFINED,
-    CellAgreement,
     ClassAlpha,
     DriftStatistics,
     Estimate,
     MapStatistics,
     OutlyingFrames,
     RangeStratum,
+    SpotAgreement,
 )
 from semstab.metrics import macro_mean
 from semstab.report.means import by_model
@@ -45,7 +45,7 @@ def temporal_agreement(result: Result) -> list[Table]:
     """Return alpha with the data that it rests on, and the agreement at voxels, which depends on their size."""
     columns = (
         Column.of(ALPHA),
-        Column("cells", "Cells", 0),
+        Column("spots", "Spots", 0),
         Column("views", "Views", 0),
         Column("labelled_percent", "Labelled (%)", 0, "higher"),
         REPEATED,
@@ -56,9 +56,9 @@ def temporal_agreement(result: Result) -> list[Table]:
     )
     numbers: tuple[Number, ...] = (
         lambda stats: stats.headline.alpha.ends,
-        of_cells(lambda cells: cells.cells),
-        of_cells(lambda cells: cells.views),
-        of_cells(lambda cells: 100 * cells.labelled),
+        of_spots(lambda spots: spots.spots),
+        of_spots(lambda cells: cells.views),
+        of_spots(lambda cells: 100 * cells.labelled),
         lambda stats: stats.repeated.voxels,
         lambda stats: stats.agreement.vss.value,
         lambda stats: stats.agreement.psa,
@@ -118,7 +118,7 @@ def ranges(result: Result) -> list[Table]:
             (
                 f"{record.unit.scene}: {_from_to(row)}" if several else _from_to(row),
                 100 * row.share,
-                row.cells,
+                row.spots,
                 row.alpha,
             )
             for record, stats in rows
@@ -130,7 +130,7 @@ def ranges(result: Result) -> list[Table]:
         return []
     columns = (
         Column("range", "Range (m)"), Column("observations_percent", "Observations (%)", 1),
-        Column("cells", "Cells seen twice", 0), Column.of(ALPHA),
+        Column("spots", "Spots seen twice", 0), Column.of(ALPHA),
     )  # fmt: skip
     caption = (
         "The range of an observation is the distance from which a spot was seen; two of one spot count together where"
@@ -314,9 +314,9 @@ def ordered(take: Callable[[DriftStatistics], float | Estimate]) -> Number:
     return lambda stats: take(stats.drift) if stats.order_known else math.nan
 
 
-def of_cells(take: Callable[[CellAgreement], float]) -> Number:
+def of_spots(take: Callable[[SpotAgreement], float]) -> Number:
     """Return a function that takes a number of the sampled cells; NaN where there are none."""
-    return lambda stats: math.nan if stats.cells is None else take(stats.cells)
+    return lambda stats: math.nan if stats.spots is None else take(stats.spots)
 
 
 def _value(number: float | Estimate) -> float:
@@ -348,7 +348,7 @@ def grouped(rows: Iterable[T], name: Callable[[T], str]) -> dict[str, list[T]]:
 
 def _class_rows(assessed: Sequence[MapStatistics]) -> tuple[Row, ...]:
     by_name = grouped((row for stats in assessed for row in stats.agreement.classes), lambda row: row.name)
-    cells = (stats.cells for stats in assessed if stats.cells is not None)
+    cells = (stats.spots for stats in assessed if stats.spots is not None)
     alphas: dict[str, list[ClassAlpha]] = grouped((row for each in cells for row in each.classes), lambda row: row.name)
     return tuple(
         (
@@ -377,7 +377,7 @@ def _verdict_row(record: Record, stats: MapStatistics) -> Row:
         stats.verdict.level,
         100 * stats.verdict.probability,
         stats.headline.alpha.ends,
-        math.nan if stats.cells is None else 100 * stats.cells.labelled,
+        math.nan if stats.spots is None else 100 * stats.spots.labelled,
         UNDEFINED if right is None else right.quadrants.wrong_of_consistent.percent,
         stats.repeated.voxels,
         100 * stats.repeated.share,

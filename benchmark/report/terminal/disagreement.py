@@ -67,7 +67,7 @@ def class_means(records: Sequence[Record]) -> dict[str, tuple[float, float]]:
     """Return alpha of each class and its share of the disagreement, macro means over scenes, where both are known."""
     known: dict[str, list[tuple[float, float]]] = {}
     for statistics in (record.statistics for record in records if record.statistics is not None):
-        for row in () if statistics.cells is None else statistics.cells.classes:
+        for row in () if statistics.spots is None else statistics.spots.classes:
             if not (math.isnan(row.alpha.value) or math.isnan(row.disagreement)):
                 known.setdefault(row.name, []).append((row.alpha.value, row.disagreement))
     return {

@@ -59,12 +59,12 @@ def _verdict(run: UnitSummary) -> Iterator[str]:
             initial_indent="  ",
             subsequent_indent="  ",
         )
-    elif statistics.verdict.level == "uninformative" and statistics.cells is not None:
-        share, name = nearly_all(statistics.cells.largest_share), statistics.cells.largest_class
+    elif statistics.verdict.level == "uninformative" and statistics.spots is not None:
+        share, name = nearly_all(statistics.spots.largest_share), statistics.spots.largest_class
         yield f"  {share} of the observations are {name}: agreement does not assess such a map"
     else:
         yield LEVELS
-    silent = 0.0 if statistics.cells is None else 1 - statistics.cells.labelled
+    silent = 0.0 if statistics.spots is None else 1 - statistics.spots.labelled
     if statistics.verdict.level == "usable" and alpha.value >= LIMITS.stable and silent > 1 - LIMITS.labelled:
         yield f"  {percent(silent)} of the locations have no label in most frames: such a map is usable at most"
     if statistics.verdict.level == "undecided":

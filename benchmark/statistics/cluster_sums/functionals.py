@@ -3,11 +3,10 @@
 from __future__ import annotations
 
 import dataclasses
-import functools
 import math
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 
@@ -22,7 +21,7 @@ Statistic = Callable[[Float64], Float64]
 Scale = Literal["share", "agreement", "plain"]
 
 
-Part = Literal["map", "fine", "coarse"]
+Part = Literal["map", "near", "far"]
 
 
 def iou_of(sums: Float64) -> Float64:
@@ -52,7 +51,7 @@ class Functional:
         of: The number (...,) from these sums (..., C).
         low, high: Its range.
         scale: Scale of its interval: a 'share' or mean of numbers from 0 to 1, an 'agreement', at most 1, or 'plain'.
-        parts: The parts that its sums come from, each with its weight: a map, or sampled cells.
+        parts: The parts that its sums come from, each with its weight: a map, or spots.
         pairs: Names of the part of the first two sums that is of pairs alone, where the first is of pairwise
             agreement: at a location that two frames saw, neither frame has it for itself alone.
         pair_weight: Weight of an observation of these pairs in the first two sums.
@@ -77,14 +76,34 @@ class Functional:
         """Whether frames do not show how much it varies, so that its intervals are for these frames."""
         return self.by_location or set(self.names) <= set(WITHOUT_FRAMES)
 
-    def of_parts(self, sums: Iterable[Float64]) -> Float64:
-        """Return the number (...,) from the sums (..., C) of each of its parts."""
-        weighted = [weight * self.of(each) for (_, weight), each in zip(self.parts, sums, strict=True)]
-        return functools.reduce(np.add, weighted)
+
+SPOTS: tuple[tuple[Part, float], ...] = (("near", 1.0), ("far", -1.0))
+"""alpha + lever (alpha - alpha'), with alpha' of the second answers: agreement falls with the distance of the points that
+answer from the spot, to first order linearly, as a border of two classes lies between them. See `lever_of`."""
+
+LARGEST_LEVER = 2.0
 
 
-CELLS: tuple[tuple[Part, float], ...] = (("fine", 2.0), ("coarse", -1.0))
-"""2 alpha(h) - alpha(2 h): alpha falls with the size of cells, to first order linearly, as they mix more surfaces."""
+def lever_of(near: ClusterSums, far: ClusterSums) -> float:
+    """Return d / (d' - d), from root mean square distances d of the first and d' of the second answers from spots.
+
+    The line through alpha at d and alpha' at d' is read at 0. It is 0 if the second answers are the first ones.
+    """
+    return float(lever(*(part["square"].sum() for part in (near, far))))
+
+
+def lever(near: Any, far: Any) -> Float64:
+    """Return the lever (...,) from sums (...,) of squared distances of as many first and second answers."""
+    first, second = np.sqrt(near), np.sqrt(far)
+    with np.errstate(invalid="ignore", divide="ignore"):
+        ratio = np.where(second > first, first / (second - first), 0.0)
+    return np.minimum(ratio, LARGEST_LEVER)
+
+
+def alpha_of_spots(near: Float64, far: Float64) -> Float64:
+    """Return alpha (...,) from the sums (..., C + 1) of `ALPHA_SUMS` and squares of first and of second answers."""
+    first, second = alpha_of(near[..., :-1]), alpha_of(far[..., :-1])
+    return first + lever(near[..., -1], far[..., -1]) * (first - second)
 
 
 ALPHA_SUMS = ("agreeing", "observations", "own", "evidence")
@@ -93,7 +112,7 @@ PAIRS = ("twice_agreeing", "twice")
 
 FUNCTIONALS: Mapping[str, Functional] = {
     "psa": Functional(("psa", "voxels"), ratio_of, pairs=PAIRS, pair_weight=0.5),
-    "alpha": Functional(ALPHA_SUMS, alpha_of, -1.0, 1.0, "agreement", pairs=PAIRS, parts=CELLS),
+    "alpha": Functional(ALPHA_SUMS, alpha_of, -1.0, 1.0, "agreement", pairs=PAIRS, parts=SPOTS),
     "voxel_alpha": Functional(ALPHA_SUMS, alpha_of, -1.0, 1.0, "agreement", pairs=PAIRS),
     "vss": Functional(("vss", "recurrent"), ratio_of),
     "entropy": Functional(("entropy", "voxels"), ratio_of, by_location=True),
@@ -104,13 +123,13 @@ FUNCTIONALS: Mapping[str, Functional] = {
     "miou": Functional(("known", "known", "class_right", "class_known", "class_predicted"), miou_of, scale="plain"),
     "ece": Functional(("calibrated", "calibrated", "gap"), ece_of, scale="plain"),
 }
-"""Numbers by key: alpha, of cells that two views saw or more; PSA, Krippendorff's alpha of voxels and entropy at
+"""Numbers by key: alpha, of spots that two views saw or more; PSA, Krippendorff's alpha of voxels and entropy at
 OP >= 2, VSS at OP >= 3, SBD less that in random order where that is known; with ground truth the accuracy of the fused
 labels at OP >= 2 and of single observations, the wrong among the consistent locations at OP >= 3, mean intersection
 over union and expected calibration error at OP >= 2."""
 
 BY_CLASS: Mapping[str, Functional] = {
-    "alpha": Functional(CLASS_SUMS, class_alpha_of, -1.0, 1.0, "agreement", parts=CELLS),
+    "alpha": Functional(CLASS_SUMS, class_alpha_of, -1.0, 1.0, "agreement", parts=SPOTS),
     "voxel_alpha": Functional(CLASS_SUMS, class_alpha_of, -1.0, 1.0, "agreement"),
     "accuracy": Functional(("class_right", "class_known"), ratio_of),
     "precision": Functional(("class_right", "class_predicted"), ratio_of),
@@ -149,8 +168,12 @@ def functional(key: str | Functional, k: int | None = None) -> Functional:
 
 def parts_of(sums: ClusterSums, number: Functional) -> tuple[tuple[ClusterSums, float], ...]:
     """Return the sums that a number is of, each with its weight; none where they are missing."""
-    of = {"map": sums, "fine": sums.fine, "coarse": sums.coarse}
+    of = {"map": sums, "near": sums.near, "far": sums.far}
     present = [(part, weight) for name, weight in number.parts if (part := of[name]) is not None]
+    if number.parts == SPOTS and len(present) == len(SPOTS):
+        (near, _), (far, _) = present
+        lever = lever_of(near, far)
+        present = [(near, 1 + lever), (far, -lever)]
     known = all(set(number.names) <= set(part.layout) for part, _ in present)
     return tuple(present) if known and len(present) == len(number.parts) else ()
 
@@ -167,7 +190,9 @@ def value(sums: ClusterSums, key: str | Functional, k: int | None = None) -> flo
     """Return the number; NaN where undefined."""
     number = functional(key, k)
     parts = parts_of(sums, number)
-    return float(number.of_parts(columns_of(part, number).sum(axis=0) for part, _ in parts)) if parts else math.nan
+    if not parts:
+        return math.nan
+    return float(sum(weight * number.of(columns_of(part, number).sum(axis=0)) for part, weight in parts))
 
 
 def frames_of(sums: ClusterSums, key: str | Functional, k: int | None = None) -> int:
@@ -176,7 +201,7 @@ def frames_of(sums: ClusterSums, key: str | Functional, k: int | None = None) ->
     return parts[0][0].frame_count if parts else 0
 
 
-def chance_of(cells: ClusterSums) -> float:
+def chance_of(spots: ClusterSums) -> float:
     """Return the probability that two observations from anywhere, of different views, agree; NaN for fewer than two."""
-    evidence, n = cells["evidence"].sum(axis=0), float(cells["observations"].sum())
-    return float((evidence**2).sum() - cells["own"].sum()) / (n * (n - 1)) if n > 1 else math.nan
+    evidence, n = spots["evidence"].sum(axis=0), float(spots["observations"].sum())
+    return float((evidence**2).sum() - spots["own"].sum()) / (n * (n - 1)) if n > 1 else math.nan

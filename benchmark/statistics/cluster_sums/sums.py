@@ -18,15 +18,13 @@ from semstab.core import arrays as arrow
 from semstab.core.files import atomic_path, parse_json
 from semstab.core.json_form import from_json
 from semstab.core.types import Float64, Int32, Int64
-from semstab.data import earlier, parquet
+from semstab.data import parquet
 from semstab.data.measures import measures
 from semstab.errors import DataError
 from semstab.statistics.cluster_sums.columns import OF_TRUTH, column_names, layout, of_measure, side_by_side, width
 from semstab.statistics.cluster_sums.index import MOST_CELLS, ClusterIndex, distinct_rows
 
-SCHEMA = 5
-WITHOUT_CELLS = 2, 3
-"""Versions of files whose samples had no cells: only the sums of their maps are read."""
+SCHEMA = 6
 
 
 @dataclass(frozen=True, eq=False)
@@ -44,13 +42,13 @@ class ClusterSums:
             for sums that belong to none (`WITHOUT_FRAMES`).
         columns: (m, C) float64.
         layout: The columns of each name.
-        edge: Metres, a power of 2; that of cells is their own, so that alpha and its interval are the same whatever the
+        edge: Metres, a power of 2; that of spots is their own, so that alpha and its interval are the same whatever the
             voxels of the map.
         step: Frames of a group, a power of 2; 0 where they are unknown.
         voxel_size: Metres.
         fused: Number of frames that they come from.
-        fine, coarse: The same of sampled cells, which are units instead of voxels and views instead of frames, and of
-            cells twice as wide, where there are `CellObservations`.
+        near, far: The same of spots, which are units instead of voxels, and views, instead of frames: of their first
+            and of their second answers, if there are `SpotObservations`.
     """
 
     cell: Int32
@@ -62,8 +60,8 @@ class ClusterSums:
     voxel_size: float = math.nan
     classes: tuple[str, ...] = ()
     fused: int = 0
-    fine: ClusterSums | None = None
-    coarse: ClusterSums | None = None
+    near: ClusterSums | None = None
+    far: ClusterSums | None = None
 
     @classmethod
     def of_cubes(cls, cell: npt.NDArray[np.integer], edge: float, sums: Mapping[str, Float64]) -> ClusterSums:
@@ -127,16 +125,15 @@ class ClusterSums:
         return len(self.index.cubes)
 
     def coarsened(self, edge: float, step: int) -> ClusterSums:
-        """Return the sums of larger cubes, or groups of frames; step 0 forgets the frames of the map, not of its cells.
+        """Return the sums of larger cubes, or groups of frames; step 0 forgets the frames of the map, not of its spots.
 
-        Cubes of the cells are then at least as large as cubes of the map.
+        Cubes of the spots are then at least as large as cubes of the map.
         """
-        cells = (part and part.coarsened(max(edge, part.edge), part.step) for part in (self.fine, self.coarse))
-        fine, coarse = cells
-        return dataclasses.replace(self._map_coarsened(edge, step), fine=fine, coarse=coarse)
+        near, far = (part and part.coarsened(max(edge, part.edge), part.step) for part in (self.near, self.far))
+        return dataclasses.replace(self._map_coarsened(edge, step), near=near, far=far)
 
     def _map_coarsened(self, edge: float, step: int) -> ClusterSums:
-        """Return the sums of the map in larger cubes or groups of frames, with the sums of cells unchanged."""
+        """Return the sums of the map in larger cubes or groups of frames, with the sums of spots unchanged."""
         cell = _joined(self.cell, edge / self.edge)
         known = step and self.step
         frame = _joined(self.frame, step // self.step) if known else np.full(len(cell), -1)
@@ -164,7 +161,7 @@ class ClusterSums:
         import pyarrow as pa
         import pyarrow.parquet as pq
 
-        parts = [part for part in (self, self.fine, self.coarse) if part is not None]
+        parts = [part for part in (self, self.near, self.far) if part is not None]
         about = {name: getattr(self, name) for name in ("K", "classes", "truth")}
         about |= {name: [getattr(part, name) for part in parts] for name in ("edge", "step", "voxel_size", "fused")}
         lengths = [len(part.frame) for part in parts]
@@ -194,14 +191,11 @@ class ClusterSums:
                 content = file.read()
             about = parse_json((content.schema.metadata or {})[b"semstab"])
             kind, version = about.pop("kind"), about.pop("schema")
-            old = (kind, version) in (("InfluenceSums", each) for each in WITHOUT_CELLS)
-            if not old and (kind, version) != ("ClusterSums", SCHEMA):
+            if (kind, version) != ("ClusterSums", SCHEMA):
                 raise DataError("it is of another kind or version")
-            if old:
-                about |= {name: [about.get(name, 0)] for name in ("edge", "step", "voxel_size", "fused")}
             meta = from_json(SumsMeta, about, path)
             part, *keys = (_key(arrow.values_of(content.column(name)), name) for name in KEYS)
-            names = [earlier.SUMS.get(name, name) for name in content.column_names] if old else content.column_names
+            names = content.column_names
             if len(names) < meta.K:
                 raise DataError(f"{len(names) - len(KEYS)} columns of sums for {meta.K} classes")
             stored = dict(zip(names, content.columns, strict=True))
@@ -223,12 +217,12 @@ class ClusterSums:
                 cell, frame = np.stack([key[rows] for key in keys[:3]], axis=1), keys[3][rows]
                 where = cell.astype(np.int32), frame.astype(np.int32), columns[rows, : width(its_layout)]
                 parts.append(cls(*where, its_layout, edge, step, voxel_size, meta.classes, fused))
-        whole, *cells = parts
-        return dataclasses.replace(whole, fine=cells[0], coarse=cells[1]) if cells else whole
+        whole, *spots = parts
+        return dataclasses.replace(whole, near=spots[0], far=spots[1]) if spots else whole
 
 
 KEYS = ("part", "ix", "iy", "iz", "frame")
-"""The columns of the file before the sums; part 0 is the map, 1 the fine cells, 2 the coarse ones."""
+"""The columns of the file before the sums; part 0 is the map, 1 the first and 2 the second answers of spots."""
 
 
 LARGEST = 2.0**30
@@ -250,7 +244,7 @@ class SumsMeta:
     def __post_init__(self) -> None:
         parts = {len(each) for each in (self.edge, self.step, self.voxel_size, self.fused)}
         if not (parts <= {1} or parts <= {3}):
-            raise DataError("sums of other parts than a map, fine and coarse cells")
+            raise DataError("sums of other parts than a map, and two answers of spots")
         sizes = all(0 < size < math.inf for size in self.voxel_size)
         if not (sizes and self.K > 0 and len(self.classes) in (0, self.K)):
             raise DataError(f"{self.K} classes, {len(self.classes)} names, voxels of {self.voxel_size[0]:g} m")
@@ -276,7 +270,7 @@ def _key(values: npt.NDArray[Any], name: str) -> npt.NDArray[Any]:
 
 
 def aligned(*parts: ClusterSums) -> tuple[ClusterSums, ...]:
-    """Return the sums, of maps and of their cells, at the finest cubes and groups of frames that all of them have.
+    """Return the sums, of maps and of their spots, at the finest cubes and groups of frames that all of them have.
 
     Raises:
         DataError: If they have different columns.
@@ -286,8 +280,8 @@ def aligned(*parts: ClusterSums) -> tuple[ClusterSums, ...]:
     edge, steps = max(part.edge for part in parts), [part.step for part in parts]
     step = max(steps) if all(steps) else 0
     same = [part if (part.edge, part.step) == (edge, step) else part._map_coarsened(edge, step) for part in parts]
-    fine, coarse = [part.fine for part in same if part.fine], [part.coarse for part in same if part.coarse]
-    if len(fine) < len(same) or len(coarse) < len(same):
+    near, far = [part.near for part in same if part.near], [part.far for part in same if part.far]
+    if len(near) < len(same) or len(far) < len(same):
         return tuple(same)
-    cells = zip(same, aligned(*fine), aligned(*coarse), strict=True)
-    return tuple(dataclasses.replace(part, fine=one, coarse=two) for part, one, two in cells)
+    spots = zip(same, aligned(*near), aligned(*far), strict=True)
+    return tuple(dataclasses.replace(part, near=one, far=two) for part, one, two in spots)

@@ -18,11 +18,11 @@ def agreement(log, a, b):
 
 
 @serial
-def add_pairs(first, second, bins, cluster, log, sums):
-    """Add pairs (m,) of observations to `sums` (bins, clusters, 3 + K), in each of a pair's bins (m, axes).
+def add_pairs(first, second, bins, cluster, log, square, sums):
+    """Add pairs (m,) of observations to `sums` (bins, clusters, 4 + K), in each of a pair's bins (m, axes).
 
-    Either observation adds s . s', 1, ||s||^2 and s to its cluster; cluster (n,) is that of each observation, log is
-    (starts, label, weight) of all of them.
+    Either observation adds s . s', 1, ||s||^2, s and its squared distance from the spot, square (n,), to its cluster;
+    cluster (n,) is that of each observation, log is (starts, label, weight) of all of them.
     """
     starts, label, weight = log
     for pair in range(first.shape[0]):
@@ -36,6 +36,7 @@ def add_pairs(first, second, bins, cluster, log, sums):
                 sums[k, of, 2] += own
                 for e in range(starts[one], starts[one + 1]):
                     sums[k, of, 3 + label[e]] += weight[e]
+                sums[k, of, sums.shape[2] - 1] += square[one]
 
 
 @serial

@@ -1,4 +1,4 @@
-"""Alpha of each class on sampled cells, its share of the disagreement, and classes that move."""
+"""Alpha of each class at spots, its share of the disagreement, and classes that move."""
 
 from __future__ import annotations
 
@@ -10,57 +10,57 @@ import numpy as np
 from semstab.core.types import THIS_SCENE, Float64, Scope
 from semstab.data import labels
 from semstab.data.measures import dominant
-from semstab.data.statistics import CellAgreement, ClassAlpha, MovingClasses
+from semstab.data.statistics import ClassAlpha, MovingClasses, SpotAgreement
 from semstab.data.voxels import VoxelTable
-from semstab.statistics.accumulate import sums_of_cells
+from semstab.statistics.accumulate import sums_of_spots
 from semstab.statistics.cluster_sums import MOST_CLASSES, ClusterSums, chance_of, value
 from semstab.statistics.intervals import confidence_intervals, probability_above, scope_of, spec_of
-from semstab.statistics.observations import CellObservations
+from semstab.statistics.observations import SpotObservations
 from semstab.statistics.verdict import LIMITS, Limits
 
 LITTLE, MUCH = 0.01, 0.1
 """The shares of the disagreement from which on a class that moves, and all of them together, are analysed."""
 
 
-def cell_agreement(
-    cells: CellObservations,
+def spot_agreement(
+    spots: SpotObservations,
     sums: ClusterSums,
     table: VoxelTable,
     scope: Scope = THIS_SCENE,
     critical: Sequence[str] = (),
     limits: Limits = LIMITS,
-) -> CellAgreement:
+) -> SpotAgreement:
     """Return alpha of each class, with the observations that alpha rests on.
 
     Args:
-        cells: Labels of sampled cells.
-        sums: Sums of the map with these cells.
+        spots: Labels that views give spots.
+        sums: Sums of the map with these spots.
         table: The map, by which locations of a class are counted.
         scope: Scope of the intervals, where there are enough views for it.
         critical: Classes that the verdict depends on; where none is named, those with enough locations.
         limits: Limits of the verdict.
     """
-    fine = sums.fine
-    assert fine is not None
+    near = sums.near
+    assert near is not None
     names, named = sums.classes or tuple(str(k) for k in range(table.K)), set(critical) & set(sums.classes)
     locations = np.bincount(dominant(table)[table.op >= 2], minlength=table.K).tolist()
-    scope_of_cells, evidence = scope_of(sums, scope), fine["evidence"].sum(axis=0)
+    scope_of_spots, evidence = scope_of(sums, scope), near["evidence"].sum(axis=0)
     alphas = confidence_intervals(
-        spec_of(sums, "alpha", k, scope_of_cells) for k in range(table.K) if table.K <= MOST_CLASSES
+        spec_of(sums, "alpha", k, scope_of_spots) for k in range(table.K) if table.K <= MOST_CLASSES
     )
-    n, largest = float(fine["observations"].sum()), int(evidence.argmax())
+    n, largest = float(near["observations"].sum()), int(evidence.argmax())
     disagreement = _disagreement(evidence / n if n else evidence, np.array([alpha.value for alpha in alphas]))
     moving = [k for k in labels.moving(names) if k < len(disagreement) and disagreement[k] >= LITTLE]
-    return CellAgreement(
-        cell_size=cells.coarsening * cells.cell_size,
-        cells=round(float(fine["voxels"].sum())),
-        cubes=fine.cells,
-        frames=cells.frames,
-        views=len(cells.views),
-        chance=chance_of(fine),
+    return SpotAgreement(
+        spacing=spots.spacing,
+        spots=round(float(near["voxels"].sum())),
+        cubes=near.cells,
+        frames=spots.frames,
+        views=len(spots.views),
+        chance=chance_of(near),
         largest_class=names[largest],
         largest_share=float(evidence[largest]) / n if n else math.nan,
-        labelled=cells.labelled_share(),
+        labelled=spots.labelled_share(),
         classes=tuple(
             ClassAlpha(
                 name,
@@ -72,23 +72,23 @@ def cell_agreement(
             )
             for k, (name, alpha) in enumerate(zip(names, alphas, strict=False))
         ),
-        moving=moving_classes(cells, sums, moving) if disagreement[moving].sum() >= MUCH else None,
+        moving=moving_classes(spots, sums, moving) if disagreement[moving].sum() >= MUCH else None,
     )
 
 
-def moving_classes(cells: CellObservations, sums: ClusterSums, moving: Sequence[int]) -> MovingClasses | None:
+def moving_classes(spots: SpotObservations, sums: ClusterSums, moving: Sequence[int]) -> MovingClasses | None:
     """Return the share of the disagreement at locations of these classes, and alpha without them; None without any.
 
-    The sums are of all cells.
+    The sums are of all spots.
     """
 
     def disagreeing(of: ClusterSums, alpha: float) -> float:
-        fine = of.fine
-        assert fine is not None
-        return float(fine["observations"].sum()) * (1 - alpha) * (1 - chance_of(fine))
+        near = of.near
+        assert near is not None
+        return float(near["observations"].sum()) * (1 - alpha) * (1 - chance_of(near))
 
-    rest = sums_of_cells(cells.without(moving))
-    whole, alpha = (min(value(each, "alpha"), 1.0) for each in (sums, rest))  # extrapolated to cells without a size
+    rest = sums_of_spots(spots.without(moving))
+    whole, alpha = (min(value(each, "alpha"), 1.0) for each in (sums, rest))  # extrapolated to the spot itself
     if not (everywhere := disagreeing(sums, whole)) > 0:
         return None
     share = 1 - disagreeing(rest, alpha) / everywhere

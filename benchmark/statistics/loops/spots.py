@@ -1,0 +1,597 @@
+"""Compiled passes over spots of the surface: new ones in a frame's depth, and the pixels that answer for them.
+
+On a plane, inverse depth is linear in image coordinates. So the depth that a frame shows at a spot, between the centres
+of its pixels, follows from a pixel and its slope, however steeply the surface is seen.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from semstab.core.compiled import serial
+
+BITS = 21
+"""Bits of a coarse cell's index along each axis in its key."""
+
+SPAN = 1 << BITS
+
+ALONG_X, ALONG_Y, ALONG_Z = np.uint32(0xD1B54A33), np.uint32(0xABC98389), np.uint32(0x8CB92BA7)
+"""Weights of a cell's indices in its hash: 2^32 / g^k of the root g of g^4 = g + 1, so that along no line and in no
+plane the same sum comes again soon (Roberts 2018, The Unreasonable Effectiveness of Quasirandom Sequences)."""
+
+GOLDEN = np.uint64(0x9E3779B97F4A7C15)
+EMPTY = np.int64(-1)
+
+PLACES, MOST_PLACES = 3.0, np.int64(64)
+"""Places that are looked at in the area of a coarse cell's face, so that few cells are left out by chance; and the most
+of them for one pixel, or point of a scan."""
+
+STEEPEST = 32.0
+"""Largest area that a pixel shows, in those that it would show if the surface faced it."""
+
+ON_A_PLANE = 0.03
+"""Sparse points lie on a plane if it leaves at most this over of their inverse depth, relative."""
+
+NEXT = 2.25
+"""The squared distance of a point in the next pixel, of 1.5 pixels."""
+
+
+@serial
+def mixed(number):
+    """Return a hash of 32 bits, lowbias32 (Wellons 2018, Prospecting for Hash Functions)."""
+    h = np.uint32(number)
+    h = np.uint32((h ^ (h >> np.uint32(16))) * np.uint32(0x7FEB352D))
+    h = np.uint32((h ^ (h >> np.uint32(15))) * np.uint32(0x846CA68B))
+    return np.uint32(h ^ (h >> np.uint32(16)))
+
+
+@serial
+def hash_cell(x, y, z):
+    """Return the hash of a coarse cell, the same in each run."""
+    weighted = np.uint32(np.uint32(x) * ALONG_X) + np.uint32(np.uint32(y) * ALONG_Y) + np.uint32(np.uint32(z) * ALONG_Z)
+    return mixed(np.uint32(weighted))
+
+
+@serial
+def fraction(number):
+    """Return a number from 0 to 1, without both, from a hash."""
+    return (np.float64(mixed(number)) + 0.5) / 4294967296.0
+
+
+@serial
+def inverse(depth, row, column):
+    """Return the inverse depth of a pixel; 0 without valid depth and outside of the image."""
+    if row < 0 or column < 0 or row >= depth.shape[0] or column >= depth.shape[1]:
+        return 0.0
+    d = np.float64(depth[row, column])
+    return 1.0 / d if 0.0 < d < np.inf else 0.0
+
+
+@serial
+def slope(before, here, after):
+    """Return the slope of inverse depth by the minmod limiter: the smaller of both sides, 0 at an edge or a peak."""
+    left, right = here - before, after - here
+    if before > 0.0 and after > 0.0:
+        if left * right <= 0.0:
+            return 0.0
+        return left if abs(left) < abs(right) else right
+    if before > 0.0:
+        return left if abs(left) < 0.5 * here else 0.0
+    if after > 0.0:
+        return right if abs(right) < 0.5 * here else 0.0
+    return 0.0
+
+
+@serial
+def slopes(depth, row, column, here):
+    """Return the slopes of inverse depth along a row and along a column."""
+    return (
+        slope(inverse(depth, row, column - 1), here, inverse(depth, row, column + 1)),
+        slope(inverse(depth, row - 1, column), here, inverse(depth, row + 1, column)),
+    )
+
+
+# --- New spots --------------------------------------------------------------------------------------------------------
+
+
+@serial
+def is_new(table, key, added):
+    """Return whether a table with open addressing lacks a key, which may then be added; its size is a power of 2."""
+    mask = np.uint64(len(table) - 1)
+    slot = (np.uint64(key) * GOLDEN >> np.uint64(20)) & mask
+    while table[slot] != EMPTY:
+        if table[slot] == key:
+            return False
+        slot = (slot + np.uint64(1)) & mask
+    if added:
+        table[slot] = key
+    return True
+
+
+@serial
+def fill(point, edge, low, table):
+    """Add the coarse cells of points (n, 3) to a table."""
+    for i in range(len(point)):
+        a = np.int64(np.floor(point[i, 0] / edge)) - low[0]
+        b = np.int64(np.floor(point[i, 1] / edge)) - low[1]
+        c = np.int64(np.floor(point[i, 2] / edge)) - low[2]
+        is_new(table, (a << (2 * BITS)) | (b << BITS) | c, True)
+
+
+@serial
+def in_world(x, y, z, T):
+    """Return a point of the sensor in the world."""
+    return (
+        T[0, 0] * x + T[0, 1] * y + T[0, 2] * z + T[0, 3],
+        T[1, 0] * x + T[1, 1] * y + T[1, 2] * z + T[1, 3],
+        T[2, 0] * x + T[2, 1] * y + T[2, 2] * z + T[2, 3],
+    )
+
+
+@serial
+def free(px, py, pz, edge, share, low, table, taken):
+    """Return the hash of a point's coarse cell if it is in the sample and has no spot, else -1; it is taken if so."""
+    i, j, k = np.int64(np.floor(px / edge)), np.int64(np.floor(py / edge)), np.int64(np.floor(pz / edge))
+    own = np.int64(hash_cell(i, j, k))
+    if own >= share:
+        return np.int64(-1)
+    a, b, c = i - low[0], j - low[1], k - low[2]
+    if a < 0 or b < 0 or c < 0 or a >= SPAN or b >= SPAN or c >= SPAN:
+        return np.int64(-1)
+    return own if is_new(table, (a << (2 * BITS)) | (b << BITS) | c, taken) else np.int64(-1)
+
+
+@serial
+def area(here, along_x, along_y, x, y, fx, fy):
+    """Return the area of the surface that a pixel at ray (x, y, 1) shows, m^2, from inverse depth and its slopes.
+
+    Inverse depth of a plane n . X = 1 is n . (x, y, 1). So n follows from the slopes, and the area is z^3 |n| / (fx fy);
+    at most as at an angle of incidence of about 88 degrees.
+    """
+    nx, ny = along_x * fx, along_y * fy
+    nz = here - nx * x - ny * y
+    normal = np.sqrt(nx * nx + ny * ny + nz * nz)
+    return min(normal, STEEPEST * here) / (here * here * here * fx * fy)
+
+
+@serial
+def number_of(expected, chance):
+    """Return how many places to look at if `expected` are expected, by a number from 0 to 1; at most MOST_PLACES."""
+    return min(np.int64(np.floor(expected + chance)), MOST_PLACES)
+
+
+@serial
+def new_in_image(depth, camera, T, edge, share, low, stride, factor, seed, table, point, hashed):
+    """Add spots where an image shows a coarse cell without one; return how many.
+
+    Places are looked at evenly over the surface, PLACES in the area of a coarse cell's face: in blocks of stride x
+    stride pixels, in an order that jumps over the image by `factor`, as many as the area that a pixel shows asks for.
+    A place lies anywhere in its pixel, so that the view that finds a spot meets it as any other view does.
+    """
+    H, W = depth.shape
+    fx, fy, cx, cy = camera
+    columns = (W + stride - 1) // stride
+    total, n, at = (H + stride - 1) // stride * columns, 0, np.int64(0)
+    for _ in range(total):
+        at += factor
+        if at >= total:
+            at -= total
+        top, left = stride * (at // columns), stride * (at % columns)
+        number = np.uint32(np.uint32(seed) ^ (np.uint32(at) * np.uint32(0x85EBCA6B)))
+        places, done = np.int64(1), np.int64(0)
+        while done < places:
+            number = mixed(np.uint32(number + np.uint32(0x9E3779B9)))
+            v = top + stride * fraction(number)
+            u = left + stride * fraction(np.uint32(number ^ np.uint32(0x27D4EB2F)))
+            row, column = np.int64(v), np.int64(u)
+            v, u = v - 0.5, u - 0.5
+            here = inverse(depth, row, column)
+            done += 1
+            if here == 0.0:
+                continue
+            along_x, along_y = slopes(depth, row, column, here)
+            if done == 1:
+                shown = area(here, along_x, along_y, (column - cx) / fx, (row - cy) / fy, fx, fy) * stride * stride
+                places = number_of(PLACES * shown / (edge * edge), fraction(np.uint32(number ^ np.uint32(0x165667B1))))
+                if places == 0:
+                    continue
+            there = here + along_x * (u - column) + along_y * (v - row)
+            z = 1.0 / (there if there > 0.5 * here else here)
+            px, py, pz = in_world((u - cx) / fx * z, (v - cy) / fy * z, z, T)
+            own = free(px, py, pz, edge, share, low, table, True)
+            if own >= 0:
+                point[n, 0], point[n, 1], point[n, 2], hashed[n] = px, py, pz, own
+                n += 1
+                if n == len(hashed):
+                    return n
+    return n
+
+
+# --- Answers of an image ----------------------------------------------------------------------------------------------
+
+
+@serial
+def project(point, depth, camera, T, spot, x, y, error, room):
+    """Find the spots that fall on a pixel with depth, in front of the camera; return how many.
+
+    For each it writes its number, its image coordinates, how much nearer than the spot the surface is (relative), and
+    `room`: by how much the surface's slope changes that within a pixel.
+    """
+    H, W = depth.shape
+    fx, fy, cx, cy = camera
+    n = 0
+    for i in range(len(point)):
+        a, b, c = point[i, 0] - T[0, 3], point[i, 1] - T[1, 3], point[i, 2] - T[2, 3]
+        z = T[0, 2] * a + T[1, 2] * b + T[2, 2] * c
+        if not z > 1e-9:
+            continue
+        u = (T[0, 0] * a + T[1, 0] * b + T[2, 0] * c) / z * fx + cx
+        v = (T[0, 1] * a + T[1, 1] * b + T[2, 1] * c) / z * fy + cy
+        if not (-0.5 <= u < W - 0.5 and -0.5 <= v < H - 0.5):
+            continue
+        column, row = np.int64(np.floor(u + 0.5)), np.int64(np.floor(v + 0.5))
+        here = inverse(depth, row, column)
+        if here == 0.0:
+            continue
+        along_x, along_y = slopes(depth, row, column, here)
+        spot[n], x[n], y[n] = i, u, v
+        error[n] = (here + along_x * (u - column) + along_y * (v - row)) * z - 1.0
+        room[n] = (abs(along_x) + abs(along_y)) * z
+        n += 1
+    return n
+
+
+@serial
+def own_label(labels, unlabelled, row, column, K):
+    """Return the label of a pixel: K for none, K + 1 for a pixel that is left out and does not answer."""
+    label = np.int64(labels[row, column])
+    if label < K:
+        return label
+    return np.int64(K) if unlabelled.shape[0] and unlabelled[row, column] else np.int64(K + 1)
+
+
+@serial
+def answer(spot, x, y, error, room, allowed, slack, depth, labels, unlabelled, K, camera, seed, out, near, far, square):
+    """Write the answers of the pixels that show a spot: its number, two labels, and two squared distances, metres^2.
+
+    A pixel shows a spot if both are at the same depth, but for `allowed` (relative) and `slack` of the slope. The first
+    label is that of the pixel which the spot falls into, the second one that of a pixel next to it, if it shows the
+    same surface. The distances are those of the pixels' centres from the spot, across the ray. unlabelled (H, W) marks
+    pixels to which the model gave no label; (0, 0) without such pixels. Returns the number of answers.
+    """
+    fx, fy, _, _ = camera
+    n = 0
+    for i in range(len(spot)):
+        if abs(error[i]) > allowed + slack * room[i]:
+            continue
+        column, row = np.int64(np.floor(x[i] + 0.5)), np.int64(np.floor(y[i] + 0.5))
+        own, here = own_label(labels, unlabelled, row, column, K), inverse(depth, row, column)
+        other, dx, dy = own, column - x[i], row - y[i]
+        ex, ey = dx, dy
+        side = mixed(np.uint32(np.uint32(seed) ^ np.uint32(spot[i])))
+        sign = np.int64(1) if side & np.uint32(2) else np.int64(-1)
+        step_x, step_y = (sign, np.int64(0)) if side & np.uint32(1) else (np.int64(0), sign)
+        there = inverse(depth, row + step_y, column + step_x)
+        if there > 0.0 and own < K:
+            along_x, along_y = slopes(depth, row, column, here)
+            expected = here + along_x * step_x + along_y * step_y
+            its = own_label(labels, unlabelled, row + step_y, column + step_x, K)
+            if its < K and abs(there - expected) <= (1.5 * allowed + slack * room[i]) * here:
+                other, ex, ey = its, dx + step_x, dy + step_y
+        out[n], near[n], far[n] = spot[i], own, other
+        square[n, 0] = ((dx / fx) ** 2 + (dy / fy) ** 2) / (here * here)
+        square[n, 1] = ((ex / fx) ** 2 + (ey / fy) ** 2) / (here * here)
+        n += 1
+    return n
+
+
+# --- Sparse depth: points of a scan, or of one that is drawn into an image --------------------------------------------
+
+
+@serial
+def directions(points, unit, u, v, w):
+    """Write direction (azimuth, elevation) in units of radians, and inverse range, of points (n, 3); 0 of invalid ones."""
+    for i in range(len(points)):
+        x, y, z = np.float64(points[i, 0]), np.float64(points[i, 1]), np.float64(points[i, 2])
+        distance = np.sqrt(x * x + y * y + z * z)
+        if not (0.0 < distance < np.inf):
+            w[i] = 0.0
+            continue
+        u[i], v[i] = (np.arctan2(y, x) + np.pi) / unit, (np.arcsin(z / distance) + 0.5 * np.pi) / unit
+        w[i] = 1.0 / distance
+
+
+@serial
+def drawn(u, v, w, grid):
+    """Write into `grid` (rows, columns) the number of the point in each pixel, the nearest one; -1 without any."""
+    grid[:] = -1
+    rows, columns = grid.shape
+    for i in range(len(w)):
+        if w[i] > 0.0:
+            row, column = min(np.int64(v[i] + 0.5), rows - 1), np.int64(u[i] + 0.5)
+            column = column - columns if column >= columns else column
+            there = grid[row, column]
+            if there < 0 or w[i] > w[there]:
+                grid[row, column] = i
+
+
+@serial
+def surface(grid, u, v, w, x, y, reach, around):
+    """Return what points around (x, y) say of the surface there, by a plane through their inverse depth.
+
+    reach is in pixels; around is True if the columns of the image close a circle. It returns the inverse depth, 0
+    where there is no plane; the root mean square of what the plane leaves over, relative; the number of the nearest
+    point, -1 without any; the squared distance to it in pixels; and the slopes of the plane in a pixel, relative.
+    """
+    rows, columns = grid.shape
+    column, row = np.int64(np.floor(x + 0.5)), np.int64(np.floor(y + 0.5))
+    nearest, least, reference = np.int64(-1), 1e18, 0.0
+    for b in range(max(row - reach, 0), min(row + reach + 1, rows)):
+        for a in range(column - reach, column + reach + 1):
+            at = a % columns if around else a
+            if at < 0 or at >= columns or grid[b, at] < 0:
+                continue
+            i = grid[b, at]
+            dx, dy = u[i] - x, v[i] - y
+            if around:
+                dx = dx - columns * np.round(dx / columns)
+            distance = dx * dx + dy * dy
+            if distance < least:
+                nearest, least, reference = np.int64(i), distance, w[i]
+    if nearest < 0:
+        return 0.0, 0.0, nearest, least, 0.0, 0.0
+    n = sx = sy = sw = sxx = sxy = syy = sxw = syw = sww = 0.0
+    for b in range(max(row - reach, 0), min(row + reach + 1, rows)):
+        for a in range(column - reach, column + reach + 1):
+            at = a % columns if around else a
+            if at < 0 or at >= columns or grid[b, at] < 0:
+                continue
+            i = grid[b, at]
+            dx, dy, dw = u[i] - x, v[i] - y, w[i] / reference - 1.0
+            if around:
+                dx = dx - columns * np.round(dx / columns)
+            n += 1.0
+            sx, sy, sw = sx + dx, sy + dy, sw + dw
+            sxx, sxy, syy = sxx + dx * dx, sxy + dx * dy, syy + dy * dy
+            sxw, syw, sww = sxw + dx * dw, syw + dy * dw, sww + dw * dw
+    if n < 4.0:
+        return 0.0, 0.0, nearest, least, 0.0, 0.0
+    mx, my, mw = sx / n, sy / n, sw / n
+    cxx, cxy, cyy = sxx / n - mx * mx, sxy / n - mx * my, syy / n - my * my
+    cxw, cyw, cww = sxw / n - mx * mw, syw / n - my * mw, sww / n - mw * mw
+    det = cxx * cyy - cxy * cxy
+    if not det > 1e-3 * (cxx + cyy) ** 2:
+        return 0.0, 0.0, nearest, least, 0.0, 0.0
+    along_x, along_y = (cyy * cxw - cxy * cyw) / det, (cxx * cyw - cxy * cxw) / det
+    left = max(cww - along_x * cxw - along_y * cyw, 0.0)
+    there = (1.0 + mw - along_x * mx - along_y * my) * reference
+    scale = reference / there if there > 0.0 else 0.0
+    return there, np.sqrt(left), nearest, least, along_x * scale, along_y * scale
+
+
+@serial
+def new_in_points(
+    grid, u, v, w, camera, around, reach, allowed, T, edge, share, low, factor, seed, table, point, hashed
+):
+    """Add spots where points show a coarse cell without one; return how many.
+
+    Places are looked at evenly over the surface, as in `new_in_image`: on the plane through the points around a point,
+    up to half of `spacing` (pixels) away from it; at the point itself if there is no plane.
+    """
+    total, n, at = len(w), 0, np.int64(0)
+    fx, fy, cx, cy = camera
+    for _ in range(total):
+        at += factor
+        if at >= total:
+            at -= total
+        if w[at] == 0.0:
+            continue
+        number = np.uint32(np.uint32(seed) ^ (np.uint32(at) * np.uint32(0x85EBCA6B)))
+        there, left, _, _, along_x, along_y = surface(grid, u, v, w, u[at], v[at], reach, around)
+        plane = there > 0.0 and left <= allowed
+        if plane:
+            if around:
+                narrow = max(np.cos(v[at] / fy - 0.5 * np.pi), 1e-3)
+                normal = np.sqrt(1.0 + (along_x * fx / narrow) ** 2 + (along_y * fy) ** 2)
+                shown = min(normal, STEEPEST) * narrow / (w[at] * w[at] * fx * fy)
+            else:
+                x, y = (u[at] - cx) / fx, (v[at] - cy) / fy
+                shown = area(w[at], along_x * w[at], along_y * w[at], x, y, fx, fy)
+        else:
+            shown = 1.0 / (w[at] * w[at] * fx * fy)
+        shown *= spacing * spacing
+        places = number_of(PLACES * shown / (edge * edge), fraction(np.uint32(number ^ np.uint32(0x165667B1))))
+        for k in range(places):
+            number = mixed(np.uint32(number + np.uint32(0x9E3779B9)))
+            x, y, here = u[at], v[at], w[at]
+            if plane:
+                dx = (fraction(number) - 0.5) * spacing
+                dy = (fraction(np.uint32(number ^ np.uint32(0x27D4EB2F))) - 0.5) * spacing
+                near = there * (1.0 + along_x * dx + along_y * dy)
+                if near > 0.5 * here:
+                    x, y, here = x + dx, y + dy, near
+            px, py, pz = in_world(*back(x, y, here, camera, around), T)
+            own = free(px, py, pz, edge, share, low, table, True)
+            if own >= 0:
+                point[n, 0], point[n, 1], point[n, 2], hashed[n] = px, py, pz, own
+                n += 1
+                if n == len(hashed):
+                    return n
+    return n
+
+
+@serial
+def back(x, y, w, camera, around):
+    """Return the point of the sensor at image coordinates and inverse depth, or inverse range of a scan."""
+    fx, fy, cx, cy = camera
+    if around:
+        azimuth, elevation = x / fx - np.pi, y / fy - 0.5 * np.pi
+        flat = np.cos(elevation) / w
+        return flat * np.cos(azimuth), flat * np.sin(azimuth), np.sin(elevation) / w
+    return (x - cx) / fx / w, (y - cy) / fy / w, 1.0 / w
+
+
+@serial
+def project_sparse(point, grid, u, v, w, camera, around, reach, T, spot, x, y, error, room, nearest):
+    """Find the spots that points around show; return how many. As `project`, and `nearest` takes the nearest point.
+
+    A plane through the points around tells the depth there; where they lie on no plane, as at an edge, the nearest point
+    does, if it is the next pixel. `room` is the slope of the plane in a pixel, relative.
+    """
+    rows, columns = grid.shape
+    fx, fy, cx, cy = camera
+    n = 0
+    for i in range(len(point)):
+        a, b, c = point[i, 0] - T[0, 3], point[i, 1] - T[1, 3], point[i, 2] - T[2, 3]
+        X = T[0, 0] * a + T[1, 0] * b + T[2, 0] * c
+        Y = T[0, 1] * a + T[1, 1] * b + T[2, 1] * c
+        Z = T[0, 2] * a + T[1, 2] * b + T[2, 2] * c
+        distance = np.sqrt(X * X + Y * Y + Z * Z) if around else Z
+        if not distance > 1e-9:
+            continue
+        if around:
+            p, q = (np.arctan2(Y, X) + np.pi) * fx, (np.arcsin(Z / distance) + 0.5 * np.pi) * fy
+        else:
+            p, q = X / Z * fx + cx, Y / Z * fy + cy
+            if not (-0.5 <= p < columns - 0.5 and -0.5 <= q < rows - 0.5):
+                continue
+        there, left, at, least, along_x, along_y = surface(grid, u, v, w, p, q, reach, around)
+        if there == 0.0 or left > ON_A_PLANE:
+            if at < 0 or least > NEXT:
+                continue
+            there, along_x, along_y = w[at], 0.0, 0.0
+        spot[n], x[n], y[n], error[n], room[n], nearest[n] = i, p, q, there * distance - 1.0, 0.0, at
+        room[n] = abs(along_x) + abs(along_y)
+        n += 1
+    return n
+
+
+@serial
+def answer_image_sparse(
+    spot, x, y, error, allowed, labels, unlabelled, K, w, nearest, camera, seed, out, near, far, square
+):
+    """Write the answers of the pixels of an image with sparse depth and dense labels, as `answer` does."""
+    H, W = labels.shape
+    fx, fy, _, _ = camera
+    n = 0
+    for i in range(len(spot)):
+        if abs(error[i]) > allowed:
+            continue
+        column, row, here = np.int64(np.floor(x[i] + 0.5)), np.int64(np.floor(y[i] + 0.5)), w[nearest[i]]
+        own, dx, dy = own_label(labels, unlabelled, row, column, K), column - x[i], row - y[i]
+        other, ex, ey = own, dx, dy
+        side = mixed(np.uint32(np.uint32(seed) ^ np.uint32(spot[i])))
+        sign = np.int64(1) if side & np.uint32(2) else np.int64(-1)
+        step_x, step_y = (sign, np.int64(0)) if side & np.uint32(1) else (np.int64(0), sign)
+        if own < K and 0 <= row + step_y < H and 0 <= column + step_x < W:
+            its = own_label(labels, unlabelled, row + step_y, column + step_x, K)
+            if its < K:
+                other, ex, ey = its, dx + step_x, dy + step_y
+        out[n], near[n], far[n] = spot[i], own, other
+        square[n, 0] = ((dx / fx) ** 2 + (dy / fy) ** 2) / (here * here)
+        square[n, 1] = ((ex / fx) ** 2 + (ey / fy) ** 2) / (here * here)
+        n += 1
+    return n
+
+
+@serial
+def answer_points(
+    spot,
+    x,
+    y,
+    error,
+    room,
+    allowed,
+    grid,
+    u,
+    v,
+    w,
+    labels,
+    nearest,
+    camera,
+    around,
+    reach,
+    seed,
+    out,
+    near,
+    far,
+    square,
+):
+    """Write the answers of the nearest points, whose labels (n,) are given, as `answer` does.
+
+    The second label is that of a point which lies further to one side, half of `reach` away from the nearest one.
+    """
+    rows, columns = grid.shape
+    fx, fy, _, _ = camera
+    n = 0
+    for i in range(len(spot)):
+        if abs(error[i]) > allowed:
+            continue
+        at = nearest[i]
+        side = mixed(np.uint32(np.uint32(seed) ^ np.uint32(spot[i])))
+        sign = 0.5 * reach if side & np.uint32(2) else -0.5 * reach
+        goal_x, goal_y = (u[at] + sign, v[at]) if side & np.uint32(1) else (u[at], v[at] + sign)
+        other, least = np.int64(-1), 1e18
+        column, row = np.int64(np.floor(goal_x + 0.5)), np.int64(np.floor(goal_y + 0.5))
+        for b in range(max(row - reach, 0), min(row + reach + 1, rows)):
+            for a in range(column - reach, column + reach + 1):
+                c = a % columns if around else a
+                if c < 0 or c >= columns or grid[b, c] < 0 or grid[b, c] == at:
+                    continue
+                j = grid[b, c]
+                dx, dy = u[j] - goal_x, v[j] - goal_y
+                if around:
+                    dx = dx - columns * np.round(dx / columns)
+                apart = abs(dx + goal_x - u[at]) + abs(dy + goal_y - v[at])
+                if dx * dx + dy * dy < least and abs(w[j] / w[at] - 1.0) <= 1.5 * allowed + room[i] * apart:
+                    other, least = np.int64(j), dx * dx + dy * dy
+        narrow = np.cos(y[i] / fy - 0.5 * np.pi) if around else 1.0
+        out[n], near[n], far[n] = spot[i], labels[at], labels[at]
+        for k in range(2):
+            j = at if k == 0 or other < 0 else other
+            dx, dy = u[j] - x[i], v[j] - y[i]
+            if around:
+                dx = dx - columns * np.round(dx / columns)
+            square[n, k] = ((narrow * dx / fx) ** 2 + (dy / fy) ** 2) / (w[at] * w[at])
+        if other >= 0:
+            far[n] = labels[other]
+        n += 1
+    return n
+
+
+# --- Entries in order of spot and view --------------------------------------------------------------------------------
+
+
+@serial
+def observe(number, view, label, K, first, of, starts, classes, shares):
+    """Write each observation: its spot, and the share of each class among its answers, classes ascending.
+
+    number, view (m,) are the spot and the view of each answer, in order: a camera that stands still answers more than
+    once in a view. `first` is an answer of each observation, `of` counts spots; returns the number of observations, and
+    the number of their classes together. All arrays are as long as the answers, `starts` is longer by one.
+    """
+    sums, met = np.zeros(K), np.empty(K, np.int64)
+    n = m = start = 0
+    spots = -1
+    before = np.int64(-1)
+    starts[0] = 0
+    while start < len(number):
+        end, many, spot = start, 0, number[start]
+        while end < len(number) and number[end] == spot and view[end] == view[start]:
+            if sums[label[end]] == 0.0:
+                met[many] = label[end]
+                many += 1
+            sums[label[end]] += 1.0
+            end += 1
+        spots += spot != before
+        before = spot
+        first[n], of[n] = start, spots
+        if many > 1:
+            met[:many].sort()
+        for own in met[:many]:
+            classes[m], shares[m], sums[own] = own, sums[own] / (end - start), 0.0
+            m += 1
+        n += 1
+        starts[n] = m
+        start = end
+    return n, m
