@@ -29,7 +29,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from exact_errors import ERRORS, IGNORED, Labeller, unlabelled
-from exact_scenes import Array, Ints
+from exact_scenes import Array, Ints, yard
 from exact_views import PATHS, Flight, Pinhole, Seen, flight
 
 from semstab.data.frames import Frame
@@ -73,7 +73,7 @@ class Condition:
     @property
     def name(self) -> str:
         """What a row begins with."""
-        usual = 8 if PATHS[self.path] is PATHS["street"] or self.path in ("sparse", "scan") else 6
+        usual = 6 if PATHS[self.path][0] is yard else 8
         parts = {
             f"{self.K} classes": usual != self.K,
             f"{self.unlabelled:.0%} unlabelled": self.unlabelled > 0,

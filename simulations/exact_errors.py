@@ -144,11 +144,15 @@ def lasting(flight: Flight, K: int, rng: np.random.Generator) -> Labeller:
     return lambda seen: np.where(fields[seen.frame // LASTS](seen) > norm.isf(0.25), (seen.truth + 1) % K, seen.truth)
 
 
-def far(flight: Flight, K: int, rng: np.random.Generator) -> Labeller:
-    """Return errors that grow with range, from none to 70 %, between the 5 and 95 % quantiles over the pixels."""
-    distance = np.concatenate([seen.distance[seen.face >= 0] for seen in flight.images])
-    low, high = np.quantile(distance, (0.05, 0.95))
-    return in_blobs(lambda seen: 0.7 * np.clip((seen.distance - low) / (high - low), 0, 1), flight, K, rng)
+def with_range(most: float) -> Callable[[Flight, int, np.random.Generator], Labeller]:
+    """Return errors that grow with range, from none to `most`, between the 5 and 95 % quantiles over the pixels."""
+
+    def errors(flight: Flight, K: int, rng: np.random.Generator) -> Labeller:
+        distance = np.concatenate([seen.distance[seen.face >= 0] for seen in flight.images])
+        low, high = np.quantile(distance, (0.05, 0.95))
+        return in_blobs(lambda seen: most * np.clip((seen.distance - low) / (high - low), 0, 1), flight, K, rng)
+
+    return errors
 
 
 def grazing(flight: Flight, K: int, rng: np.random.Generator) -> Labeller:
@@ -169,8 +173,8 @@ def corners(flight: Flight, K: int, rng: np.random.Generator) -> Labeller:
 
 ERRORS: dict[str, Callable[[Flight, int, np.random.Generator], Labeller]] = {
     "none": none, "pixels": pixels, "blobs": blobs, "blocks": blocks, "place": place, "view": view,
-    "class": classes, "border": border, "burst": burst, "lasting": lasting, "range": far, "angle": grazing,
-    "radius": corners,
+    "class": classes, "border": border, "burst": burst, "lasting": lasting, "range": with_range(0.35),
+    "strong range": with_range(0.7), "angle": grazing, "radius": corners,
 }  # fmt: skip
 
 

@@ -150,7 +150,7 @@ class Flight:
 
 def _looking(centre: Array, forward: Array) -> Array:
     z = forward / np.linalg.norm(forward)
-    x = np.cross(z, [0, 0, 1.0]) if abs(z[2]) < 0.999 else np.array([1.0, 0, 0])
+    x = np.cross(z, [0, 0, 1.0] if abs(z[2]) < 0.99 else [0, 1.0, 0])
     x /= np.linalg.norm(x)
     pose = np.eye(4)
     pose[:3] = np.stack([x, np.cross(z, x), z, centre], axis=1)
