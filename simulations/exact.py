@@ -42,7 +42,7 @@ LIMIT, LIMIT_OF_FEW, FEW = 0.02, 0.03, 5
 """Largest difference, that with few frames, and how many are not few."""
 
 DRAWS = 60
-"""Most draws of as many points as are wanted, until as many are seen twice."""
+"""Most draws of points, until as many as are wanted are seen twice."""
 
 RING, STEP = np.radians(2.0), np.radians(3.2)
 """Between the rings, and between the rays of a ring, of a scanner that gives a camera depth at 4 % of its pixels."""
@@ -150,10 +150,10 @@ def alpha_of(unit: Ints, label: Ints) -> Exact:
 
 def exact(flown: Flight, labeller: Labeller, points: int, rng: np.random.Generator) -> Exact:
     """Return alpha of the surface: draw until so many points have two labels."""
-    units, labels, drawn, twice = [], [], 0, 0
+    units, labels, drawn, twice, n = [], [], 0, 0, points
     for _ in range(DRAWS):
-        point, face = flown.scene.draw(points, rng)
-        times = np.zeros(points, int)
+        point, face = flown.scene.draw(n, rng)
+        times = np.zeros(n, int)
         for frame in range(len(flown.poses)):
             some, seen = flown.meet(frame, point, face)
             label = labeller(seen)
@@ -161,9 +161,10 @@ def exact(flown: Flight, labeller: Labeller, points: int, rng: np.random.Generat
             times[some[named]] += 1
             units.append(drawn + some[named])
             labels.append(label[named])
-        drawn, twice = drawn + points, twice + np.count_nonzero(times >= 2)
+        drawn, twice = drawn + n, twice + np.count_nonzero(times >= 2)
         if twice >= points:
             break
+        n = min(int(1.05 * (points - twice) * drawn / max(twice, 1)) + 100, 4 * points)
     return alpha_of(np.concatenate(units), np.concatenate(labels))
 
 

@@ -4,9 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
+from functools import cached_property
 
 import numpy as np
 import numpy.typing as npt
+from scipy.spatial import cKDTree
 
 Array = npt.NDArray[np.float64]
 Ints = npt.NDArray[np.int64]
@@ -68,7 +70,7 @@ class Solid:
         classes = np.array([side] * k + [top, side])
         return cls(normals, offsets, (*walls, upper, lower), classes, textures or {})
 
-    @property
+    @cached_property
     def sphere(self) -> tuple[Array, float]:
         """A centre and a radius that hold it."""
         corners = np.concatenate(self.polygons)
@@ -165,11 +167,11 @@ def patches(half: float, K: int, rng: np.random.Generator) -> Texture:
     """Return patches about 5 m wide of random classes, with 3 stripes 0.4 m wide across them."""
     n = max(64, K)
     sites, of = rng.uniform(-half, half, (n, 2)), rng.permutation(np.arange(n) % K)
+    nearest = cKDTree(sites)
     angles, at, striped = rng.uniform(0, np.pi, 3), rng.uniform(-half / 2, half / 2, 3), rng.integers(0, K, 3)
 
     def texture(points: Array) -> Ints:
-        near = (points[:, None, :2] - sites) ** 2
-        classes: Ints = of[near.sum(axis=-1).argmin(axis=-1)]
+        classes: Ints = of[nearest.query(points[:, :2])[1]]
         for angle, offset, stripe in zip(angles, at, striped, strict=True):
             across = points[:, 0] * np.cos(angle) + points[:, 1] * np.sin(angle) - offset
             classes = np.where(np.abs(across) < 0.2, stripe, classes)
