@@ -28,6 +28,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
+import numpy.typing as npt
 from exact_errors import ERRORS, IGNORED, Labeller, unlabelled
 from exact_scenes import Array, Ints, yard
 from exact_views import PATHS, Flight, Pinhole, Seen, flight
@@ -161,7 +162,7 @@ def exact(flown: Flight, labeller: Labeller, points: int, rng: np.random.Generat
             times[some[named]] += 1
             units.append(drawn + some[named])
             labels.append(label[named])
-        drawn, twice = drawn + n, twice + np.count_nonzero(times >= 2)
+        drawn, twice = drawn + n, twice + int((times >= 2).sum())
         if twice >= points:
             break
         n = min(int(1.05 * (points - twice) * drawn / max(twice, 1)) + 100, 4 * points)
@@ -189,7 +190,7 @@ def frames(flown: Flight, labeller: Labeller, condition: Condition, rng: np.rand
         yield Frame(seen.frame, depth.reshape(H, W), K, pose, labels=labels.reshape(H, W))
 
 
-def _hit(camera: Pinhole, seen: Seen) -> np.ndarray:
+def _hit(camera: Pinhole, seen: Seen) -> npt.NDArray[np.bool_]:
     """Return the pixels (n,) that rays of a scanner beside the camera hit."""
     up, aside = np.meshgrid(np.arange(-np.pi / 4, np.pi / 4, RING), np.arange(-np.pi / 4, np.pi / 4, STEP))
     ways = np.stack([np.cos(up) * np.sin(aside), -np.sin(up), np.cos(up) * np.cos(aside)], axis=-1).reshape(-1, 3)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 
@@ -31,7 +31,7 @@ class Solid:
     offsets: Array
     polygons: tuple[Array, ...]
     classes: Ints
-    textures: dict[int, Texture] = field(default_factory=dict)
+    textures: Mapping[int, Texture] = field(default_factory=dict)
 
     @classmethod
     def prism(
@@ -43,7 +43,7 @@ class Solid:
         *,
         gradient: Sequence[float] = (0.0, 0.0),
         bottom: float = 0.0,
-        textures: dict[int, Texture] | None = None,
+        textures: Mapping[int, Texture] | None = None,
     ) -> Solid:
         """Return a prism over an outline (k, 2), counter-clockwise.
 
@@ -78,17 +78,17 @@ class Solid:
         return centre, float(np.linalg.norm(corners - centre, axis=1).max())
 
 
-def rectangle(low: Sequence[float], high: Sequence[float], turn: float = 0.0) -> Array:
+def rectangle(low: Sequence[float] | Array, high: Sequence[float] | Array, turn: float = 0.0) -> Array:
     """Return the corners (4, 2) of a rectangle, turned about its middle; its edges face -y, +x, +y and -x."""
     corners = np.array([[low[0], low[1]], [high[0], low[1]], [high[0], high[1]], [low[0], high[1]]], float)
     c, s = np.cos(turn), np.sin(turn)
     return corners.mean(axis=0) + (corners - corners.mean(axis=0)) @ np.array([[c, s], [-s, c]])
 
 
-def disc(x: float, y: float, radius: float, sides: int = 8) -> Array:
+def disc(middle: Sequence[float] | Array, radius: float, sides: int = 8) -> Array:
     """Return the corners of a regular polygon."""
     angle = 2 * np.pi * np.arange(sides) / sides
-    return np.stack([x + radius * np.cos(angle), y + radius * np.sin(angle)], axis=1)
+    return np.asarray(middle) + radius * np.stack([np.cos(angle), np.sin(angle)], axis=1)
 
 
 class Scene:
@@ -198,7 +198,7 @@ def yard(K: int, rng: np.random.Generator) -> Scene:
         outline = rectangle(middle - size / 2, middle + size / 2, turn)
         solids.append(Solid.prism(outline, tall / 2, *rng.integers(0, K, 2).tolist(), gradient=rise.tolist()))
     for _ in range(6):
-        outline, of = disc(*_within(11, rng), rng.uniform(0.08, 0.2)), int(rng.integers(0, K))
+        outline, of = disc(_within(11, rng), rng.uniform(0.08, 0.2)), int(rng.integers(0, K))
         solids.append(Solid.prism(outline, rng.uniform(3, 6), of, of))
     return Scene(solids)
 
@@ -241,7 +241,7 @@ def street(K: int, rng: np.random.Generator) -> Scene:
             )
             x = end + rng.choice([0.0, 3.0])
         for x in np.arange(LENGTH[0] + 5, LENGTH[1], 12):
-            outline = disc(x + rng.uniform(-2, 2), side * 5.0, rng.uniform(0.06, 0.15))
+            outline = disc((x + rng.uniform(-2, 2), side * 5.0), rng.uniform(0.06, 0.15))
             solids.append(Solid.prism(outline, rng.uniform(4, 7), pole, pole))
         for x in np.arange(LENGTH[0] + 8, LENGTH[1] - 8, 9):
             if rng.random() < 0.6:

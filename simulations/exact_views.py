@@ -16,9 +16,20 @@ from semstab.data.frames import Intrinsics
 class Sensor(Protocol):
     """Where a direction lies in an image; integer (u, v) are the middles of pixels."""
 
-    width: int
-    height: int
-    reach: float
+    @property
+    def width(self) -> int:
+        """Columns."""
+        ...
+
+    @property
+    def height(self) -> int:
+        """Rows."""
+        ...
+
+    @property
+    def reach(self) -> float:
+        """Metres beyond which it sees nothing."""
+        ...
 
     def rays(self, u: Array, v: Array) -> Array:
         """Return directions (n, 3) of image coordinates, in the sensor's axes."""
