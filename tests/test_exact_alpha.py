@@ -5,7 +5,7 @@ import itertools
 import exact
 import numpy as np
 import pytest
-from exact_errors import in_squares, none, unlabelled
+from exact_errors import border, in_squares, none, unlabelled
 from exact_scenes import Scene, Solid, rectangle
 from exact_views import Flight, Pinhole, flight, strips
 
@@ -68,6 +68,23 @@ def test_the_truth_has_an_alpha_of_one(path):
     labeller = unlabelled(none(flown, 8, rng), 0.3, flown, rng)
     found = exact.exact(flown, labeller, 500, rng)
     assert (found.value, found.error) == (1.0, 0.0)
+
+
+@pytest.mark.parametrize("path", ["orbit", "strips", "oblique", "street", "scan"])
+def test_a_frame_meets_the_points_that_it_looks_at_with_the_same_labels(path):
+    rng = np.random.default_rng(0)
+    flown = flight(path, 1, 8, (45, 60), rng)
+    labeller = unlabelled(border(flown, 8, rng), 0.3, flown, rng)
+    u, v = rng.uniform(-0.5, np.array([[flown.sensor.width], [flown.sensor.height]]) - 0.5, (2, 3000))
+    looked = flown.look(0, u, v)
+    hit = looked.face >= 0
+    some, met = flown.meet(0, looked.point[hit], looked.face[hit])
+    assert hit.sum() > 1000
+    assert len(some) == hit.sum()
+    assert met.u == pytest.approx(u[hit], abs=1e-9)
+    assert met.t == pytest.approx(looked.t[hit])
+    assert (met.truth == looked.truth[hit]).mean() > 0.999  # the rest lies on a border, within rounding
+    assert (labeller(met) == labeller(looked)[hit]).mean() > 0.999
 
 
 def above_a_box():
