@@ -105,6 +105,30 @@ def test_two_models_are_one_sentence(result, tmp_path):
     assert printed(found, tmp_path / "run").index(text[:40]) < 300
 
 
+@pytest.mark.parametrize(("vss", "sbd", "miou", "said"), [
+    (0.04, 0.5, 0.15, "VSS (OP>=3) (.942 against .902), SBD (.010 against .020) and mIoU (.580 against .430) are better"),
+    (0.04, 1.0, -0.1, "VSS (OP>=3) (.942 against .902) is better"),
+    (0.01, 0.95, 0.01, None),
+    (-0.1, 2.0, -0.1, None),
+])  # fmt: skip
+def test_measures_that_say_the_opposite_of_alpha_are_named_in_one_line(
+    result, tmp_path, monkeypatch, vss, sbd, miou, said
+):
+    """By alpha nervous is less stable than twin; here other measures of nervous are better, by so much."""
+    numbers = {
+        "twin": {"VSS (OP>=3)": 0.942 - vss, "SBD": 0.02, "mIoU": 0.58 - miou},
+        "nervous": {"VSS (OP>=3)": 0.942, "SBD": 0.02 * sbd, "mIoU": 0.58},
+    }
+    found = of_some(result, ["twin", "nervous"], tmp_path / "run")
+    monkeypatch.setattr("semstab.report.ranking._measured", lambda records: numbers[records[0].unit.model])
+    told = list(answers(found))
+    assert len(told) == 1 + (said is not None)
+    if said is not None:
+        assert told[1].startswith("the measures do not agree on this order: alpha is higher for twin, but ")
+        assert f"{said} for nervous" in told[1]
+        assert told[1][:60] in printed(found, tmp_path / "run")
+
+
 def test_one_model_has_no_ranking(result, tmp_path):
     alone = of_some(result, ["twin"], tmp_path / "run")
     assert ranking(alone).ranks == ranking(alone).differences == ()

@@ -12,12 +12,13 @@ from typing import TypeVar
 
 from semstab.core.types import THESE_FRAMES, THIS_SCENE, Scope
 from semstab.data.labels import sharing_classes
+from semstab.data.measures import SBD, VSS
 from semstab.data.records import Record, Result
-from semstab.data.statistics import Estimate, Interval
+from semstab.data.statistics import Estimate, Interval, short
 from semstab.datasets import GROUND_TRUTH
 from semstab.metrics import macro_mean
 from semstab.report.filter_study import filter_studies
-from semstab.report.means import by_model
+from semstab.report.means import ENOUGH, by_model, pooled
 from semstab.statistics.agreement import ALPHA
 from semstab.statistics.cluster_sums import ClusterSums, value
 from semstab.statistics.intervals import difference, mean_of, scope_of
@@ -174,12 +175,64 @@ def answers(result: Result) -> Iterator[str]:
             "ranks are by alpha of the observations that all models made; a rank is 1 plus the number of models shown"
             f" to be more stable (Holm over {len(ranked.differences)} pairs)"
         )
+    yield from contradictions(result, ranked)
     if ranked.unranked:
         yield f"not ranked, as nearly the whole map is one class: {', '.join(ranked.unranked)}"
     if ranked.apart and not ranked.ranks:
         yield f"not compared, as their classes differ: {', '.join(ranked.apart)}"
     elif ranked.apart:
         yield f"not compared, as the classes of the others differ: {', '.join(ranked.apart)}"
+
+
+CLEAR: Mapping[str, tuple[float, float]] = {"VSS (OP>=3)": (0.02, 0.0), "SBD": (0.002, 0.2), "mIoU": (0.02, 0.0)}
+"""How far two models have to lie apart for a measure to tell their order: at least so far, and by at least such a share
+of the larger value. VSS and mIoU are from 0 to 1, SBD is in bits."""
+
+
+def contradictions(result: Result, ranked: Ranking) -> Iterator[str]:
+    """Yield one sentence where other measures clearly say the opposite of an order that alpha shows.
+
+    It has the numbers of the first such pair, that with the largest difference of alpha, and names the others.
+    """
+    models = by_model(result.select())
+    opposed = []
+    for each in sorted((each for each in ranked.differences if each.shown), key=lambda each: -abs(each.value)):
+        better, worse = (each.model, each.other) if each.value > 0 else (each.other, each.model)
+        if against := _against(models[better], models[worse]):
+            opposed.append((better, worse, against))
+    if not opposed:
+        return
+    better, worse, against = opposed[0]
+    *others, last = against
+    listed = f"{', '.join(others)} and {last}" if others else last
+    more = "; ".join(f"{first} above {second}" for first, second, _ in opposed[1:4])
+    rest = f"; so it is for {more}{', ...' if len(opposed) > 4 else ''}" if more else ""
+    yield (
+        f"the measures do not agree on this order: alpha is higher for {better}, but {listed}"
+        f" {'are' if others else 'is'} better for {worse}{rest}; look at the classes before you choose"
+    )
+
+
+def _against(better: Sequence[Record], worse: Sequence[Record]) -> list[str]:
+    """Return the measures that are clearly better for the second model: 'VSS (OP>=3) (.942 against .863)'."""
+    found = []
+    of_both = (_measured(worse), _measured(better))
+    for name, (least, share) in CLEAR.items():
+        higher, lower = (values[name] for values in of_both)
+        gain = lower - higher if name == "SBD" else higher - lower  # less drift is better
+        if gain >= max(least, share * max(abs(higher), abs(lower))):
+            found.append(f"{name} ({short(higher, digits=3)} against {short(lower, digits=3)})")
+    return found
+
+
+def _measured(records: Sequence[Record]) -> dict[str, float]:
+    """Return the measures of a model beside alpha, over its scenes; NaN where unknown."""
+    recurrent = pooled(records).recurrent
+    enough = recurrent.voxels >= ENOUGH
+    known = [record.statistics.correctness for record in records if record.statistics is not None]
+    miou = macro_mean([right.miou.value for right in known if right is not None]) if any(known) else math.nan
+    vss, sbd = (recurrent[measure] if enough else math.nan for measure in (VSS, SBD))
+    return {"VSS (OP>=3)": vss, "SBD": sbd, "mIoU": miou}
 
 
 def _is_uninformative(record: Record) -> bool:
