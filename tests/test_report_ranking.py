@@ -106,7 +106,8 @@ def test_two_models_are_one_sentence(result, tmp_path):
 
 
 @pytest.mark.parametrize(("vss", "sbd", "miou", "said"), [
-    (0.04, 0.5, 0.15, "VSS (OP>=3) (.942 against .902), SBD (.010 against .020) and mIoU (.580 against .430) are better"),
+    (0.04, 0.5, 0.15,
+     "VSS (OP>=3) (.942 against .902), SBD (.010 against .020) and mIoU (.580 against .430) are better"),
     (0.04, 1.0, -0.1, "VSS (OP>=3) (.942 against .902) is better"),
     (0.01, 0.95, 0.01, None),
     (-0.1, 2.0, -0.1, None),
