@@ -11,6 +11,7 @@ from posed_config import configure
 from rich.console import Console
 
 import semstab
+import semstab.report.ranking
 from semstab.comparison.gate import gate, gate_config
 from semstab.configure import predicted_config, resolve
 from semstab.predict.predictor import parse_predictors
@@ -128,6 +129,26 @@ def test_measures_that_say_the_opposite_of_alpha_are_named_in_one_line(
         assert told[1].startswith("the measures do not agree on this order: alpha is higher for twin, but ")
         assert f"{said} for nervous" in told[1]
         assert told[1][:60] in printed(found, tmp_path / "run")
+
+
+def test_a_model_that_owes_its_order_to_what_it_leaves_out_is_not_shown_to_be_more_stable(
+    result, tmp_path, monkeypatch
+):
+    """By common observations twin is the more stable one."""
+    found = of_some(result, ["twin", "nervous"], tmp_path / "run")
+    common = semstab.report.ranking._common
+
+    def silent(files):
+        return common(files)[0], {"twin": 0.5, "nervous": 0.6}
+
+    monkeypatch.setattr("semstab.report.ranking._common", silent)
+    semstab.report.ranking._ranking.cache_clear()
+    first, second, *_ = answers(found)
+    (difference,) = ranking(found).differences
+    semstab.report.ranking._ranking.cache_clear()
+    assert (difference.shown, difference.silent) == (False, True)
+    assert first.startswith("nervous is not shown to differ from twin: alpha -")
+    assert second.startswith("twin has a higher alpha than nervous on what both label, but a lower one if what it")
 
 
 def test_one_model_has_no_ranking(result, tmp_path):
