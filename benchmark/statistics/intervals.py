@@ -208,11 +208,11 @@ def probability_above(interval: Interval, threshold: float, scale: Scale) -> flo
     from scipy import special
 
     low, high = interval.low, interval.high
-    if scale == "agreement" and high < 1:  # by the end that no bound cuts off, on log(1 - x)
+    if scale == "agreement" and 1 - low <= math.e * (1 + TINY) * (1 - interval.value):  # on log(1 - x), see `_ends`
         value, error = -math.log(max(1 - interval.value, TINY)), -math.log(max(1 - interval.value, TINY))
         error -= -math.log(max(1 - low, TINY))
         above = -math.log(max(1 - threshold, TINY))
-    elif scale == "agreement":  # 1 is within noise, see `_ends`
+    elif scale == "agreement":  # by the end that no bound cuts off
         value, error, above = interval.value, interval.value - low, threshold
     else:
         value, error, above = interval.value, max(interval.value - low, high - interval.value), threshold
@@ -257,28 +257,29 @@ def _ends(result: float, spread: Spread, unseen: float, scale: Scale, level: flo
 
         1 - (1 - x) exp(h / (1 - x)) to 1 - (1 - x) exp(-h / (1 - x))
 
-    - From h = 1 - x on, 1 is within noise. The upper end is 1, and the lower end is (e - 1) h below x: the scale's own
-      end at h = 1 - x, from where on h tells nothing of the relative error of 1 - x. The few errors that were seen may
-      be fewer than those that were missed, so that `unseen`, the part that locations without a single error may have
-      missed, counts in addition, by 1 - (1 - x) / h: not at all at h = 1 - x, in full at x = 1.
-    - Within RESOLUTION of 1, the upper end is 1 whatever h is.
+    - From h = 1 - x on, the lower end is (e - 1) h below x: the scale's own end at h = 1 - x, from where on h tells
+      nothing of the relative error of 1 - x. The few errors that were seen may be fewer than those that were missed, so
+      that `unseen`, the part that locations without a single error may have missed, counts in addition, by
+      1 - (1 - x) / h: not at all at h = 1 - x, in full at x = 1.
+    - An upper end within RESOLUTION of 1 is 1.
     - Without any variance the lower end is `unseen` below x.
     """
     if spread.variance <= TINY:
-        return result - unseen, _not_below_one(result, result) if scale == "agreement" else result + unseen
+        return result - unseen, _up_to_one(result) if scale == "agreement" else result + unseen
     half = spread.half(level)
     if scale == "plain" or math.isnan(half):
         return result - half, result + half
-    apart = max(1 - result, 0.0)
-    if half >= apart:
-        return result - math.hypot((math.e - 1) * half, unseen * (1 - apart / half)), 1.0
+    apart = max(1 - result, TINY)
     ratio = half / apart
-    return 1 - apart * math.exp(ratio), _not_below_one(result, 1 - apart * math.exp(-ratio))
+    high = _up_to_one(1 - apart * math.exp(-ratio))
+    if ratio < 1:
+        return 1 - apart * math.exp(ratio), high
+    return result - math.hypot((math.e - 1) * half, unseen * (1 - 1 / ratio)), high
 
 
-def _not_below_one(result: float, high: float) -> float:
-    """Return the upper end of an agreement's interval, 1 where the number cannot be told from 1."""
-    return 1.0 if 1 - result <= RESOLUTION else high
+def _up_to_one(high: float) -> float:
+    """Return the upper end of an agreement's interval: 1 where it cannot be told from 1."""
+    return 1.0 if 1 - high <= RESOLUTION else high
 
 
 def _interval(
