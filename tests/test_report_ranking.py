@@ -14,7 +14,9 @@ import semstab
 import semstab.report.ranking
 from semstab.comparison.gate import gate, gate_config
 from semstab.configure import predicted_config, resolve
+from semstab.core.palette import KINDS
 from semstab.predict.predictor import parse_predictors
+from semstab.report.page import _card
 from semstab.report.ranking import answers, ranking
 from semstab.report.terminal import print_summary
 
@@ -149,6 +151,20 @@ def test_a_model_that_owes_its_order_to_what_it_leaves_out_is_not_shown_to_be_mo
     assert (difference.shown, difference.silent) == (False, True)
     assert first.startswith("nervous is not shown to differ from twin: alpha -")
     assert second.startswith("twin has a higher alpha than nervous on what both label, but a lower one if what it")
+
+
+def test_both_levels_are_printed_where_they_differ(result, tmp_path):
+    """Twin labels 92 % of the pixels, and is usable of all."""
+    for models, who in ((["twin", "nervous"], "twin: "), (["twin"], "")):
+        found = of_some(result, models, tmp_path / "_".join(models))
+        verdict = found.record(model="twin").statistics.verdict
+        for name, content in {"level": "stable", "of_all": "usable", "labelled": 0.92}.items():
+            object.__setattr__(verdict, name, content)
+        said = "stable of the 92 % that it labels, usable of all"
+        assert f"{who}{said}" in " ".join(printed(found, tmp_path / "run").split())
+        assert _card("twin", [found.record(model="twin")])["scenes"][0] == {
+            "scene": "scene0", "level": said, "kind": KINDS["usable"], "probability": "",
+        }  # fmt: skip
 
 
 def test_one_model_has_no_ranking(result, tmp_path):
