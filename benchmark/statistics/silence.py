@@ -33,5 +33,7 @@ def silence(cells: CellObservations) -> Silence:
     labelled, pixels = cells.label < cells.K, float(cells.weight.sum())
     if not pixels:
         return Silence(math.nan, math.nan)
+    if labelled.all():
+        return Silence(1.0, 1.0)
     log = dataclasses.replace(cells, K=cells.K + 1, classes=()).observations()  # the last class: no label
     return Silence(float(cells.weight[labelled].sum()) / pixels, min(pairs_labelled(log), 1.0))
