@@ -36,7 +36,7 @@ from exact_views import PATHS, Flight, Pinhole, Seen, flight
 from semstab.data.frames import Frame
 from semstab.data.statistics import Interval
 from semstab.statistics import Sampler
-from semstab.statistics.accumulate import sums_of_cells
+from semstab.statistics.accumulate import sums_of_spots
 from semstab.statistics.intervals import estimate
 
 LIMIT, LIMIT_OF_FEW, FEW = 0.02, 0.03, 5
@@ -214,7 +214,7 @@ def said(shown: list[Frame], K: int) -> Interval:
     sampler = Sampler(K)
     for frame in shown:
         sampler.add(frame)
-    return estimate(sums_of_cells(sampler.sample()), "alpha")
+    return estimate(sums_of_spots(sampler.sample()), "alpha")
 
 
 # --- The table --------------------------------------------------------------------------------------------------------

@@ -35,7 +35,7 @@ MOST_NEW = 1 << 16
 LOOKED_AT = 40_000
 """Blocks of pixels, about, in which new spots are looked for."""
 
-APART = 2.0
+APART = 1.0
 """Edge of a coarse cell, in distances of the pixels in which new spots are looked for, or more."""
 
 SIDE = 640
