@@ -74,7 +74,7 @@ class Entry(EntryNumbers):
     def counted(self) -> float:
         """Return the factor of its alpha if what has no label counts as disagreeing; 1 where that is not known."""
         statistics = self.summary.statistics
-        return 1.0 if statistics is None or statistics.cells is None else statistics.cells.counted
+        return 1.0 if statistics is None or statistics.spots is None else statistics.spots.counted
 
     @functools.cached_property
     def sums(self) -> ClusterSums:

@@ -371,7 +371,7 @@ def surface(grid, u, v, w, x, y, reach, around):
 
 @serial
 def new_in_points(
-    grid, u, v, w, camera, around, reach, allowed, T, edge, share, low, factor, seed, table, point, hashed
+    grid, u, v, w, camera, around, reach, spacing, allowed, T, edge, share, low, factor, seed, table, point, hashed
 ):
     """Add spots where points show a coarse cell without one; return how many.
 
@@ -401,7 +401,7 @@ def new_in_points(
             shown = 1.0 / (w[at] * w[at] * fx * fy)
         shown *= spacing * spacing
         places = number_of(PLACES * shown / (edge * edge), fraction(np.uint32(number ^ np.uint32(0x165667B1))))
-        for k in range(places):
+        for _ in range(places):
             number = mixed(np.uint32(number + np.uint32(0x9E3779B9)))
             x, y, here = u[at], v[at], w[at]
             if plane:
