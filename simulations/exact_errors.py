@@ -1,0 +1,191 @@
+"""How models err, at exact image coordinates: for `exact.py`."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+from exact_scenes import Array, Ints
+from exact_views import Flight, Seen
+from scipy import ndimage
+from scipy.stats import norm
+
+Labeller = Callable[[Seen], Ints]
+"""The label (n,) that a frame gives at image coordinates, the same whenever it is asked."""
+
+Number = Callable[[Seen], Array]
+
+IGNORED = 255
+PAD = 8
+"""Pixels around an image at which smooth fields are known as well."""
+
+BLOB, BLOCK, METRES, SHIFT, LASTS = 4.0, 8, 3.0, 2.0, 4
+"""Blur of blobs in pixels, edge of blocks in pixels, width of errors of a place, most pixels of a border, frames."""
+
+
+def smooth(flight: Flight, blur: float, rng: np.random.Generator) -> Number:
+    """Return a smooth random field of each frame, of variance 1."""
+    shape = flight.sensor.height + 2 * PAD, flight.sensor.width + 2 * PAD
+    fields = []
+    for _ in flight.poses:
+        blurred = ndimage.gaussian_filter(rng.standard_normal(shape), blur, mode="wrap")
+        fields.append(ndimage.spline_filter(blurred * 2 * blur * np.sqrt(np.pi)))
+
+    def at(seen: Seen) -> Array:
+        where = np.stack([seen.v + PAD, seen.u + PAD])
+        found: Array = ndimage.map_coordinates(fields[seen.frame], where, prefilter=False, mode="nearest")
+        return found
+
+    return at
+
+
+def squares(flight: Flight, edge: int, rng: np.random.Generator) -> Number:
+    """Return a uniform number that is the same all over a square of pixels, and anew in each frame."""
+    shape = len(flight.poses), -(-flight.sensor.height // edge), -(-flight.sensor.width // edge)
+    drawn = rng.random(shape)
+
+    def at(seen: Seen) -> Array:
+        v, u = (np.floor(x + 0.5).astype(int) // edge for x in (seen.v, seen.u))
+        return drawn[seen.frame, v, u]
+
+    return at
+
+
+def of_place(metres: float, rng: np.random.Generator) -> Number:
+    """Return a smooth field over space, of variance 1."""
+    waves, phase = rng.normal(0, 1 / metres, (32, 3)), rng.uniform(0, 2 * np.pi, 32)
+    return lambda seen: np.cos(seen.point @ waves.T + phase).sum(axis=1) / 4
+
+
+def other(truth: Ints, by: Array, K: int) -> Ints:
+    """Return another class than the true one; by: (n,) from 0 to 1."""
+    return (truth + 1 + np.minimum((by * (K - 1)).astype(int), K - 2)) % K
+
+
+def in_blobs(share: Number, flight: Flight, K: int, rng: np.random.Generator) -> Labeller:
+    """Return errors in blobs, of which `share` says how frequent they are; three classes at most stand in."""
+    error, by = smooth(flight, BLOB, rng), smooth(flight, 2 * BLOB, rng)
+
+    def label(seen: Seen) -> Ints:
+        instead = other(seen.truth, norm.cdf(by(seen)) * min(3, K - 1) / (K - 1), K)
+        return np.where(error(seen) > norm.isf(share(seen)), instead, seen.truth)
+
+    return label
+
+
+def in_squares(share: float, edge: int, flight: Flight, K: int, rng: np.random.Generator) -> Labeller:
+    """Return errors of whole squares of pixels."""
+    error, by = squares(flight, edge, rng), squares(flight, edge, rng)
+    return lambda seen: np.where(error(seen) < share, other(seen.truth, by(seen), K), seen.truth)
+
+
+def none(flight: Flight, K: int, rng: np.random.Generator) -> Labeller:
+    """Return the truth."""
+    return lambda seen: seen.truth
+
+
+def pixels(flight: Flight, K: int, rng: np.random.Generator) -> Labeller:
+    """Return errors of 15 % of the pixels, each by itself."""
+    return in_squares(0.15, 1, flight, K, rng)
+
+
+def blobs(flight: Flight, K: int, rng: np.random.Generator) -> Labeller:
+    """Return errors of blobs, 20 % of each image."""
+    return in_blobs(lambda seen: np.full(len(seen.u), 0.2), flight, K, rng)
+
+
+def blocks(flight: Flight, K: int, rng: np.random.Generator) -> Labeller:
+    """Return errors of 20 % of the blocks of 8 x 8 pixels."""
+    return in_squares(0.2, BLOCK, flight, K, rng)
+
+
+def place(flight: Flight, K: int, rng: np.random.Generator) -> Labeller:
+    """Return errors that stay at their place."""
+    field = of_place(METRES, rng)
+    return lambda seen: np.where(field(seen) > norm.isf(0.3), (seen.truth + 1) % K, seen.truth)
+
+
+def view(flight: Flight, K: int, rng: np.random.Generator) -> Labeller:
+    """Return frames of different quality: errors of up to 60 % of the image."""
+    share = rng.uniform(0, 0.6, len(flight.poses))
+    return in_blobs(lambda seen: np.full(len(seen.u), share[seen.frame]), flight, K, rng)
+
+
+def classes(flight: Flight, K: int, rng: np.random.Generator) -> Labeller:
+    """Return errors of every third class: half of its blocks are taken for the next one."""
+    error = squares(flight, BLOCK, rng)
+    return lambda seen: np.where((seen.truth % 3 == 0) & (error(seen) < 0.5), (seen.truth + 1) % K, seen.truth)
+
+
+def border(flight: Flight, K: int, rng: np.random.Generator) -> Labeller:
+    """Return borders in the wrong place: the class of where another ray goes, up to 2 pixels away."""
+    right, down = smooth(flight, BLOB, rng), smooth(flight, BLOB, rng)
+
+    def label(seen: Seen) -> Ints:
+        du, dv = (SHIFT * np.clip(field(seen) / 2, -1, 1) for field in (right, down))
+        shown = flight.look(seen.frame, seen.u + du, seen.v + dv).truth
+        return np.where(shown >= 0, shown, seen.truth)
+
+    return label
+
+
+def burst(flight: Flight, K: int, rng: np.random.Generator) -> Labeller:
+    """Return errors of 60 % in every fourth frame, one after another, and of 5 % in the others."""
+    F = len(flight.poses)
+    bad = max(1, F // 4)
+    first = rng.integers(0, F - bad + 1)
+    share = np.where((np.arange(F) >= first) & (np.arange(F) < first + bad), 0.6, 0.05)
+    return in_blobs(lambda seen: np.full(len(seen.u), share[seen.frame]), flight, K, rng)
+
+
+def lasting(flight: Flight, K: int, rng: np.random.Generator) -> Labeller:
+    """Return errors that stay at their place for 4 frames."""
+    fields = [of_place(METRES, rng) for _ in range(len(flight.poses) // LASTS + 1)]
+    return lambda seen: np.where(fields[seen.frame // LASTS](seen) > norm.isf(0.25), (seen.truth + 1) % K, seen.truth)
+
+
+def with_range(most: float) -> Callable[[Flight, int, np.random.Generator], Labeller]:
+    """Return errors that grow with range, from none to `most`, between the 5 and 95 % quantiles over the pixels."""
+
+    def errors(flight: Flight, K: int, rng: np.random.Generator) -> Labeller:
+        distance = np.concatenate([seen.distance[seen.face >= 0] for seen in flight.images])
+        low, high = np.quantile(distance, (0.05, 0.95))
+        return in_blobs(lambda seen: most * np.clip((seen.distance - low) / (high - low), 0, 1), flight, K, rng)
+
+    return errors
+
+
+def grazing(flight: Flight, K: int, rng: np.random.Generator) -> Labeller:
+    """Return errors that grow from 30 degrees off the surface's normal to 70 % at 90."""
+    return in_blobs(lambda seen: 0.7 * np.clip((seen.angle - 30) / 60, 0, 1), flight, K, rng)
+
+
+def corners(flight: Flight, K: int, rng: np.random.Generator) -> Labeller:
+    """Return errors that grow with the square of the image radius, to 60 % in the corners."""
+    H, W = flight.sensor.height, flight.sensor.width
+
+    def share(seen: Seen) -> Array:
+        away = (seen.u - (W - 1) / 2) ** 2 + (seen.v - (H - 1) / 2) ** 2
+        return np.clip(0.6 * away / ((W / 2) ** 2 + (H / 2) ** 2), 0, 1)
+
+    return in_blobs(share, flight, K, rng)
+
+
+ERRORS: dict[str, Callable[[Flight, int, np.random.Generator], Labeller]] = {
+    "none": none, "pixels": pixels, "blobs": blobs, "blocks": blocks, "place": place, "view": view,
+    "class": classes, "border": border, "burst": burst, "lasting": lasting, "range": with_range(0.35),
+    "strong range": with_range(0.7), "angle": grazing, "radius": corners,
+}  # fmt: skip
+
+
+def unlabelled(labeller: Labeller, share: float, flight: Flight, rng: np.random.Generator) -> Labeller:
+    """Return the labeller without labels in blobs, a share of each image, and where there is no surface."""
+    field = smooth(flight, BLOB, rng)
+
+    def label(seen: Seen) -> Ints:
+        without = seen.face < 0
+        if share:
+            without |= field(seen) < norm.ppf(share)
+        return np.where(without, IGNORED, labeller(seen))
+
+    return label

@@ -1,0 +1,131 @@
+"""simulations/exact.py knows alpha: closed forms, labels by hand, and what a camera sees of a box."""
+
+import itertools
+
+import exact
+import numpy as np
+import pytest
+from exact_errors import border, in_squares, none, unlabelled
+from exact_scenes import Scene, Solid, rectangle
+from exact_views import Flight, Pinhole, flight, strips
+
+
+def by_hand(units):
+    """Krippendorff's nominal alpha of lists of labels, from the matrix of coincidences."""
+    units = [labels for labels in units if len(labels) >= 2]
+    K = max(map(max, units)) + 1
+    together = np.zeros((K, K))
+    for labels in units:
+        for a, b in itertools.permutations(labels, 2):
+            together[a, b] += 1 / (len(labels) - 1)
+    of = together.sum(axis=1)
+    n = of.sum()
+    return 1 - (n - 1) * (n - np.trace(together)) / (n**2 - (of**2).sum())
+
+
+def test_alpha_is_that_of_the_matrix_of_coincidences():
+    rng = np.random.default_rng(0)
+    units = [rng.integers(0, 4, rng.integers(0, 6)).tolist() + [2] * int(rng.integers(0, 4)) for _ in range(50)]
+    unit, label = np.array([(k, label) for k, labels in enumerate(units) for label in labels]).T
+    order = rng.permutation(len(unit))
+    found = exact.alpha_of(unit[order], label[order])
+    assert found.value == pytest.approx(by_hand(units), abs=1e-12)
+    assert found.points == sum(len(labels) >= 2 for labels in units)
+    assert found.views == pytest.approx(np.mean([len(labels) for labels in units if len(labels) >= 2]))
+
+
+def test_its_error_is_how_much_it_varies_with_the_points_drawn():
+    rng, found = np.random.default_rng(0), []
+    for _ in range(200):
+        times = rng.integers(1, 6, 300)
+        unit = np.repeat(np.arange(300), times)
+        truth = rng.choice(3, 300, p=(0.6, 0.3, 0.1))[unit]
+        found.append(exact.alpha_of(unit, np.where(rng.random(len(unit)) < 0.2, (truth + 1) % 3, truth)))
+    assert np.mean([own.error for own in found]) == pytest.approx(np.std([own.value for own in found]), rel=0.15)
+
+
+def plane(K, frames, seed=0):
+    """A flight over a plane with stripes of all classes, each 0.5 m wide."""
+    stripes = {4: lambda points: np.floor(2 * points[:, 0]).astype(int) % K}
+    scene = Scene([Solid.prism(rectangle((-40, -40), (40, 40)), 0.0, 0, 0, bottom=-1.0, textures=stripes)])
+    return Flight(scene, Pinhole(80, 60), strips(frames, np.random.default_rng(seed)))
+
+
+@pytest.mark.parametrize(("K", "wrong"), [(2, 0.1), (2, 0.3), (5, 0.2)])
+def test_errors_of_pixels_on_a_plane_have_the_alpha_of_their_closed_form(K, wrong):
+    flown, rng = plane(K, 12), np.random.default_rng(1)
+    labeller = in_squares(wrong, 1, flown, K, rng)
+    agree = (1 - wrong) ** 2 + wrong**2 / (K - 1)
+    found = exact.exact(flown, labeller, 10000, rng)
+    assert found.value == pytest.approx(1 - (1 - agree) / (1 - 1 / K), abs=0.02)
+    assert found.points >= 10000
+
+
+@pytest.mark.parametrize("path", ["orbit", "strips", "oblique", "street", "scan"])
+def test_the_truth_has_an_alpha_of_one(path):
+    rng = np.random.default_rng(0)
+    flown = flight(path, 4, 8, (45, 60), rng)
+    labeller = unlabelled(none(flown, 8, rng), 0.3, flown, rng)
+    found = exact.exact(flown, labeller, 500, rng)
+    assert (found.value, found.error) == (1.0, 0.0)
+
+
+@pytest.mark.parametrize("path", ["orbit", "strips", "oblique", "street", "scan"])
+def test_a_frame_meets_the_points_that_it_looks_at_with_the_same_labels(path):
+    rng = np.random.default_rng(0)
+    flown = flight(path, 1, 8, (45, 60), rng)
+    labeller = unlabelled(border(flown, 8, rng), 0.3, flown, rng)
+    u, v = rng.uniform(-0.5, np.array([[flown.sensor.width], [flown.sensor.height]]) - 0.5, (2, 3000))
+    looked = flown.look(0, u, v)
+    hit = looked.face >= 0
+    some, met = flown.meet(0, looked.point[hit], looked.face[hit])
+    assert hit.sum() > 1000
+    assert len(some) == hit.sum()
+    assert met.u == pytest.approx(u[hit], abs=1e-9)
+    assert met.t == pytest.approx(looked.t[hit])
+    assert (met.truth == looked.truth[hit]).mean() > 0.999  # the rest lies on a border, within rounding
+    assert (labeller(met) == labeller(looked)[hit]).mean() > 0.999
+
+
+def above_a_box():
+    """A camera 10 m above the middle of a box 2 m wide and 4 m high."""
+    ground = Solid.prism(rectangle((-20, -20), (20, 20)), 0.0, 0, 0, bottom=-1.0)
+    pose = np.eye(4)
+    pose[:3, :3], pose[2, 3] = np.diag([1.0, -1.0, -1.0]), 10.0
+    return Flight(Scene([ground, Solid.prism(rectangle((-1, -1), (1, 1)), 4.0, 1, 2)]), Pinhole(81, 61), pose[None])
+
+
+def test_a_box_hides_what_is_in_its_shadow():
+    flown = above_a_box()
+    xy = np.random.default_rng(0).uniform(-8, 8, (4000, 2))
+    points = np.column_stack([xy, np.zeros(len(xy))])
+    some, seen = flown.meet(0, points, np.full(len(xy), 4))
+    f = flown.sensor.intrinsics.fx
+    image = np.abs(xy * f / 10)
+    inside = (image[:, 0] < 40.5) & (image[:, 1] < 30.5)
+    shadow = np.abs(xy).max(axis=1) < 10 / 6  # of the top's edges, 6 m below the camera
+    assert set(some) == set(np.flatnonzero(inside & ~shadow))
+    assert seen.u == pytest.approx(40 + xy[some, 0] * f / 10)
+    assert seen.v == pytest.approx(30 - xy[some, 1] * f / 10)
+    assert seen.t == pytest.approx(10.0)
+    assert seen.point == pytest.approx(points[some])
+
+
+def test_an_image_shows_the_box_and_the_ground():
+    flown = above_a_box()
+    (seen,) = flown.images
+    f = flown.sensor.intrinsics.fx
+    top = np.maximum(np.abs(seen.u - 40), np.abs(seen.v - 30)) < f / 6
+    assert (seen.truth == np.where(top, 2, 0)).all()
+    assert seen.t == pytest.approx(np.where(top, 6.0, 10.0))
+
+
+def test_points_are_as_frequent_as_their_surface_is_large():
+    _, face = above_a_box().scene.draw(40000, np.random.default_rng(0))
+    areas = [40.0, 40, 40, 40, 1600, 0, 8, 8, 8, 8, 4, 0]
+    assert np.bincount(face, minlength=12) / 40000 == pytest.approx(np.array(areas) / np.sum(areas), abs=0.004)
+
+
+def test_the_tool_is_near_the_exact_value_where_errors_are_alike_everywhere():
+    true, own = exact.trial(exact.Condition("orbit", "pixels", 12), 0, (60, 80), 4000)
+    assert own.value == pytest.approx(true.value, abs=0.03)
