@@ -45,8 +45,8 @@ def as_in_0_3(value):
             "reached": named["judged"]["psa"],
         }
         named["reach"] = {"by": "ground truth", "voxels": 9, "classes": [share]}
-    if {"level", "probability", "line"} == named.keys():
-        del named["probability"]
+    if {"level", "probability", "line"} <= named.keys():
+        named = {name: named[name] for name in ("level", "line")}
     if isinstance(named.get("cubes"), int) and "verdict" in named:
         named["blocks"] = {"count": named.pop("cubes"), "size": 0.5}
     return named

@@ -175,6 +175,24 @@ def test_a_rule_of_each_class_leaves_out_what_neither_or_the_baseline_never_give
         assert f"{rule}: left out, as seen nowhere twice in {doorless}: door" in found.notes
 
 
+def test_what_has_no_label_counts_as_disagreeing_in_a_rule_on_alpha(run, tmp_path):
+    """Of each image the left third has no label."""
+    data = shutil.copytree(run.parent / "wall", tmp_path / "wall")
+    for path in (data / "labels/a").glob("*.png"):
+        labels = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
+        labels[:, : labels.shape[1] // 3] = 255
+        cv2.imwrite(str(path), labels)
+    semstab.run(configure(data, check=None, models=["a"]), out=tmp_path / "silent", report=False)
+    found = gate(tmp_path / "silent", None, gate_config(rules=["alpha > 0.1", "psa > 0"]))
+    alpha, _ = found.judgements
+    (record,) = semstab.load(tmp_path / "silent").result.select()
+    cells, own = record.statistics.cells, record.statistics.headline.alpha
+    assert 0.5 < cells.pairs_labelled < 0.8
+    assert alpha.new == pytest.approx(own.value * cells.pairs_labelled)
+    assert alpha.interval.high <= cells.pairs_labelled
+    assert [note for note in found.notes if "which count as disagreeing: alpha is 0." in note]
+
+
 def test_a_class_that_the_run_has_lost_does_not_pass(run, doorless):
     found = gate(doorless, f"{run}:a", gate_config(rules=["class *: alpha drop < 1.9"]))
     wall, door, window = found.judgements
@@ -501,7 +519,7 @@ def test_a_change_of_alpha_is_what_a_comparison_says_of_the_same_runs(run, quiet
         assert (row.base, row.new, row.interval.value) == (own.base, own.other, own.difference.value)
     kept = {name: semstab.load_result(folder).record(model=own).statistics
             for name, folder, own in (("new", quiet_models, "part"), ("base", run, "a"))}  # fmt: skip
-    assert alone.new == kept["new"].headline.alpha.value
+    assert alone.new == pytest.approx(kept["new"].headline.alpha.value * kept["new"].cells.pairs_labelled)
     assert of_all.base != kept["base"].headline.alpha.value
     assert voxels.new == pytest.approx(kept["new"].agreement.voxel_alpha.value)
     text, *_ = gate(new, base, gate_config(rules=rules[:1])).notes

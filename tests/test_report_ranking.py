@@ -11,9 +11,12 @@ from posed_config import configure
 from rich.console import Console
 
 import semstab
+import semstab.report.ranking
 from semstab.comparison.gate import gate, gate_config
 from semstab.configure import predicted_config, resolve
+from semstab.core.palette import KINDS
 from semstab.predict.predictor import parse_predictors
+from semstab.report.page import _card
 from semstab.report.ranking import answers, ranking
 from semstab.report.terminal import print_summary
 
@@ -103,6 +106,65 @@ def test_two_models_are_one_sentence(result, tmp_path):
     (text,) = answers(found)
     assert text.startswith("nervous is less stable than twin: alpha -")
     assert printed(found, tmp_path / "run").index(text[:40]) < 300
+
+
+@pytest.mark.parametrize(("vss", "sbd", "miou", "said"), [
+    (0.04, 0.5, 0.15,
+     "VSS (OP>=3) (.942 against .902), SBD (.010 against .020) and mIoU (.580 against .430) are better"),
+    (0.04, 1.0, -0.1, "VSS (OP>=3) (.942 against .902) is better"),
+    (0.01, 0.95, 0.01, None),
+    (-0.1, 2.0, -0.1, None),
+])  # fmt: skip
+def test_measures_that_say_the_opposite_of_alpha_are_named_in_one_line(
+    result, tmp_path, monkeypatch, vss, sbd, miou, said
+):
+    """By alpha nervous is less stable than twin; here other measures of nervous are better, by so much."""
+    numbers = {
+        "twin": {"VSS (OP>=3)": 0.942 - vss, "SBD": 0.02, "mIoU": 0.58 - miou},
+        "nervous": {"VSS (OP>=3)": 0.942, "SBD": 0.02 * sbd, "mIoU": 0.58},
+    }
+    found = of_some(result, ["twin", "nervous"], tmp_path / "run")
+    monkeypatch.setattr("semstab.report.ranking._measured", lambda records: numbers[records[0].unit.model])
+    told = list(answers(found))
+    assert len(told) == 1 + (said is not None)
+    if said is not None:
+        assert told[1].startswith("the measures do not agree on this order: alpha is higher for twin, but ")
+        assert f"{said} for nervous" in told[1]
+        assert told[1][:60] in printed(found, tmp_path / "run")
+
+
+def test_a_model_that_owes_its_order_to_what_it_leaves_out_is_not_shown_to_be_more_stable(
+    result, tmp_path, monkeypatch
+):
+    """By common observations twin is the more stable one."""
+    found = of_some(result, ["twin", "nervous"], tmp_path / "run")
+    common = semstab.report.ranking._common
+
+    def silent(files):
+        return common(files)[0], {"twin": 0.5, "nervous": 0.6}
+
+    monkeypatch.setattr("semstab.report.ranking._common", silent)
+    semstab.report.ranking._ranking.cache_clear()
+    first, second, *_ = answers(found)
+    (difference,) = ranking(found).differences
+    semstab.report.ranking._ranking.cache_clear()
+    assert (difference.shown, difference.silent) == (False, True)
+    assert first.startswith("nervous is not shown to differ from twin: alpha -")
+    assert second.startswith("twin has a higher alpha than nervous on what both label, but a lower one if what it")
+
+
+def test_both_levels_are_printed_where_they_differ(result, tmp_path):
+    """Twin labels 92 % of the pixels, and is usable of all."""
+    for models, who in ((["twin", "nervous"], "twin: "), (["twin"], "")):
+        found = of_some(result, models, tmp_path / "_".join(models))
+        verdict = found.record(model="twin").statistics.verdict
+        for name, content in {"level": "stable", "of_all": "usable", "labelled": 0.92}.items():
+            object.__setattr__(verdict, name, content)
+        said = "stable of the 92 % that it labels, usable of all"
+        assert f"{who}{said}" in " ".join(printed(found, tmp_path / "run").split())
+        assert _card("twin", [found.record(model="twin")])["scenes"][0] == {
+            "scene": "scene0", "level": said, "kind": KINDS["usable"], "probability": "",
+        }  # fmt: skip
 
 
 def test_one_model_has_no_ranking(result, tmp_path):

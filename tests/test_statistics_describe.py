@@ -224,8 +224,8 @@ def of_class(name, low, high, *, matters=True):
 
 
 @pytest.mark.parametrize(("low", "high", "level"), [
-    (0.81, 0.9, "stable"), (0.79, 0.9, "stable"), (0.67, 0.7, "usable"), (0.6, 0.9, "usable"),
-    (0.6, 0.98, "undecided"), (0.3, 0.66, "unstable"), (math.nan, math.nan, "no verdict"),
+    (0.81, 0.9, "stable"), (0.79, 0.9, "stable"), (0.67, 0.7, "usable"), (0.6, 0.79, "usable"),
+    (0.6, 0.9, "undecided"), (0.6, 0.98, "undecided"), (0.3, 0.66, "unstable"), (math.nan, math.nan, "no verdict"),
 ])  # fmt: skip
 def test_the_most_probable_level_is_the_verdict(low, high, level):
     assert judged(low, high).level == level

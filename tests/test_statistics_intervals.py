@@ -14,11 +14,13 @@ from simulated_events import cells_of, grid, log_of
 
 from semstab.core.types import OTHER_SCENES, THESE_FRAMES, THIS_SCENE
 from semstab.data.statistics import Interval
-from semstab.statistics.accumulate import Cubes, cluster_sums_of
+from semstab.statistics.accumulate import Cubes, cluster_sums_of, sums_of_cells
 from semstab.statistics.agreement import ratio_of
 from semstab.statistics.cluster_sums import value
 from semstab.statistics.intervals import (
     NO_LOCATIONS,
+    RESOLUTION,
+    _ends,
     confidence_intervals,
     difference,
     estimate,
@@ -28,6 +30,7 @@ from semstab.statistics.intervals import (
     standard_error,
     unpaired,
 )  # fmt: skip
+from semstab.statistics.variance import Spread
 
 
 def sums_from(labels, side, voxel_size=0.125):
@@ -82,6 +85,33 @@ def test_no_error_seen_is_not_no_error_and_next_to_nothing_is_nowhere():
     assert places.estimate(1e-112 * columns, ratio_of).undecided == NO_LOCATIONS
 
 
+@pytest.mark.parametrize("wrong", [1, 2, 5, 20])
+def test_a_few_errors_leave_an_interval_that_is_narrow_and_holds_one(wrong):
+    """Of 10,404 places in eight frames so many err once; the ends are no narrower than without a single error."""
+    labels = np.repeat(np.arange(102 * 102)[:, None] % 3, 8, axis=1)
+    none = estimate(sums_of_cells(cells_of(labels, index=grid(102))), "alpha")
+    labels[:wrong, 0] = (labels[:wrong, 0] + 1) % 3
+    found = estimate(sums_of_cells(cells_of(labels, index=grid(102))), "alpha")
+    assert 0.9 < found.low < found.value < found.high == 1
+    assert found.low <= none.low + 0.05
+    assert probability_above(found, 0.8, "agreement") > 0.99
+
+
+@pytest.mark.parametrize("value", [-0.9, 0.0, 0.5, 0.9, 0.99, 0.99995, 1.0])
+def test_ends_of_an_agreement_grow_with_its_error_without_a_jump(value):
+    """From no error at all to more than everything; nothing explodes where 1 is within noise."""
+    halves = np.geomspace(1e-5, 3, 4000)
+    ends = [_ends(value, Spread((half / 1.96) ** 2, math.inf), 0.02, "agreement", 0.95) for half in halves]
+    low, high = np.array(ends).T
+    assert (np.diff(low) < 1e-12).all()
+    assert np.diff(low).min() > -0.02
+    assert (value - low <= 2 * halves + 0.02).all()
+    assert ((low <= value) & (value <= high) & (high <= 1)).all()
+    assert (np.diff(high) >= 0).all()
+    assert not ((high > 1 - RESOLUTION) & (high < 1)).any()
+    assert (high == 1).all() == (value >= 1 - RESOLUTION)
+
+
 def test_an_interval_says_its_level_and_what_follows_from_it_does_not_depend_on_that():
     sums = simulated(frames=32, observations=8, side=24)
     usual, narrow = estimate(sums, "alpha"), estimate(sums, "alpha", level=0.8)
@@ -100,7 +130,7 @@ def test_few_places_and_places_that_err_alike_leave_a_wide_interval_and_one_cube
     labels[: 18 * 36] = 1
     labels[[5, 700, 1200], 0] ^= 1
     found = estimate(sums_from(labels, 36), "alpha", scope=THESE_FRAMES)
-    assert 0.95 < found.low < found.value < found.high < 1
+    assert 0.95 < found.low < found.value < found.high == 1  # it cannot be told from 1
     near, far = (estimate(simulated(side=64, reach=reach), "alpha", scope=THESE_FRAMES) for reach in (6.0, 0.5))
     assert near.high - near.low > 3 * (far.high - far.low)
     only = estimate(sums_from(np.zeros((4, 3), dtype=int), 2, 0.5), "alpha", scope=THESE_FRAMES)

@@ -20,6 +20,7 @@ from semstab.comparison.gate_evaluation import (
     is_lost,
     require_data,
     require_values,
+    silence_notes,
     value_of,
     with_values,
 )
@@ -116,7 +117,8 @@ def gate(new: str | os.PathLike[str], against: str | os.PathLike[str] | None, co
                 continue
             require_values(rule, pairs)
             judgements.append(assess(rule, pairs, config.level / len(rules), config.scope))
-            notes += [*coverage_counts(judgements[-1], pairs), *(runs.common[1] if runs.on_common(rule) else ())]
+            notes += [*silence_notes(rule, pairs), *coverage_counts(judgements[-1], pairs)]
+            notes += runs.common[1] if runs.on_common(rule) else ()
     notes += _without_frames(judgements, config.scope)
     baseline = "" if base is None else str(base)
     return GateResult(

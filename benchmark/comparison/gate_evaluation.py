@@ -15,7 +15,7 @@ from semstab.comparison.gate_result import Judgement, negative, verdict
 from semstab.comparison.gate_rules import Rule
 from semstab.comparison.pairing import on_common_observations
 from semstab.comparison.runs import Entry, RunHandle
-from semstab.comparison.tables import COVERAGE, FLICKER, RECURRENT_VSS, SBD_EXCESS, left_out
+from semstab.comparison.tables import COVERAGE, FLICKER, LEAST_LEFT_OUT, RECURRENT_VSS, SBD_EXCESS, left_out
 from semstab.config import nearest
 from semstab.core.types import OTHER_SCENES, THESE_FRAMES, THIS_SCENE, Scope
 from semstab.data.measures import Measure
@@ -189,7 +189,8 @@ def value_of(rule: Rule, entry: Entry) -> float:
         return float(np.mean(list(entry.flicker.values())))
     if rule.measure.quantity is COVERAGE:
         return math.nan
-    return value(entry.sums, rule.measure.quantity.key, _k(rule, entry))
+    number = value(entry.sums, rule.measure.quantity.key, _k(rule, entry))
+    return min(number, number * entry.counted) if bounds_alpha(rule) else number
 
 
 def _interval_of(rule: Rule, new: Entry, base: Entry | None, level: float, scope: Scope) -> Interval:
@@ -199,6 +200,9 @@ def _interval_of(rule: Rule, new: Entry, base: Entry | None, level: float, scope
     if rule.measure.quantity is not FLICKER:
         k, before = _k(rule, new), None if base is None else base.sums
         result = bounded(rule, new.sums, before, k=k, level=level, scope=scope)
+        if bounds_alpha(rule):
+            number, low, high = (min(x, new.counted * x) for x in (result.value, result.low, result.high))
+            result = dataclasses.replace(result, value=number, low=low, high=high)
         if _of_all_alpha(rule) and any(map(_is_nearly_one_class, (new.sums, before))):
             return dataclasses.replace(result, undecided=ONE_CLASS)
         return result
@@ -234,6 +238,23 @@ ONE_CLASS = "nearly the whole map is one class, so that alpha tells nothing"
 
 def _of_all_alpha(rule: Rule) -> bool:
     return rule.measure.quantity is ALPHA and rule.class_name is None
+
+
+def bounds_alpha(rule: Rule) -> bool:
+    """Return whether a rule bounds alpha itself, for which what has no label counts as disagreeing."""
+    return _of_all_alpha(rule) and rule.change is None
+
+
+def silence_notes(rule: Rule, pairs: Sequence[Pair]) -> list[str]:
+    """Return how alpha of a rule differs from that of what the run labels."""
+    if not bounds_alpha(rule):
+        return []
+    return [
+        f"{new.summary.unit.scene}: the run gives no label in {1 - new.counted:.1%} of the pairs of views, which count"
+        f" as disagreeing: alpha is {value_of(rule, new):.3f}, and {value(new.sums, ALPHA.key):.3f} of what it labels"
+        for new, _ in pairs
+        if 1 - new.counted >= LEAST_LEFT_OUT
+    ]
 
 
 def _is_nearly_one_class(sums: ClusterSums | None) -> bool:

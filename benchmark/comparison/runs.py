@@ -70,6 +70,12 @@ class Entry(EntryNumbers):
     record: Record | None = None
     small: tuple[ClusterSums, Flicker] | None = None
 
+    @property
+    def counted(self) -> float:
+        """Return the factor of its alpha if what has no label counts as disagreeing; 1 where that is not known."""
+        statistics = self.summary.statistics
+        return 1.0 if statistics is None or statistics.cells is None else statistics.cells.counted
+
     @functools.cached_property
     def sums(self) -> ClusterSums:
         """Its sums by frame and cube of space.

@@ -477,7 +477,7 @@ class Result:
             verdict = alpha = ""
             if run.statistics is not None:
                 verdict, alpha = str(run.statistics.verdict), run.statistics.headline.alpha.text()
-                colors[verdict] = KIND_COLORS[KINDS.get(run.statistics.verdict.level, "bad")]
+                colors[verdict] = KIND_COLORS[KINDS.get(run.statistics.verdict.decisive, "bad")]
             rows.append([unit.scene, unit.model, unit.backend, verdict, alpha, table.voxels, *seen])
         titles = [measure.title for measure in measures()]
         headers = [

@@ -156,7 +156,7 @@ def _is_untested(record: Record) -> bool:
     statistics = record.statistics
     return bool(
         statistics
-        and statistics.verdict.level == "stable"
+        and "stable" in (statistics.verdict.level, statistics.verdict.of_all)
         and statistics.correctness is None
         and record.unit.model != GROUND_TRUTH
     )

@@ -115,8 +115,10 @@ def _scene_verdict(record: Record) -> dict[str, str]:
     statistics = record.statistics
     if statistics is None:
         return {"scene": record.unit.scene, "level": "not assessed", "kind": "open", "probability": ""}
-    level, p = statistics.verdict.level, statistics.verdict.stated
-    return {"scene": record.unit.scene, "level": level, "kind": KINDS.get(level, "bad"), "probability": p}
+    verdict = statistics.verdict
+    level, kind = verdict.difference or verdict.level, KINDS.get(verdict.decisive, "bad")
+    p = "" if verdict.difference else verdict.stated
+    return {"scene": record.unit.scene, "level": level, "kind": kind, "probability": p}
 
 
 def _numbers(
@@ -140,8 +142,8 @@ def _numbers(
     alpha = macro_mean(alphas)
     yield "alpha", "" if math.isnan(alpha) else short(alpha), interval(None if head is None else head.alpha)
     yield "two views agree", mean([stats.agreeing for stats in assessed], "{:.0f} %", 100), "of the spots"
-    if one is not None and one.ranges is not None and one.ranges.is_told:
-        value, note = one.ranges.parts
+    if one is not None and one.told_ranges is not None:
+        value, note = one.told_ranges.parts
         yield "reliable", value, note
     flicker = [record.image_space.compensated_flicker_percent for record in records]
     yield "flicker", mean(flicker, "{:.1f} %"), f"of the {records[0].image_space.changing}, motion removed"

@@ -12,12 +12,13 @@ from typing import TypeVar
 
 from semstab.core.types import THESE_FRAMES, THIS_SCENE, Scope
 from semstab.data.labels import sharing_classes
+from semstab.data.measures import SBD, VSS
 from semstab.data.records import Record, Result
-from semstab.data.statistics import Estimate, Interval
+from semstab.data.statistics import Estimate, Interval, short
 from semstab.datasets import GROUND_TRUTH
 from semstab.metrics import macro_mean
 from semstab.report.filter_study import filter_studies
-from semstab.report.means import by_model
+from semstab.report.means import ENOUGH, by_model, pooled
 from semstab.statistics.agreement import ALPHA
 from semstab.statistics.cluster_sums import ClusterSums, value
 from semstab.statistics.intervals import difference, mean_of, scope_of
@@ -35,7 +36,10 @@ class Difference:
         p_holm: p-value, corrected for all pairs of models.
         scope: What varies in the interval.
         undecided: Why nothing may be claimed; '' where something may.
-        shown: Whether the difference is shown: Holm's p-value is below 0.05, and the interval excludes 0.
+        shown: Whether the difference is shown: Holm's p-value is below 0.05, the interval excludes 0, and it is not
+            `silent`.
+        silent: Whether the first two hold, but the more stable model owes that to what it leaves out: its alpha is the
+            lower one if what has no label counts as disagreeing (`Ignored.alpha`).
     """
 
     model: str
@@ -48,6 +52,7 @@ class Difference:
     scope: Scope
     undecided: str
     shown: bool
+    silent: bool = False
 
 
 @dataclass(frozen=True)
@@ -100,28 +105,36 @@ def _files(records: list[Record]) -> Files:
 @functools.lru_cache(maxsize=8)
 def _ranking(scenes: tuple[Files, ...], names: tuple[str, ...]) -> Ranking:
     """Return the ranking of some models, which terminal and report ask for one after the other."""
-    sums = [_common_sums(files) for files in scenes] if len(names) > 1 else []
-    apart = tuple(name for name in names if sums and name not in sums[0])
+    common = [_common(files) for files in scenes] if len(names) > 1 else []
+    apart = tuple(name for name in names if common and name not in common[0][0])
     names = tuple(name for name in names if name not in apart)
-    known = [each for each in sums if {*names} <= each.keys()]
-    return replace(ranked(known, names), apart=apart)
+    known = [each for each in common if {*names} <= each[0].keys()]
+    of_all = {name: macro_mean([alpha[name] for _, alpha in known]) for name in names} if known else {}
+    return replace(ranked([sums for sums, _ in known], names, of_all=of_all), apart=apart)
 
 
 def ranked(
-    scenes: Sequence[Mapping[str, ClusterSums]], names: Sequence[str], places: Sequence[str] | None = None
+    scenes: Sequence[Mapping[str, ClusterSums]],
+    names: Sequence[str],
+    places: Sequence[str] | None = None,
+    of_all: Mapping[str, float] | None = None,
 ) -> Ranking:
-    """Return the ranking of models by their sums in each scene; each place counts once, however often it was flown."""
+    """Return the ranking of models by their sums in each scene; each place counts once, however often it was flown.
+
+    of_all is alpha of each model if what it leaves out counts as disagreeing: a model is not shown to be more stable
+    than another where that is lower.
+    """
     places = [str(k) for k in range(len(scenes))] if places is None else places
     pairs = list(itertools.combinations(names, 2)) if scenes else []
     changes = [over_places([_difference(by_model[b], by_model[a]) for by_model in scenes], places) for a, b in pairs]
     p_values = holm([change.p_value for change in changes])
-    differences = tuple(
-        Difference(
-            b, a, change.value, change.low, change.high, len(scenes), p, change.scope, change.undecided,
-            shown=change.decided and p < 1 - change.level and not change.low <= 0 <= change.high,
-        )
-        for (a, b), change, p in zip(pairs, changes, p_values, strict=True)
-    )  # fmt: skip
+    differences = []
+    for (a, b), change, p in zip(pairs, changes, p_values, strict=True):
+        differs = change.decided and p < 1 - change.level and not change.low <= 0 <= change.high
+        silent = bool(differs and of_all) and change.value * ((of_all or {})[b] - (of_all or {})[a]) < 0
+        interval = change.value, change.low, change.high
+        shown = differs and not silent
+        differences.append(Difference(b, a, *interval, len(scenes), p, change.scope, change.undecided, shown, silent))
     alpha = {name: _mean_alpha(name, scenes, places) for name in names} if scenes else {}
     better = dict.fromkeys(alpha, 0)
     for each in differences:
@@ -129,7 +142,7 @@ def ranked(
             better[each.other if each.value > 0 else each.model] += 1
     order = sorted(alpha, key=lambda name: (better[name], -alpha[name]))
     ranks = tuple((1 + n, tuple(tied)) for n, tied in itertools.groupby(order, key=better.__getitem__))
-    return Ranking(ranks, differences)
+    return Ranking(ranks, tuple(differences))
 
 
 def over_places(values: Sequence[Interval], places: Sequence[str]) -> Interval:
@@ -163,6 +176,8 @@ def answers(result: Result) -> Iterator[str]:
             relation = "is not compared with"
         elif one.shown:
             relation = "is more stable than" if one.value > 0 else "is less stable than"
+        elif one.silent:
+            relation = "is not shown to differ from"
         change = Estimate(one.value, one.low, one.high).text("+")
         scenes = f", {one.scenes} of {len(result.scenes)} scenes" if one.scenes < len(result.scenes) else ""
         why = f"; {one.undecided}" if one.undecided else ""
@@ -174,6 +189,13 @@ def answers(result: Result) -> Iterator[str]:
             "ranks are by alpha of the observations that all models made; a rank is 1 plus the number of models shown"
             f" to be more stable (Holm over {len(ranked.differences)} pairs)"
         )
+    for each in (each for each in ranked.differences if each.silent):
+        better, worse = (each.model, each.other) if each.value > 0 else (each.other, each.model)
+        yield (
+            f"{better} has a higher alpha than {worse} on what both label, but a lower one if what it leaves out counts"
+            " as disagreeing"
+        )
+    yield from contradictions(result, ranked)
     if ranked.unranked:
         yield f"not ranked, as nearly the whole map is one class: {', '.join(ranked.unranked)}"
     if ranked.apart and not ranked.ranks:
@@ -182,12 +204,69 @@ def answers(result: Result) -> Iterator[str]:
         yield f"not compared, as the classes of the others differ: {', '.join(ranked.apart)}"
 
 
+CLEAR: Mapping[str, tuple[float, float]] = {"VSS (OP>=3)": (0.02, 0.0), "SBD": (0.002, 0.2), "mIoU": (0.02, 0.0)}
+"""How far two models have to lie apart for a measure to tell their order: at least so far, and by at least such a share
+of the larger value. VSS and mIoU are from 0 to 1, SBD is in bits."""
+
+
+def contradictions(result: Result, ranked: Ranking) -> Iterator[str]:
+    """Yield one sentence where other measures clearly say the opposite of an order that alpha shows.
+
+    It has the numbers of the first such pair, that with the largest difference of alpha, and names the others.
+    """
+    models = by_model(result.select())
+    opposed = []
+    for each in sorted((each for each in ranked.differences if each.shown), key=lambda each: -abs(each.value)):
+        better, worse = (each.model, each.other) if each.value > 0 else (each.other, each.model)
+        if against := _against(models[better], models[worse]):
+            opposed.append((better, worse, against))
+    if not opposed:
+        return
+    better, worse, against = opposed[0]
+    *others, last = against
+    listed = f"{', '.join(others)} and {last}" if others else last
+    more = "; ".join(f"{first} above {second}" for first, second, _ in opposed[1:4])
+    rest = f"; so it is for {more}{', ...' if len(opposed) > 4 else ''}" if more else ""
+    yield (
+        f"the measures do not agree on this order: alpha is higher for {better}, but {listed}"
+        f" {'are' if others else 'is'} better for {worse}{rest}; look at the classes before you choose"
+    )
+
+
+def _against(better: Sequence[Record], worse: Sequence[Record]) -> list[str]:
+    """Return the measures that are clearly better for the second model: 'VSS (OP>=3) (.942 against .863)'."""
+    found = []
+    of_both = (_measured(worse), _measured(better))
+    for name, (least, share) in CLEAR.items():
+        higher, lower = (values[name] for values in of_both)
+        gain = lower - higher if name == "SBD" else higher - lower  # less drift is better
+        if gain >= max(least, share * max(abs(higher), abs(lower))):
+            found.append(f"{name} ({short(higher, digits=3)} against {short(lower, digits=3)})")
+    return found
+
+
+def _measured(records: Sequence[Record]) -> dict[str, float]:
+    """Return the measures of a model beside alpha, over its scenes; NaN where unknown."""
+    recurrent = pooled(records).recurrent
+    enough = recurrent.voxels >= ENOUGH
+    known = [record.statistics.correctness for record in records if record.statistics is not None]
+    miou = macro_mean([right.miou.value for right in known if right is not None]) if any(known) else math.nan
+    vss, sbd = (recurrent[measure] if enough else math.nan for measure in (VSS, SBD))
+    return {"VSS (OP>=3)": vss, "SBD": sbd, "mIoU": miou}
+
+
 def _is_uninformative(record: Record) -> bool:
     return record.statistics is not None and record.statistics.verdict.level == "uninformative"
 
 
-def _common_sums(files: Files) -> Mapping[str, ClusterSums]:
-    """Return the sums of the observations that all models of a scene with the same classes made."""
+def _common(files: Files) -> tuple[Mapping[str, ClusterSums], Mapping[str, float]]:
+    """Return the sums of the observations that all models of a scene with the same classes made.
+
+    Beside them is alpha of each model if what it leaves out counts as disagreeing.
+    """
     loaded = {name: CellObservations.load(file) for name, file, _ in files}
     names = sharing_classes({name: each.classes for name, each in loaded.items()})
-    return compared_observations({name: loaded[name] for name in names}).sums if names else {}
+    if not names:
+        return {}, {}
+    both = compared_observations({name: loaded[name] for name in names})
+    return both.sums, {row.model: row.alpha for row in both.compared.ignored}

@@ -16,6 +16,7 @@ from semstab.statistics.accumulate import sums_of_cells
 from semstab.statistics.cluster_sums import MOST_CLASSES, ClusterSums, chance_of, value
 from semstab.statistics.intervals import confidence_intervals, probability_above, scope_of, spec_of
 from semstab.statistics.observations import CellObservations
+from semstab.statistics.silence import silence
 from semstab.statistics.verdict import LIMITS, Limits
 
 LITTLE, MUCH = 0.01, 0.1
@@ -48,6 +49,7 @@ def cell_agreement(
     alphas = confidence_intervals(
         spec_of(sums, "alpha", k, scope_of_cells) for k in range(table.K) if table.K <= MOST_CLASSES
     )
+    silent = silence(cells)
     n, largest = float(fine["observations"].sum()), int(evidence.argmax())
     disagreement = _disagreement(evidence / n if n else evidence, np.array([alpha.value for alpha in alphas]))
     moving = [k for k in labels.moving(names) if k < len(disagreement) and disagreement[k] >= LITTLE]
@@ -73,6 +75,8 @@ def cell_agreement(
             for k, (name, alpha) in enumerate(zip(names, alphas, strict=False))
         ),
         moving=moving_classes(cells, sums, moving) if disagreement[moving].sum() >= MUCH else None,
+        pixels_labelled=silent.pixels,
+        pairs_labelled=silent.pairs,
     )
 
 

@@ -208,10 +208,12 @@ def probability_above(interval: Interval, threshold: float, scale: Scale) -> flo
     from scipy import special
 
     low, high = interval.low, interval.high
-    if scale == "agreement" and interval.value < 1 - TINY:  # by the end that no bound cuts off, on log(1 - x)
+    if scale == "agreement" and 1 - low <= math.e * (1 + TINY) * (1 - interval.value):  # on log(1 - x), see `_ends`
         value, error = -math.log(max(1 - interval.value, TINY)), -math.log(max(1 - interval.value, TINY))
         error -= -math.log(max(1 - low, TINY))
         above = -math.log(max(1 - threshold, TINY))
+    elif scale == "agreement":  # by the end that no bound cuts off
+        value, error, above = interval.value, interval.value - low, threshold
     else:
         value, error, above = interval.value, max(interval.value - low, high - interval.value), threshold
     if math.isnan(value) or math.isnan(error):
@@ -243,15 +245,41 @@ def _share_ends(p: float, spread: Spread, units: int, level: float) -> tuple[flo
     return float(low), float(high)
 
 
+RESOLUTION = 0.02
+"""Distance from 1 within which an alpha cannot be told from 1: the error that is left where cells on borders of labels
+are extrapolated to cells without a size. Alpha of perfect labels is .98 to 1.00 (docs/metrics.md)."""
+
+
 def _ends(result: float, spread: Spread, unseen: float, scale: Scale, level: float) -> tuple[float, float]:
-    """Return the ends by Student's t, for agreement on the scale log(1 - x), so that none passes 1."""
+    """Return the ends by Student's t, with half the width h.
+
+    An agreement x has its interval on the scale log(1 - x), so that none passes 1, as long as h is below 1 - x:
+
+        1 - (1 - x) exp(h / (1 - x)) to 1 - (1 - x) exp(-h / (1 - x))
+
+    - From h = 1 - x on, the lower end is (e - 1) h below x: the scale's own end at h = 1 - x, from where on h tells
+      nothing of the relative error of 1 - x. The few errors that were seen may be fewer than those that were missed, so
+      that `unseen`, the part that locations without a single error may have missed, counts in addition, by
+      1 - (1 - x) / h: not at all at h = 1 - x, in full at x = 1.
+    - An upper end within RESOLUTION of 1 is 1.
+    - Without any variance the lower end is `unseen` below x.
+    """
     if spread.variance <= TINY:
-        return result - unseen, result if scale == "agreement" else result + unseen
+        return result - unseen, _up_to_one(result) if scale == "agreement" else result + unseen
     half = spread.half(level)
-    if scale == "plain" or 1 - result <= TINY:
+    if scale == "plain" or math.isnan(half):
         return result - half, result + half
-    ratio = min(half / (1 - result), 30.0)
-    return 1 - (1 - result) * math.exp(ratio), 1 - (1 - result) * math.exp(-ratio)
+    apart = max(1 - result, TINY)
+    ratio = half / apart
+    high = _up_to_one(1 - apart * math.exp(-ratio))
+    if ratio < 1:
+        return 1 - apart * math.exp(ratio), high
+    return result - math.hypot((math.e - 1) * half, unseen * (1 - 1 / ratio)), high
+
+
+def _up_to_one(high: float) -> float:
+    """Return the upper end of an agreement's interval: 1 where it cannot be told from 1."""
+    return 1.0 if 1 - high <= RESOLUTION else high
 
 
 def _interval(

@@ -10,9 +10,10 @@ import numpy as np
 from semstab.core.types import THIS_SCENE, Float64, Scope
 from semstab.data.statistics import UNKNOWN, RangeAgreement, RangeStratum
 from semstab.statistics.accumulate import sums_of_cells
+from semstab.statistics.cluster_sums import chance_of
 from semstab.statistics.intervals import estimate, scope_of
 from semstab.statistics.observations import CellObservations
-from semstab.statistics.verdict import LIMITS, Limits
+from semstab.statistics.verdict import LEAST_CLASSES, LIMITS, Limits
 
 EDGES: Float64 = np.array([m * 10.0**e for e in range(-1, 4) for m in (1, 1.5, 2, 3, 5, 7)])
 """Ranges, in metres, at which strata end."""
@@ -21,13 +22,16 @@ LEAST_ENTRIES, LEAST_SHARE = 2000, 0.02
 """The least entries of a stratum, and their share in all; a smaller one is joined with the next."""
 
 LEAST_SEEN_TWICE = 200
-"""The least number of cells that two views saw from a range, for its alpha to be reported."""
+"""The least number of cells that two views saw from a range, for it to be assessed."""
 
 
 def range_agreement(
     cells: CellObservations, scope: Scope = THIS_SCENE, limits: Limits = LIMITS
 ) -> RangeAgreement | None:
     """Return alpha by range, from sampled cells; None where all were seen from about one distance.
+
+    A stratum is assessed, and has an alpha, where two views saw LEAST_SEEN_TWICE cells or more and they have
+    LEAST_CLASSES effective classes or more.
 
     The range of an observation is the distance of the cell from its view's centre. A stratum has the observations that
     were made in it: two of one cell count together where both fall into it.
@@ -41,19 +45,19 @@ def range_agreement(
         return None
     strata = []
     for low, high in itertools.pairwise(edges):
-        within = cells.only((distance >= low) & (distance < high))
+        within = cells.only((distance >= low) & ((distance < high) | (high == edges[-1])))
         sums = sums_of_cells(within)
         fine = sums.fine
         assert fine is not None
         seen_twice = round(float(fine["voxels"].sum()))
-        enough = seen_twice >= LEAST_SEEN_TWICE
-        alpha = estimate(sums, "alpha", scope=scope_of(sums, scope)) if enough else UNKNOWN
+        assessed = seen_twice >= LEAST_SEEN_TWICE and chance_of(fine) * LEAST_CLASSES <= 1
+        alpha = estimate(sums, "alpha", scope=scope_of(sums, scope)) if assessed else UNKNOWN
         strata.append(RangeStratum(low, high, len(within) / len(cells), seen_twice, alpha))
     return RangeAgreement(tuple(strata), limits.usable, *_reliable(strata, limits.usable))
 
 
 def _edges(distance: Float64) -> list[float]:
-    """Return ends of strata that each have enough entries, the first one 0; the last one is the farthest entry's."""
+    """Return ends of strata that each have enough entries, the first one 0; the last one is the farthest distance."""
     least = max(LEAST_ENTRIES, LEAST_SHARE * len(distance))
     chosen, below = [0.0], 0
     for edge in EDGES.tolist():
@@ -61,8 +65,8 @@ def _edges(distance: Float64) -> list[float]:
         if nearer - below >= least and len(distance) - nearer >= least:
             chosen.append(edge)
             below = nearer
-    beyond = EDGES[distance.max() < EDGES]
-    return [*chosen, float(beyond[0]) if len(beyond) else math.inf]
+    farthest = float(distance.max())
+    return [*(edge for edge in chosen if edge < farthest), farthest]
 
 
 def _reliable(strata: list[RangeStratum], usable: float) -> tuple[float, float, float]:
@@ -75,7 +79,7 @@ def _reliable(strata: list[RangeStratum], usable: float) -> tuple[float, float, 
         reached = 0.0
         for stratum, value in zip(strata, values, strict=True):
             if math.isnan(value):
-                continue  # hardly a spot was seen twice from there
+                continue  # not assessed
             if value < usable:
                 break
             reached = stratum.high

@@ -2,12 +2,21 @@
 
 from __future__ import annotations
 
+import dataclasses
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 
 from semstab.core.types import THIS_SCENE
-from semstab.data.statistics import CellAgreement, Flipping, HeadlineStatistics, Interval, Level, StabilityVerdict
+from semstab.data.statistics import (
+    CellAgreement,
+    Flipping,
+    HeadlineStatistics,
+    Interval,
+    Level,
+    StabilityVerdict,
+    short,
+)
 from semstab.statistics.intervals import LEAST_FRAMES, probability_above
 
 
@@ -51,7 +60,7 @@ ADVICE: dict[Level, str] = {
     "stable": "its labels agree from frame to frame; act on them",
     "usable": "act on a label only where several frames agree",
     "unstable": "do not act on its labels",
-    "undecided": "no level is probable enough; take more frames",
+    "undecided": "alpha is not known well enough for a level; take more frames",
     "uninformative": "nearly the whole map is one class, so that agreement says nothing",
     "misleading": "do not take agreement for truth",
     "no verdict": "too few locations were seen twice; more overlap between frames is needed",
@@ -66,12 +75,37 @@ TOO_FEW_VOXELS = "its map has too few locations to act on; use smaller voxels, o
 STILL = "the camera stood still: all frames show one view"
 
 
-def level_probabilities(alpha: Interval, limits: Limits = LIMITS) -> Mapping[Level, float]:
-    """Return how probable each level is; NaN without an interval."""
-    reliable, tentative = (
-        probability_above(alpha, threshold, "agreement") for threshold in (limits.stable, limits.usable)
-    )
+def level_probabilities(alpha: Interval, limits: Limits = LIMITS, share: float = 1.0) -> Mapping[Level, float]:
+    """Return how probable each level of share * alpha is; NaN without an interval."""
+
+    def above(limit: float) -> float:
+        return 0.0 if limit > share else probability_above(alpha, limit / share, "agreement")
+
+    if math.isnan(alpha.low):
+        return dict.fromkeys(("stable", "usable", "unstable"), math.nan)
+    reliable, tentative = above(limits.stable), above(limits.usable)
     return {"stable": reliable, "usable": tentative - reliable, "unstable": 1 - tentative}
+
+
+def holds_all_levels(alpha: Interval, limits: Limits = LIMITS, share: float = 1.0) -> bool:
+    """Return whether the interval of share * alpha holds both limits, so that it excludes no level."""
+    return share * alpha.low <= limits.usable and limits.stable <= share * alpha.high
+
+
+def why_undecided(alpha: Interval, limits: Limits = LIMITS) -> str:
+    """Return why no level is stated: the interval holds both limits, or no level is probable enough."""
+    if holds_all_levels(alpha, limits):
+        return f"the interval holds both {short(limits.usable, digits=3)} and {short(limits.stable)}"
+    levels = level_probabilities(alpha, limits).items()
+    return f"no level has p {short(DECIDED)} ({', '.join(f'{name} {_below(p, DECIDED)}' for name, p in levels)})"
+
+
+def _below(p: float, limit: float) -> str:
+    """Return a probability with two digits, and with more of them where it would be rounded up to a limit."""
+    for digits in range(2, 5):
+        if p >= limit or round(p, digits) < limit:
+            return short(p, digits=digits)
+    return f"just below {short(limit)}"
 
 
 def verdict(
@@ -84,7 +118,10 @@ def verdict(
     share: float,
     limits: Limits = LIMITS,
 ) -> StabilityVerdict:
-    """Return the most probable level of alpha.
+    """Return the most probable level of alpha, and the level if what the model leaves out counts as disagreeing.
+
+    It is undecided where the interval of alpha holds both limits, whatever the probabilities are, and where no level
+    has DECIDED. The second level is that of alpha times the share of pairs of views of which both have a label.
 
     Args:
         model: Its name.
@@ -99,11 +136,10 @@ def verdict(
     if reason := _missing(cells, voxels):
         return StabilityVerdict("no verdict", math.nan, f"{model}: no verdict, {reason}; {support}")
     assert cells is not None
-    probabilities = level_probabilities(headline.alpha, limits)
-    level, probability = _level(headline, cells, probabilities)
+    level, probability = _level(headline, cells, limits)
+    of_all, _ = _level(headline, cells, limits, cells.counted)
     silent = cells.labelled < limits.labelled
-    if silent and level == "stable":
-        level, probability = "usable", probabilities["usable"] + probability
+    both = StabilityVerdict(level, probability, "", None if of_all == level else of_all, cells.pixels_labelled)
     wrong = headline.wrong_of_consistent
     same = cells.agreeing(headline.alpha.value)
     parts = [_alpha(headline.alpha, cells), f"two views see the same class at {same:.0%} of the spots"]
@@ -113,12 +149,13 @@ def verdict(
         parts.append(f"{wrong.value:.0%} of the consistent locations are wrong ({wrong.low:.0%} to {wrong.high:.0%})")
     if silent:
         parts.append(f"{1 - cells.labelled:.0%} of the locations have no label in most frames")
-    if flips is not None and level in ACTED_ON:
+    if flips is not None and both.decisive in ACTED_ON:
         parts += _flips(flips)
     how_sure = "" if math.isnan(probability) or level == "undecided" else f" ({probability:.0%})"
+    stated = both.difference or f"{level}{how_sure}"
     reasons = ", ".join(parts)
-    line = f"{model}: {level}{how_sure}, {ADVICE[level]}: {reasons}; {support}; {_for(headline.alpha)}"
-    return StabilityVerdict(level, probability, line)
+    line = f"{model}: {stated}, {ADVICE[both.decisive]}: {reasons}; {support}; {_for(headline.alpha)}"
+    return dataclasses.replace(both, line=line)
 
 
 def _missing(cells: CellAgreement | None, voxels: int) -> str:
@@ -133,16 +170,22 @@ def _missing(cells: CellAgreement | None, voxels: int) -> str:
 
 
 def _level(
-    headline: HeadlineStatistics, cells: CellAgreement, probabilities: Mapping[Level, float]
+    headline: HeadlineStatistics, cells: CellAgreement, limits: Limits, share: float = 1.0
 ) -> tuple[Level, float]:
+    """Return the level of share * alpha with its probability."""
     if cells.effective_classes < LEAST_CLASSES:
         return "uninformative", math.nan
+    probabilities = dict(level_probabilities(headline.alpha, limits, share))
     level = max(probabilities, key=lambda name: probabilities[name])
     if math.isnan(probabilities[level]):
         return "no verdict", math.nan
     if headline.wrong_of_consistent.low > DANGEROUS and level != "unstable":
         return "misleading", math.nan
-    return level if probabilities[level] >= DECIDED else "undecided", probabilities[level]
+    if probabilities[level] < DECIDED or holds_all_levels(headline.alpha, limits, share):
+        return "undecided", probabilities[level]
+    if level == "stable" and cells.labelled < limits.labelled:
+        return "usable", probabilities["usable"] + probabilities["stable"]
+    return level, probabilities[level]
 
 
 def _for(basis: Interval) -> str:

@@ -13,6 +13,7 @@ from semstab.data.statistics.agreement import (
     MovingClasses,
     RangeAgreement,
     RangeStratum,
+    metres,
 )
 from semstab.data.statistics.correctness import Correctness, CorrectnessStatistics, Losses, Quadrants, Reliability
 from semstab.data.statistics.drift import DriftStatistics, Flipping, FlipRates, FrameDisagreement, OutlyingFrames, Trend
@@ -62,5 +63,6 @@ __all__ = [
     "StabilityVerdict",
     "StratumStatistics",
     "Trend",
+    "metres",
     "short",
 ]

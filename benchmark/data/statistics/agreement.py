@@ -88,7 +88,8 @@ class RangeStratum:
         low, high: Ends of the range in metres; the high one is not part of it.
         share: Share of all sampled observations.
         cells: Cells that two views saw from there.
-        alpha: Alpha of these observations.
+        alpha: Alpha of these observations; NaN where they were not assessed: two views saw too few cells from there, or
+            nearly all of them are one class.
     """
 
     low: float
@@ -96,6 +97,19 @@ class RangeStratum:
     share: float
     cells: int
     alpha: Interval
+
+    @property
+    def is_assessed(self) -> bool:
+        """Return whether agreement tells anything of these observations."""
+        return not math.isnan(self.alpha.value)
+
+
+def metres(distance: float) -> str:
+    """Return a distance in metres with three digits, rounded down: '91.8', '150'."""
+    if not (math.isfinite(distance) and distance > 0):
+        return f"{distance:g}"
+    unit = math.floor(math.log10(distance)) - 2
+    return f"{math.floor(round(distance / 10.0**unit, 6)) * 10.0**unit:.6g}"
 
 
 @dataclass(frozen=True)
@@ -117,33 +131,42 @@ class RangeAgreement:
 
     @property
     def farthest(self) -> float:
-        """Return the end of the last stratum in which two views saw a spot, metres."""
-        return max((row.high for row in self.strata if not math.isnan(row.alpha.value)), default=0.0)
+        """Return the end of the last stratum that was assessed, metres."""
+        return max((row.high for row in self.strata if row.is_assessed), default=0.0)
 
     @property
     def is_told(self) -> bool:
-        """Return whether the number is printed: labels are reliable near by and may not be farther out, or at no range.
+        """Return whether the number is printed: labels are reliable near by and may not be farther out, or not there.
 
-        Where neither is known, the verdict alone is printed.
+        Where neither is known, or the interval is all that was seen, the verdict alone is printed.
         """
-        return self.low < self.farthest and (self.reliable > 0 or self.high == 0)
+        known = self.low > 0 or self.high < self.farthest
+        return known and self.low < self.farthest and (self.reliable > 0 or self.high == 0)
 
     @property
     def text(self) -> str:
         """Return the one number for people: 'reliable up to 30 m (20 to 50 m)'."""
-        return " ".join(filter(None, ("reliable", *self.parts)))
+        number, note = self.parts
+        stated = f"reliable {number}" if self.reliable else f"{number.replace('not', 'not reliable', 1)}"
+        return f"{stated} {note}".rstrip()
 
     @property
     def parts(self) -> tuple[str, str]:
         """Return the number, and its interval or the reason: ('up to 30 m', '(20 to 50 m)')."""
         if self.reliable:
-            ends = "" if self.low == self.high else f"{self.low:g} to {self.high:g} m"
+            ends = "" if self.low == self.high else f"{metres(self.low)} to {metres(self.high)} m"
             far = "the farthest seen" if self.reliable == self.farthest else ""
-            note = ", ".join(filter(None, (ends, far)))
-            return f"up to {self.reliable:g} m", note and f"({note})"
-        first = next((row for row in self.strata if not math.isnan(row.alpha.value)), self.strata[0])
-        text = f"(alpha {first.alpha.text()} from {first.low:g} to {first.high:g} m)"
-        return "at no range", text
+            note = ", ".join(filter(None, (ends, far, self._not_assessed)))
+            return f"up to {metres(self.reliable)} m", note and f"({note})"
+        first = next((row for row in self.strata if row.is_assessed), self.strata[0])
+        return f"not from {metres(first.low)} to {metres(first.high)} m", f"(alpha {first.alpha.text()})"
+
+    @property
+    def _not_assessed(self) -> str:
+        """Return the strata within the reliable range that were not assessed: '2 to 3, 5 to 7 m not assessed'."""
+        rows = [row for row in self.strata if row.high <= self.reliable and not row.is_assessed]
+        listed = ", ".join(f"{metres(row.low)} to {metres(row.high)}" for row in rows)
+        return f"{listed} m not assessed" if listed else ""
 
 
 @dataclass(frozen=True)
@@ -159,6 +182,9 @@ class CellAgreement:
         chance: Probability that two observations from anywhere on the map agree.
         largest_class: The class with most observations, and `largest_share` its share of them.
         labelled: Share of the locations with depth that have a label in at least half of their observations.
+        pixels_labelled: Share of the pixels with depth that have a label; NaN where that was not stored.
+        pairs_labelled: Share of the pairs of two views of a spot of which both have a label; NaN where that was not
+            stored.
         classes: Alpha of each class.
         moving: The classes that move, where much of the disagreement is theirs; else None.
     """
@@ -174,6 +200,13 @@ class CellAgreement:
     labelled: float
     classes: tuple[ClassAlpha, ...]
     moving: MovingClasses | None = None
+    pixels_labelled: float = math.nan
+    pairs_labelled: float = math.nan
+
+    @property
+    def counted(self) -> float:
+        """Return the factor of alpha if what has no label counts as disagreeing; 1 where that was not stored."""
+        return 1.0 if math.isnan(self.pairs_labelled) else self.pairs_labelled
 
     @property
     def effective_classes(self) -> float:

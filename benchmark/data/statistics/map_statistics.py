@@ -23,15 +23,32 @@ class StabilityVerdict:
     """A model on a scene.
 
     Attributes:
-        level: See ADVICE.
+        level: See ADVICE; of what the model labels.
         probability: Probability that the level is right, for the same scene flown again; NaN where no threshold
             decides.
         line: The reasons.
+        of_all: The level if what the model leaves out counts as disagreeing, where it is another one; else None.
+        labelled: Share of the pixels with depth that have a label; NaN where that was not stored.
     """
 
     level: Level
     probability: float
     line: str
+    of_all: Level | None = None
+    labelled: float = math.nan
+
+    @property
+    def decisive(self) -> Level:
+        """The level that counts against other models: that of all, whatever has a label."""
+        return self.of_all or self.level
+
+    @property
+    def difference(self) -> str:
+        """The two levels where they differ: 'stable of the 92 % that it labels, usable of all'; else ''."""
+        if self.of_all is None:
+            return ""
+        share = "more than 99 %" if self.labelled >= 0.995 else f"{100 * self.labelled:.0f} %"
+        return f"{self.level} of the {share} that it labels, {self.of_all} of all"
 
     @property
     def stated(self) -> str:
@@ -142,6 +159,12 @@ class MapStatistics:
         For soft scores without a log that is so for a few of them only, which are no random sample.
         """
         return self.drift.voxels >= ORDER_KNOWN * self.repeated.voxels
+
+    @property
+    def told_ranges(self) -> RangeAgreement | None:
+        """Return the agreement by range where a range is printed: only where labels are acted on, see `is_told`."""
+        acted_on = {self.verdict.level, self.verdict.decisive} <= {"stable", "usable"}
+        return self.ranges if acted_on and self.ranges is not None and self.ranges.is_told else None
 
     @property
     def sections(self) -> int:

@@ -18,6 +18,7 @@ from semstab.data.statistics import (
     MapStatistics,
     OutlyingFrames,
     RangeStratum,
+    metres,
 )
 from semstab.metrics import macro_mean
 from semstab.report.means import by_model
@@ -119,7 +120,7 @@ def ranges(result: Result) -> list[Table]:
                 f"{record.unit.scene}: {_from_to(row)}" if several else _from_to(row),
                 100 * row.share,
                 row.cells,
-                row.alpha,
+                row.alpha if row.is_assessed else "not assessed",
             )
             for record, stats in rows
             if stats.ranges is not None
@@ -134,13 +135,14 @@ def ranges(result: Result) -> list[Table]:
     )  # fmt: skip
     caption = (
         "The range of an observation is the distance from which a spot was seen; two of one spot count together where"
-        f" both were made in the same range. Labels can be used where alpha is above {LIMITS.usable:.3f}. {INTERVALS}"
+        f" both were made in the same range. Labels can be used where alpha is above {LIMITS.usable:.3f}. A range is"
+        f" not assessed where too few spots were seen twice from it, or nearly all of them are one class. {INTERVALS}"
     )
     return [Table("ranges", "Agreement by range", caption, columns, tuple(groups))]
 
 
 def _from_to(stratum: RangeStratum) -> str:
-    return f"{stratum.low:g} to {stratum.high:g}"
+    return f"{stratum.low:g} to {metres(stratum.high)}"
 
 
 def drift(result: Result) -> list[Table]:
@@ -249,6 +251,7 @@ def verdicts(result: Result) -> list[Table]:
     columns = (
         SCENE,
         Column("verdict", "Verdict"),
+        Column("of_all", "Of all"),
         Column("probability_percent", "Probability (%)", 0),
         Column.of(ALPHA),
         Column("labelled_percent", "Labelled (%)", 0, "higher"),
@@ -261,7 +264,8 @@ def verdicts(result: Result) -> list[Table]:
     caption = (
         "The verdict is the most probable level of alpha for the same scene flown again: stable from"
         f" {LIMITS.stable:g} on, usable from {LIMITS.usable:.3g}, unstable below. It is undecided if no level has"
-        f" {DECIDED:.0%}; misleading if more than {DANGEROUS:.0%} of the consistent locations are wrong, which only"
+        f" {DECIDED:.0%}, or the interval holds both limits; of all it is the level if what has no label counts as"
+        f" disagreeing; misleading if more than {DANGEROUS:.0%} of the consistent locations are wrong, which only"
         f" ground truth shows; uninformative if a map has fewer than {LEAST_CLASSES:g} effective classes. Labelled is"
         " the share of locations that have a label in half of their observations or more; below"
         f" {LIMITS.labelled:.0%} a model is at most usable. Voxels are those seen twice or more. {INTERVALS}"
@@ -375,11 +379,12 @@ def _verdict_row(record: Record, stats: MapStatistics) -> Row:
     return (
         record.unit.scene,
         stats.verdict.level,
+        stats.verdict.decisive,
         100 * stats.verdict.probability,
         stats.headline.alpha.ends,
         math.nan if stats.cells is None else 100 * stats.cells.labelled,
         UNDEFINED if right is None else right.quadrants.wrong_of_consistent.percent,
         stats.repeated.voxels,
         100 * stats.repeated.share,
-        ADVICE[stats.verdict.level],
+        ADVICE[stats.verdict.decisive],
     )

@@ -16,7 +16,7 @@ from semstab.report.narrative import nearly_all
 from semstab.report.terminal.disagreement import class_lines, outlying_lines
 from semstab.report.terminal.head import head_lines
 from semstab.report.terminal.layout import LEVELS, WIDTH, percent, percents, wrapped
-from semstab.statistics.verdict import DANGEROUS, DECIDED, LIMITS, level_probabilities
+from semstab.statistics.verdict import DANGEROUS, LIMITS, why_undecided
 
 
 def one_model(result: Result, record: Record, width: int) -> Iterator[str]:
@@ -64,17 +64,18 @@ def _verdict(run: UnitSummary) -> Iterator[str]:
         yield f"  {share} of the observations are {name}: agreement does not assess such a map"
     else:
         yield LEVELS
+    if difference := statistics.verdict.difference:
+        yield from wrapped(f"{difference}: what has no label counts as disagreeing there")
     silent = 0.0 if statistics.cells is None else 1 - statistics.cells.labelled
     if statistics.verdict.level == "usable" and alpha.value >= LIMITS.stable and silent > 1 - LIMITS.labelled:
         yield f"  {percent(silent)} of the locations have no label in most frames: such a map is usable at most"
     if statistics.verdict.level == "undecided":
-        levels = ", ".join(f"{name} {short(p)}" for name, p in level_probabilities(alpha).items())
-        yield f"  no level has p {short(DECIDED)} ({levels}): more frames decide it"
+        yield from wrapped(f"{why_undecided(alpha)}: more frames decide it")
     yield f"  two views see the same class at {percent(statistics.agreeing)} of the spots"
     if not math.isnan(wrong.value) and statistics.verdict.level != "misleading":
         yield f"  {told}"
-    if statistics.ranges is not None and statistics.ranges.is_told:
-        yield f"  {statistics.ranges.text}"
+    if statistics.told_ranges is not None:
+        yield from wrapped(statistics.told_ranges.text)
     yield ""
 
 

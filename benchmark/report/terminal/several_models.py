@@ -79,10 +79,13 @@ def several_models(result: Result, records: Sequence[Record], width: int) -> Ite
     yield from class_lines(records, width, begin)
     yield from outlying_lines(records)
     for record in records:
-        ranges = None if record.summary.statistics is None else record.summary.statistics.ranges
-        if ranges is not None and ranges.is_told:
-            scene = f" in {record.unit.scene}" if len(result.scenes) > 1 else ""
-            yield f"  {record.unit.model}{scene}: {ranges.text}"
+        statistics = record.summary.statistics
+        if statistics is None:
+            continue
+        ranges = "" if statistics.told_ranges is None else statistics.told_ranges.text
+        where = f" in {record.unit.scene}" if len(result.scenes) > 1 else ""
+        for text in filter(None, (statistics.verdict.difference, ranges)):
+            yield from wrapped(f"{record.unit.model}{where}: {text}")
     yield ""
 
 
