@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from semstab.cli.options import Quiet, ScopeOption, Verbose, print_lines, say
+from semstab.cli.options import OwnCode, Quiet, ScopeOption, Verbose, print_lines, say
 
 
 def compare(
@@ -210,6 +210,7 @@ def export(
         "--format", metavar="coco|labelstudio|cvat|fiftyone",
         help="Annotation tasks instead of the map: locations where frames disagree.")] = None,
     most: Annotated[int, typer.Option("--most", "-n", min=1, help="Largest number of annotation tasks.")] = 50,
+    code: OwnCode = None,
     quiet: Quiet = False,
 ) -> None:  # fmt: skip
     """Write the fused map as a point cloud, raster, mesh or table, with the stability of each voxel."""
@@ -218,7 +219,7 @@ def export(
     for file in write(
         run, to, scene=scene, model=model, backend=backend, measures=measure, min_op=min_op,
         classes=classes or (), thresholds=thresholds, cell=cell, asprs=asprs, radius=radius, classify=classify,
-        join=join, task_format=task_format, most=most,
+        join=join, task_format=task_format, most=most, code=code or (),
     ):  # fmt: skip
         print_lines([f"{file.path}: {file.content}", *(f"  {note}" for note in file.notes)], quiet=quiet)
 
@@ -238,6 +239,7 @@ def relabel(
     leave_one_out: Annotated[bool, typer.Option(
         "--leave-one-out", help="Label each frame by the other frames, without its own vote.")] = False,
     overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace maps of other settings.")] = False,
+    code: OwnCode = None,
     quiet: Quiet = False,
 ) -> None:  # fmt: skip
     """Write the fused classes back into every frame, as label maps of a new source."""
@@ -253,6 +255,6 @@ def relabel(
     with frame_bar(Console(stderr=True, quiet=quiet)) as bar:
         report = write(
             run, out, belief=belief, scene=scene, model=model, backend=backend, name=name, overwrite=overwrite,
-            progress=bar,
+            code=code or (), progress=bar,
         )  # fmt: skip
     print_lines(report.lines(), quiet=quiet)

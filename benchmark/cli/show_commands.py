@@ -12,7 +12,7 @@ from typing import Annotated
 
 import typer
 
-from semstab.cli.options import own_defaults, print_lines, say
+from semstab.cli.options import OwnCode, own_defaults, print_lines, say
 from semstab.errors import ConfigError, DataError
 
 
@@ -90,7 +90,10 @@ def _show_several(
         print_lines(map(str, [*written, *runs_figure(results).save(out, svg=figures is FigureFormat.svg)]))
 
 
-def view(run: Annotated[Path, typer.Argument(metavar="RUN", help="Run folder, or an .rrd file.")]) -> None:
+def view(
+    run: Annotated[Path, typer.Argument(metavar="RUN", help="Run folder, or an .rrd file.")],
+    code: OwnCode = None,
+) -> None:
     """Open a run's recording in the rerun viewer; it is made again if units have no pictures in it."""
     import subprocess
 
@@ -103,16 +106,16 @@ def view(run: Annotated[Path, typer.Argument(metavar="RUN", help="Run folder, or
         raise ConfigError(f"{run}: there is no finished run here; give the folder of --out, or one of runs/")
     if finished and lacks_pictures(run, recording):
         say(f"making {recording}")
-        record_finished(run, recording)
+        record_finished(run, recording, code or ())
     display = sys.platform != "linux" or bool(os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY"))
     stderr = None if display else subprocess.DEVNULL  # where it says in several lines that there is none
-    code = subprocess.run([*viewer_command(), str(recording)], check=False, stderr=stderr).returncode
-    if code and not display:
+    ended = subprocess.run([*viewer_command(), str(recording)], check=False, stderr=stderr).returncode
+    if ended and not display:
         raise ConfigError(
             f"{recording}: there is no display for the viewer; copy the file to a machine with one, or show it in a"
             f" browser: rerun --serve-web {shlex.quote(str(recording))}"
         )
-    raise typer.Exit(code)
+    raise typer.Exit(ended)
 
 
 KINDS = {

@@ -19,6 +19,7 @@ from pydantic import Field
 
 from semstab.comparison.runs import Entry, RunHandle, open_run, save_summary
 from semstab.config import Config, Settings, read_yaml, validated
+from semstab.core.code import only_named
 from semstab.core.json_form import from_json, to_json
 from semstab.data.records import Result
 from semstab.data.results import slug
@@ -101,7 +102,9 @@ def submissions(run: Path, path: Path, card: ModelCard | None = None) -> Iterato
         ConfigError: If the run is not of a benchmark, its settings are others, or there are several models for a file.
         DataError: If the run is damaged.
     """
-    result, config = load_result(run), Config.build(read_yaml(run / "config.yaml"), str(run / "config.yaml"))
+    result, file = load_result(run), run / "config.yaml"
+    with only_named(file, ()):
+        config = Config.build(read_yaml(file), str(file))
     benchmark = _benchmark_of(run, config)
     models = [name for name in result.models if name != GROUND_TRUTH]
     if len(models) > 1 and (path.suffix or card is not None):
