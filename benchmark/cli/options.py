@@ -356,7 +356,7 @@ def say(text: str) -> None:
 
 def print_lines(lines: Iterable[str], *, quiet: bool = False) -> None:
     """Print results as they are: no markup, no colours, no line breaks."""
-    from rich.console import Console
+    from semstab.core.console import Console
 
     console = Console(quiet=quiet)
     for line in lines:

@@ -22,11 +22,10 @@ def compare(
     quiet: Quiet = False,
 ) -> None:  # fmt: skip
     """Compare runs: report their differences with intervals, by class, location and frame."""
-    from rich.console import Console
-
     from semstab.comparison.tables import print_comparison
     from semstab.comparison.writing import compare
     from semstab.comparison.writing import markdown as as_markdown
+    from semstab.core.console import Console
     from semstab.core.types import THIS_SCENE
 
     with Console(stderr=True, quiet=quiet).status("opening") as status:
@@ -72,12 +71,11 @@ def gate(
     quiet: Quiet = False,
 ) -> None:  # fmt: skip
     """Fail if a new model is significantly worse: exit code 4 if a rule fails, 5 if one is undecided."""
-    from rich.console import Console
-
     from semstab.comparison import gate_report
     from semstab.comparison.gate import gate as assess
     from semstab.comparison.gate import gate_config
     from semstab.comparison.runs import open_run, save_summary
+    from semstab.core.console import Console
     from semstab.engine.folder import require_output
 
     gate_report.require_formats(out or ())
@@ -243,9 +241,8 @@ def relabel(
     quiet: Quiet = False,
 ) -> None:  # fmt: skip
     """Write the fused classes back into every frame, as label maps of a new source."""
-    from rich.console import Console
-
     from semstab.convert import frame_bar
+    from semstab.core.console import Console
     from semstab.exports.fused_labels import Belief
     from semstab.exports.relabel import relabel as write
     from semstab.statistics.acceptance import AcceptanceThresholds

@@ -36,8 +36,7 @@ def show(
     figures: Annotated[FigureFormat | None, typer.Option(help="Draw the figures for a paper into RUN/figures.")] = None,
 ) -> None:  # fmt: skip
     """Print the answer of a finished run, or its tables, without computing; of several runs one table of all."""
-    from rich.console import Console
-
+    from semstab.core.console import Console
     from semstab.data.records import is_run
     from semstab.engine.folder import load_result
     from semstab.report.tables import tables
@@ -147,13 +146,13 @@ def list_(
     Below stand the settings of your own: ~/.config/semstab/config.yaml.
     """
     import yaml
-    from rich.console import Console
     from rich.markup import escape
     from rich.table import Table
 
     from semstab import backends, datasets, models
     from semstab.config import read_yaml
     from semstab.configure import load_study, shipped_benchmarks, shipped_studies
+    from semstab.core.console import Console
     from semstab.data.labels import LabelSpace, shipped_taxonomies
     from semstab.errors import MissingDependencyError
     from semstab.predict import filters

@@ -32,7 +32,7 @@ from semstab.data.records import ImageSpace, Record
 from semstab.data.results import UnitSummary
 from semstab.datasets import GROUND_TRUTH
 from semstab.engine.folder import load_result, run_and_model
-from semstab.errors import ConfigError, DataError, summarize_error
+from semstab.errors import ConfigError, DataError, sanitize, summarize_error
 from semstab.statistics.cluster_sums import ClusterSums
 from semstab.statistics.verdict import ADVICE
 
@@ -277,6 +277,9 @@ CONTENT = "summary.json"
 LARGEST = 100_000_000
 """Most bytes of a file, of its unpacked content, and of the numbers in it."""
 
+LONGEST_NAME = 255
+"""Most characters of a name in it: those of a file."""
+
 LONGEST_CONTENT = 2**23
 """Most bytes of its text: of ten models in a hundred scenes it has a tenth."""
 
@@ -345,6 +348,8 @@ def load_summary(path: str | Path) -> RunHandle:
             if not isinstance(text, dict) or (text.get("kind"), text.get("schema")) != (KIND, SCHEMA):
                 raise DataError("it is of another kind or version")
             content = from_json(_Content, text, path)
+            for name in (content.model, *(scene.name for scene in content.scenes)):
+                _require_name(path, name)
             files = [archive.read(f"{i}.parquet") for i in range(len(content.scenes))]
     except (OSError, zipfile.BadZipFile, zlib.error, LookupError, ValueError, RuntimeError, EOFError) as error:
         if isinstance(error, DataError) and str(path) in str(error):
@@ -367,6 +372,12 @@ def load_summary(path: str | Path) -> RunHandle:
             flicker = dict(zip(numbers.frames, numbers.flicker, strict=True))
             scenes[numbers.name] = Entry(**_numbers(numbers), where=str(path), small=(sums, flicker))
     return RunHandle(content.model, path, content.model, scenes, content.about)
+
+
+def _require_name(path: Path, name: str) -> None:
+    """Raise DataError for a name that no folder of a scene or model has."""
+    if not name or len(name) > LONGEST_NAME or not name.isprintable():
+        raise DataError(f"{path}: {sanitize(repr(name))[:80]} is no name of a scene or model; write the summary again")
 
 
 def _numbers(numbers: EntryNumbers) -> dict[str, Any]:

@@ -179,9 +179,8 @@ def _decode_npz(path: Path, data: bytes, key: str, claimed: Claimed | None) -> n
                 shape, kind, _, start = _claims(where, head)
                 needed = math.prod(shape) * kind.itemsize
                 if size != start + needed or size > MAX_UNPACKED:
-                    most = f"at most {MAX_UNPACKED} are read"
                     raise DataError(
-                        f"{where}: the array {shape} of {kind} needs {needed} bytes, the file has {size - start} ({most});"
+                        f"{where}: the array {shape} of {kind} needs {needed} bytes, the file has {size - start};"
                         f" {AGAIN}"
                     )
                 if claimed is not None:
