@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+import contextlib
 import importlib.resources
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 from semstab.config import Config, merge, nearest, read_yaml, validated
 from semstab.config.groups import in_full
+from semstab.core.code import only_named, require_named
 from semstab.datasets import GROUND_TRUTH, open_dataset, resolved
 from semstab.errors import ConfigError
 from semstab.predict.dataset import NAME as PREDICTED
@@ -37,6 +39,43 @@ def load_config(
     content = _over(base, overrides or {})
     where = "configuration" if settings is None or isinstance(settings, Mapping) else str(settings)
     return Config.build(merge(dataset_defaults(content), content), where)
+
+
+@contextlib.contextmanager
+def settings_of_folder(run: Path, code: Collection[str] = ()) -> Iterator[Config]:
+    """Yield the configuration in a run's folder; code that it names is refused, but for what the user names as `code`.
+
+    Raises:
+        ConfigError: If a setting cannot be used; in the block also where code that is not named would start.
+    """
+    file = run / "config.yaml"
+    with only_named(file, code):
+        yield load_config(file)
+
+
+def require_named_code(run: Path) -> None:
+    """Require, within `settings_of_folder`, that the user named all code that the settings name; imports nothing.
+
+    Raises:
+        ConfigError: With the first field whose code the user did not name.
+    """
+    for field, name in _named_in(read_yaml(run / "config.yaml")):
+        require_named(name, field)
+
+
+CODE_KEYS = ("model", "backbone", "code")
+"""Settings that may name code."""
+
+
+def _named_in(content: Any, field: str = "") -> Iterator[tuple[str, str]]:
+    """Yield each field of settings that may name code, and its name."""
+    items: Any = enumerate(content) if isinstance(content, list) else getattr(content, "items", tuple)()
+    for key, value in items:
+        at = f"{field}.{key}" if field else str(key)
+        of_backends = at in ("backends", "check") or (field == "backends" and isinstance(content, list))
+        if isinstance(value, str) and (of_backends or key in CODE_KEYS):
+            yield at, value
+        yield from _named_in(value, at)
 
 
 def as_config(settings: Config | Mapping[str, Any] | str | Path) -> Config:

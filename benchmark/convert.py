@@ -12,13 +12,13 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 import yaml
-from rich.console import Console
 from rich.progress import TimeRemainingColumn
 
 from semstab.check.conventions import KNOWN_SCALES
 from semstab.check.reprojection import reader
 from semstab.config import Config
 from semstab.core.arrays import evenly
+from semstab.core.console import Console
 from semstab.core.files import (
     FolderLock,
     atomic_path,

@@ -140,8 +140,9 @@ def open_dataset(name: str, options: dict[str, Any] | BaseModel, run_folder: Pat
         MissingDependencyError: If a package that it needs is not installed.
     """
     cls = REGISTRY.load(name)
-    validated = options if isinstance(options, BaseModel) else cls.Options.model_validate(options)
-    dataset = cast("Dataset", cls(validated))
+    title = getattr(cls.Options, "title", f"dataset '{name}', options")
+    checked = options if isinstance(options, BaseModel) else validated(cls.Options, options, f"{title}: ")
+    dataset = cast("Dataset", cls(checked))
     dataset.run_folder = run_folder
     return dataset
 

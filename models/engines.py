@@ -12,6 +12,7 @@ from typing import Any, ClassVar, Literal, Protocol
 import numpy as np
 import numpy.typing as npt
 
+from semstab.core.code import require_named
 from semstab.errors import ConfigError, DataError, MissingDependencyError, summarize_error
 
 Array = npt.NDArray[Any]
@@ -208,6 +209,7 @@ def load_network(path: Path, device: str, threads: int | None) -> Engine:
         raise ConfigError(f"{path}: no network is read from '{path.suffix}'; name a file of {', '.join(FORMATS)}")
     if not path.is_file():
         raise DataError(f"{path}: there is no such file")
+    require_named(str(path))
     return FORMATS[path.suffix](path, device, threads)
 
 

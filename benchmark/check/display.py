@@ -7,13 +7,13 @@ import textwrap
 from collections.abc import Iterator, Sequence
 
 from rich.box import SIMPLE_HEAD
-from rich.console import Console
 from rich.markup import escape
 from rich.padding import Padding
 from rich.table import Table
 
 from semstab.check.coverage import FUSED_FRAMES
 from semstab.check.scene_check import SceneCheck
+from semstab.core.console import Console
 from semstab.data.labels import IGNORE_16BIT
 
 STATES = {"sound": "green", "imprecise": "yellow", "unsound": "bold red", "unclear": "yellow"}

@@ -24,7 +24,7 @@ from semstab.cli.result_commands import calibrate, compare, conform, export, gat
 from semstab.cli.run_commands import benchmark, filters, run, study
 from semstab.cli.show_commands import list_, show, view
 from semstab.core.process import configure_process
-from semstab.errors import OUT_OF_MEMORY, ConfigError, SemstabError, summarize_error
+from semstab.errors import OUT_OF_MEMORY, ConfigError, SemstabError, shown, summarize_error
 
 # Ctrl-C may interrupt any code: an import, a callback from compiled code.
 
@@ -264,7 +264,7 @@ for command, examples in COMMANDS.items():
 
 
 class _Once(logging.Filter):
-    """A filter that passes each warning of the check and the run once."""
+    """A filter that passes each warning of the check and the run once, as a line for people."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -275,6 +275,7 @@ class _Once(logging.Filter):
         message = record.getMessage()
         new = message not in self._printed
         self._printed.add(message)
+        record.msg, record.args = shown(message, keep="\n"), ()
         return new
 
 

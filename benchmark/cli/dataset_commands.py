@@ -30,12 +30,11 @@ def check(
     quiet: opt.Quiet = False,
 ) -> None:
     """Check poses, depth, units and labels of a dataset. Exit code 0 if they are sound, 2 if not."""
-    from rich.console import Console
-
     from semstab.check import SCHEMA
     from semstab.check import check as check_scenes
     from semstab.check.display import print_check
     from semstab.configure import load_config, resolve
+    from semstab.core.console import Console
     from semstab.core.files import write_json
     from semstab.engine.folder import require_output
 
@@ -144,10 +143,9 @@ def convert(
     quiet: opt.Quiet = False,
 ) -> None:  # fmt: skip
     """Write any dataset as posed folders. A second start resumes."""
-    from rich.console import Console
-
     from semstab.configure import load_config, resolve
     from semstab.convert import convert, frame_bar, print_converted
+    from semstab.core.console import Console
 
     named = {"scenes": source.scene, "models": source.model}
     content = chosen(named, settings, options, source.dataset, source.data, frames)

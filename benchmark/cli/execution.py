@@ -31,9 +31,8 @@ def execute(config: Config, out: Path, execution: Execution, *, quiet: bool, ver
     """Run a configuration, print the answer, and end with the exit code of its outcome."""
     executor = executor_of(execution.jobs, execution.scheduler)
     began = time.monotonic()
-    from rich.console import Console
-
     from semstab.api import run_study
+    from semstab.core.console import Console
     from semstab.report.terminal import ProgressBar, failure_lines, print_answer
 
     report, recording = _reported(execution), []
@@ -87,8 +86,7 @@ def measure_videos(config: Config, out: Path, execution: Execution, *, quiet: bo
     if execution.jobs > 1 or execution.scheduler is not None:
         raise ConfigError("--jobs and --scheduler: videos are measured in one process; leave them out")
     began = time.monotonic()
-    from rich.console import Console
-
+    from semstab.core.console import Console
     from semstab.report.videos import NEEDS, VideoProgress, screen
     from semstab.videos import run_videos
 

@@ -134,6 +134,9 @@ ScopeOption = Annotated[str | None, typer.Option(
     "--scope", metavar="these-frames|this-scene|other-scenes", show_default="this-scene",
     help="Population of intervals: these very frames, this scene flown again, or other scenes like it.",
     rich_help_panel=SETTINGS)]
+OwnCode = Annotated[list[str] | None, typer.Option(
+    "--code", metavar="FILE.py:NAME", rich_help_panel=SETTINGS,
+    help="Your model or backend, which the run's settings name: only code named here runs; repeatable.")]
 Overwrite = Annotated[bool, typer.Option("--overwrite", help="Replace the results of another run in --out.")]
 Quiet = Annotated[bool, typer.Option("--quiet", "-q", help="Print nothing but errors.")]
 # fmt: on
@@ -353,7 +356,7 @@ def say(text: str) -> None:
 
 def print_lines(lines: Iterable[str], *, quiet: bool = False) -> None:
     """Print results as they are: no markup, no colours, no line breaks."""
-    from rich.console import Console
+    from semstab.core.console import Console
 
     console = Console(quiet=quiet)
     for line in lines:

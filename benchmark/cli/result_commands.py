@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from semstab.cli.options import Quiet, ScopeOption, Verbose, print_lines, say
+from semstab.cli.options import OwnCode, Quiet, ScopeOption, Verbose, print_lines, say
 
 
 def compare(
@@ -22,11 +22,10 @@ def compare(
     quiet: Quiet = False,
 ) -> None:  # fmt: skip
     """Compare runs: report their differences with intervals, by class, location and frame."""
-    from rich.console import Console
-
     from semstab.comparison.tables import print_comparison
     from semstab.comparison.writing import compare
     from semstab.comparison.writing import markdown as as_markdown
+    from semstab.core.console import Console
     from semstab.core.types import THIS_SCENE
 
     with Console(stderr=True, quiet=quiet).status("opening") as status:
@@ -72,12 +71,11 @@ def gate(
     quiet: Quiet = False,
 ) -> None:  # fmt: skip
     """Fail if a new model is significantly worse: exit code 4 if a rule fails, 5 if one is undecided."""
-    from rich.console import Console
-
     from semstab.comparison import gate_report
     from semstab.comparison.gate import gate as assess
     from semstab.comparison.gate import gate_config
     from semstab.comparison.runs import open_run, save_summary
+    from semstab.core.console import Console
     from semstab.engine.folder import require_output
 
     gate_report.require_formats(out or ())
@@ -210,6 +208,7 @@ def export(
         "--format", metavar="coco|labelstudio|cvat|fiftyone",
         help="Annotation tasks instead of the map: locations where frames disagree.")] = None,
     most: Annotated[int, typer.Option("--most", "-n", min=1, help="Largest number of annotation tasks.")] = 50,
+    code: OwnCode = None,
     quiet: Quiet = False,
 ) -> None:  # fmt: skip
     """Write the fused map as a point cloud, raster, mesh or table, with the stability of each voxel."""
@@ -218,7 +217,7 @@ def export(
     for file in write(
         run, to, scene=scene, model=model, backend=backend, measures=measure, min_op=min_op,
         classes=classes or (), thresholds=thresholds, cell=cell, asprs=asprs, radius=radius, classify=classify,
-        join=join, task_format=task_format, most=most,
+        join=join, task_format=task_format, most=most, code=code or (),
     ):  # fmt: skip
         print_lines([f"{file.path}: {file.content}", *(f"  {note}" for note in file.notes)], quiet=quiet)
 
@@ -238,12 +237,12 @@ def relabel(
     leave_one_out: Annotated[bool, typer.Option(
         "--leave-one-out", help="Label each frame by the other frames, without its own vote.")] = False,
     overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace maps of other settings.")] = False,
+    code: OwnCode = None,
     quiet: Quiet = False,
 ) -> None:  # fmt: skip
     """Write the fused classes back into every frame, as label maps of a new source."""
-    from rich.console import Console
-
     from semstab.convert import frame_bar
+    from semstab.core.console import Console
     from semstab.exports.fused_labels import Belief
     from semstab.exports.relabel import relabel as write
     from semstab.statistics.acceptance import AcceptanceThresholds
@@ -253,6 +252,6 @@ def relabel(
     with frame_bar(Console(stderr=True, quiet=quiet)) as bar:
         report = write(
             run, out, belief=belief, scene=scene, model=model, backend=backend, name=name, overwrite=overwrite,
-            progress=bar,
+            code=code or (), progress=bar,
         )  # fmt: skip
     print_lines(report.lines(), quiet=quiet)

@@ -12,7 +12,7 @@ from typing import Annotated
 
 import typer
 
-from semstab.cli.options import own_defaults, print_lines, say
+from semstab.cli.options import OwnCode, own_defaults, print_lines, say
 from semstab.errors import ConfigError, DataError
 
 
@@ -36,8 +36,7 @@ def show(
     figures: Annotated[FigureFormat | None, typer.Option(help="Draw the figures for a paper into RUN/figures.")] = None,
 ) -> None:  # fmt: skip
     """Print the answer of a finished run, or its tables, without computing; of several runs one table of all."""
-    from rich.console import Console
-
+    from semstab.core.console import Console
     from semstab.data.records import is_run
     from semstab.engine.folder import load_result
     from semstab.report.tables import tables
@@ -90,7 +89,10 @@ def _show_several(
         print_lines(map(str, [*written, *runs_figure(results).save(out, svg=figures is FigureFormat.svg)]))
 
 
-def view(run: Annotated[Path, typer.Argument(metavar="RUN", help="Run folder, or an .rrd file.")]) -> None:
+def view(
+    run: Annotated[Path, typer.Argument(metavar="RUN", help="Run folder, or an .rrd file.")],
+    code: OwnCode = None,
+) -> None:
     """Open a run's recording in the rerun viewer; it is made again if units have no pictures in it."""
     import subprocess
 
@@ -103,16 +105,16 @@ def view(run: Annotated[Path, typer.Argument(metavar="RUN", help="Run folder, or
         raise ConfigError(f"{run}: there is no finished run here; give the folder of --out, or one of runs/")
     if finished and lacks_pictures(run, recording):
         say(f"making {recording}")
-        record_finished(run, recording)
+        record_finished(run, recording, code or ())
     display = sys.platform != "linux" or bool(os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY"))
     stderr = None if display else subprocess.DEVNULL  # where it says in several lines that there is none
-    code = subprocess.run([*viewer_command(), str(recording)], check=False, stderr=stderr).returncode
-    if code and not display:
+    ended = subprocess.run([*viewer_command(), str(recording)], check=False, stderr=stderr).returncode
+    if ended and not display:
         raise ConfigError(
             f"{recording}: there is no display for the viewer; copy the file to a machine with one, or show it in a"
             f" browser: rerun --serve-web {shlex.quote(str(recording))}"
         )
-    raise typer.Exit(code)
+    raise typer.Exit(ended)
 
 
 KINDS = {
@@ -144,13 +146,13 @@ def list_(
     Below stand the settings of your own: ~/.config/semstab/config.yaml.
     """
     import yaml
-    from rich.console import Console
     from rich.markup import escape
     from rich.table import Table
 
     from semstab import backends, datasets, models
     from semstab.config import read_yaml
     from semstab.configure import load_study, shipped_benchmarks, shipped_studies
+    from semstab.core.console import Console
     from semstab.data.labels import LabelSpace, shipped_taxonomies
     from semstab.errors import MissingDependencyError
     from semstab.predict import filters

@@ -24,7 +24,7 @@ import numpy as np
 from semstab.config import nearest
 from semstab.core.files import ScratchFolder, atomic_path, parse_json, read_limited
 from semstab.core.json_form import from_json, to_json
-from semstab.data import earlier
+from semstab.data import earlier, parquet
 from semstab.data.contrast import FrameShare
 from semstab.data.digests import require_unchanged
 from semstab.data.georeference import Georeference
@@ -32,7 +32,7 @@ from semstab.data.records import ImageSpace, Record
 from semstab.data.results import UnitSummary
 from semstab.datasets import GROUND_TRUTH
 from semstab.engine.folder import load_result, run_and_model
-from semstab.errors import ConfigError, DataError, summarize_error
+from semstab.errors import ConfigError, DataError, sanitize, summarize_error
 from semstab.statistics.cluster_sums import ClusterSums
 from semstab.statistics.verdict import ADVICE
 
@@ -281,7 +281,13 @@ def _valid(frames: Iterable[int], percents: Iterable[float]) -> bool:
 SCHEMA, KIND = 3, "semstab small summary"
 CONTENT = "summary.json"
 LARGEST = 100_000_000
-"""Most bytes of a file, and of its unpacked content."""
+"""Most bytes of a file, of its unpacked content, and of the numbers in it."""
+
+LONGEST_NAME = 255
+"""Most characters of a name in it: those of a file."""
+
+LONGEST_CONTENT = 2**23
+"""Most bytes of its text: of ten models in a hundred scenes it has a tenth."""
 
 MANY_GROUPS = 32
 """Number of groups of frames above which these are joined, before cubes are."""
@@ -340,12 +346,16 @@ def load_summary(path: str | Path) -> RunHandle:
         with zipfile.ZipFile(io.BytesIO(read_limited(path, LARGEST))) as archive:
             if sum(member.file_size for member in archive.infolist()) > LARGEST:
                 raise DataError(f"{path}: it unpacks to more than {LARGEST // 10**6} MB; write the summary again")
+            if archive.getinfo(CONTENT).file_size > LONGEST_CONTENT:
+                raise DataError(f"{path}: its text has more than {LONGEST_CONTENT} bytes; write the summary again")
             text = parse_json(archive.read(CONTENT))
             if isinstance(text, dict) and text.get("schema") == earlier.SMALL:
                 text = earlier.translated(text, path) | {"schema": SCHEMA}
             if not isinstance(text, dict) or (text.get("kind"), text.get("schema")) != (KIND, SCHEMA):
                 raise DataError("it is of another kind or version")
             content = from_json(_Content, text, path)
+            for name in (content.model, *(scene.name for scene in content.scenes)):
+                _require_name(path, name)
             files = [archive.read(f"{i}.parquet") for i in range(len(content.scenes))]
     except (OSError, zipfile.BadZipFile, zlib.error, LookupError, ValueError, RuntimeError, EOFError) as error:
         if isinstance(error, DataError) and str(path) in str(error):
@@ -353,18 +363,27 @@ def load_summary(path: str | Path) -> RunHandle:
         raise DataError(
             f"{path}: it is neither a run's folder nor a small summary ({summarize_error(error)})"
         ) from error
-    scenes = {}
+    scenes, room = {}, LARGEST
     with ScratchFolder() as folder:
         part = folder / "sums.parquet"
         for numbers, data in zip(content.scenes, files, strict=True):
             part.write_bytes(data)
             try:
+                room -= parquet.unpacked_bytes(part)
+                if room < 0:
+                    raise DataError(f"{part}: its sums take more than {LARGEST} bytes")
                 sums = ClusterSums.load(part)
             except DataError as error:
                 raise DataError(f"{path}: the sums of {numbers.name} are damaged; write the summary again") from error
             flicker = dict(zip(numbers.frames, numbers.flicker, strict=True))
             scenes[numbers.name] = Entry(**_numbers(numbers), where=str(path), small=(sums, flicker))
     return RunHandle(content.model, path, content.model, scenes, content.about)
+
+
+def _require_name(path: Path, name: str) -> None:
+    """Raise DataError for a name that no folder of a scene or model has."""
+    if not name or len(name) > LONGEST_NAME or not name.isprintable():
+        raise DataError(f"{path}: {sanitize(repr(name))[:80]} is no name of a scene or model; write the summary again")
 
 
 def _numbers(numbers: EntryNumbers) -> dict[str, Any]:

@@ -8,9 +8,8 @@ import textwrap
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 
-from rich.console import Console
-
 from semstab.comparison.locations import MOST
+from semstab.core.console import Console
 from semstab.data.contrast import Against, Area, Basis, ComparedObservations, Contrast, FrameShare, RunComparison
 from semstab.data.measures import ENTROPY, VSS, Quantity, measures
 from semstab.data.statistics import CONFIDENCE, Interval

@@ -10,7 +10,9 @@ import inspect
 import re
 import sys
 import traceback
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Collection, Iterator, Sequence
+from contextlib import contextmanager
+from contextvars import ContextVar
 from dataclasses import dataclass
 from pathlib import Path
 from types import ModuleType
@@ -46,9 +48,10 @@ class Code:
         """Import it, as a model or another kind of part.
 
         Raises:
-            ConfigError: If it is not there.
+            ConfigError: If it is not there, or a run folder names it and the user does not (`only_named`).
             MissingDependencyError, DataError: If it fails.
         """
+        require_named(text)
         source, _, name = text.rpartition(":")
         in_file = source.endswith(".py")
         if not name.isidentifier() or not (in_file or MODULE.fullmatch(source)):
@@ -97,6 +100,58 @@ def absolute(name: str) -> str:
     """Return the name of code, its file's from the root of the file system."""
     source, _, what = name.rpartition(":")
     return f"{Path(source).expanduser().absolute()}:{what}" if source.endswith(".py") else name
+
+
+# A run folder may come from anywhere: code that its settings name runs only where the user names it, too.
+
+PROGRAMS = (".pt", ".pth", ".pt2")
+"""Suffixes of network files that torch runs as programs."""
+
+_allowed_only: ContextVar[tuple[str, frozenset[str]] | None] = ContextVar("_allowed_only", default=None)
+
+
+def runs_code(name: str) -> bool:
+    """Return whether what a name stands for runs code that semstab does not ship: a user's, or a network's program."""
+    return is_code(name) or Path(name).suffix in PROGRAMS
+
+
+def located(name: str) -> str:
+    """Return the name of code or of a network's file, the file's from the root of the file system."""
+    return str(Path(name).expanduser().absolute()) if Path(name).suffix in PROGRAMS else absolute(name)
+
+
+@contextmanager
+def only_named(where: str | Path, named: Collection[str]) -> Iterator[None]:
+    """While the block lasts, refuse all code but that which the user named, for settings that stand in a file `where`.
+
+    Threads that `semstab.core.prefetch` starts in the block are bound, too.
+    """
+    token = _allowed_only.set((str(where), frozenset(map(located, named))))
+    try:
+        yield
+    finally:
+        _allowed_only.reset(token)
+
+
+def may_run(name: str) -> bool:
+    """Return whether code may run here: outside of `only_named` any, inside of it what the user named."""
+    bound = _allowed_only.get()
+    return bound is None or not runs_code(name) or located(name) in bound[1]
+
+
+def require_named(name: str, field: str = "") -> None:
+    """Require that code may run here.
+
+    Raises:
+        ConfigError: If `may_run` says no; the message names the file, the field where it is given, and the code.
+    """
+    bound = _allowed_only.get()
+    if bound is None or may_run(name):
+        return
+    source = f"{bound[0]}: {field}" if field else bound[0]
+    raise ConfigError(
+        f"{source} names code, which a run's folder does not start; where you trust it, add --code {located(name)}"
+    )
 
 
 def guarded(text: str, do: Callable[[], T]) -> T:

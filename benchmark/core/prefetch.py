@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextvars
 import os
 import threading
 import time
@@ -58,7 +59,7 @@ def prefetch(
 
     def fill() -> None:
         while len(ahead) < room and (index := next(waiting, None)) is not None:
-            ahead.append(pool.submit(_timed, read, index))
+            ahead.append(pool.submit(contextvars.copy_context().run, _timed, read, index))
 
     try:
         fill()

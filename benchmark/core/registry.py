@@ -14,7 +14,7 @@ from dataclasses import dataclass
 from importlib.metadata import entry_points
 from typing import Any
 
-from semstab.core.code import Code
+from semstab.core.code import Code, may_run
 from semstab.errors import ConfigError, MissingDependencyError, nearest, summarize_error
 
 EARLIER: Mapping[str, str] = {"model": "backbone"}
@@ -26,8 +26,12 @@ _code: dict[tuple[str, str], str] = {}
 
 
 def name_code(kind: str, name: str, text: str) -> None:
-    """Give a class of a user's file or package a name that registries of that kind know in this process."""
-    _code[kind, name] = text
+    """Give a class of a user's file or package a name that registries of that kind know in this process.
+
+    Code that a run folder names alone gets none, so that nothing later starts it under that name.
+    """
+    if may_run(text):
+        _code[kind, name] = text
 
 
 @dataclass(frozen=True)

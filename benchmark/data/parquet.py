@@ -165,18 +165,40 @@ def columns(path: Path, names: Sequence[str]) -> dict[str, npt.NDArray[Any]]:
         return {name: values_of(content.column(name)) for name in names}
 
 
+ORDINARY, DENSEST = 2**28, 256
+"""Bytes that a group of rows may take in memory whatever the file's size, and times the size of the file above."""
+
+
 @contextmanager
 def opened(path: str | Path) -> Iterator[pq.ParquetFile]:
-    """Open a file to read its columns.
+    """Open a file to read its columns, of which a group takes no more memory than a file of its size may hold.
 
     Raises:
-        DataError: If it is of a finished run, and not as the run wrote it.
+        DataError: If it is of a finished run, and not as the run wrote it; or if its metadata claim more.
     """
     import pyarrow.parquet as pq
 
     require_unchanged(path)
     with pq.ParquetFile(path) as file:  # pq.read_table imports pandas
+        groups = [_unpacked_bytes(file.metadata.row_group(k)) for k in range(file.metadata.num_row_groups)]
+        if max(groups, default=0) > max(ORDINARY, DENSEST * (size := Path(path).stat().st_size)):
+            raise DataError(f"{path}: its columns unpack to {max(groups)} bytes of {size}; write it again")
         yield file
+
+
+def unpacked_bytes(path: Path) -> int:
+    """Return the bytes that a file's columns take in memory, by its metadata. Raises DataError as `reading` does."""
+    import pyarrow.parquet as pq
+
+    with reading(path):
+        metadata = pq.read_metadata(path)
+        return sum(_unpacked_bytes(metadata.row_group(k)) for k in range(metadata.num_row_groups))
+
+
+def _unpacked_bytes(group: pq.RowGroupMetaData) -> int:
+    """Return the bytes that a group of rows takes in memory: eight a value, or as its pages say, if that is more."""
+    chunks = [group.column(k) for k in range(group.num_columns)]
+    return sum(max(8 * group.num_rows, 8 * each.num_values, each.total_uncompressed_size) for each in chunks)
 
 
 @contextmanager

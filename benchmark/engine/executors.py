@@ -9,9 +9,11 @@ import importlib
 import importlib.metadata
 import multiprocessing
 import os
-from collections.abc import Callable, Generator
+import signal
+from collections.abc import Callable, Generator, Iterable, Iterator
 from concurrent.futures.process import BrokenProcessPool
 from multiprocessing.connection import Connection
+from multiprocessing.process import BaseProcess
 from typing import Any
 
 from semstab.core.prefetch import default_threads
@@ -22,6 +24,7 @@ from semstab.engine.work import Job, Work
 from semstab.errors import ConfigError, MissingDependencyError
 
 CONNECT_SECONDS = 10
+ENDING_SECONDS = 5
 AWAY = OSError, RuntimeError, AttributeError
 """The errors of a client of Dask whose scheduler does not answer, while it gives it up, and once it has none."""
 
@@ -110,16 +113,43 @@ class LocalProcesses(Executor):
         listening, alive = context.Pipe(duplex=False)
         share = max(1, cores() // self.width)
         pool = cf.ProcessPoolExecutor(width, context, initializer=_start_worker, initargs=(listening, share))
+        before, done = {*multiprocessing.active_children()}, False
+
+        def submit(job: Job) -> Future:
+            with _left_alone():
+                return pool.submit(_run_all, job)
+
         try:
             _check_start(pool)
-            for future, job in _ended(take, lambda job: pool.submit(_run_all, job), lambda: width):
+            for future, job in _ended(take, submit, lambda: width):
                 works = future.result()
                 begun[:] = [each for each in begun if each is not job]
                 yield from works
             pool.shutdown()
+            done = True
         finally:
-            alive.close()  # ends processes that are still at work: after an interruption, or where one of them died
-            pool.shutdown(wait=False, cancel_futures=True)
+            alive.close()  # ends processes that are still at work, should this one be killed meanwhile
+            if not done:  # after an interruption, or where one of them died
+                _end_all({*multiprocessing.active_children()} - before)
+            pool.shutdown(wait=True, cancel_futures=True)
+
+
+@contextlib.contextmanager
+def _left_alone() -> Iterator[None]:
+    """Let processes that the block starts never hear Ctrl-C, which their parent decides on; it is heard afterwards."""
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+    try:
+        yield
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, before)
+
+
+def _end_all(processes: Iterable[BaseProcess]) -> None:
+    """End processes at once, those that still import among them: what they write is whole, or is not there."""
+    for process in processes:
+        process.kill()
+    for process in processes:
+        process.join(ENDING_SECONDS)
 
 
 def _ended(
@@ -159,8 +189,10 @@ def _run_all(job: Job) -> Job:
 
 def _check_start(pool: cf.ProcessPoolExecutor) -> None:
     """Raise ConfigError where not even an empty job runs: a script that starts processes must be importable."""
+    with _left_alone():
+        first = pool.submit(os.getpid)
     try:
-        pool.submit(os.getpid).result()
+        first.result()
     except BrokenProcessPool as error:
         raise ConfigError(
             "worker processes do not start; in a script of your own, call it under if __name__ == '__main__'"

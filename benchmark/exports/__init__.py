@@ -89,6 +89,7 @@ def export(
     beside: str | Path | None = None,
     task_format: str | None = None,
     most: int = MOST,
+    code: Sequence[str] = (),
 ) -> list[Exported]:
     """Write a unit of the run in a folder to files, in the format that each one's suffix names (`SUFFIXES`).
 
@@ -114,6 +115,8 @@ def export(
         task_format: 'coco', 'labelstudio', 'cvat' or 'fiftyone': write annotation tasks for it, the locations
             where frames disagree, instead of the map.
         most: The largest number of annotation tasks.
+        code: Code that the run's settings name and that may run for annotation tasks, FILE.py:NAME each; other code is
+            refused.
 
     Returns:
         Each file that was written, with its content.
@@ -146,7 +149,7 @@ def export(
         for file in dict(sorted((file.resolve(), file) for file in files)).values():
             held.enter_context(only_writer(file))
         if task_format is not None:
-            task, _ = task_of(run, record, result.manifest["inputs"])
+            task, _ = held.enter_context(task_of(run, record, result.manifest["inputs"], code))
             tasks = annotation_tasks(chosen(("op",)), task, most)
             named = task.mapping.target, task.scene.name, task.model
             return [_tasks_written(TaskFile(tasks, *named, file), task_format, task) for file in files]

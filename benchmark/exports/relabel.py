@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import contextlib
 import dataclasses
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Literal
 
 import numpy as np
 
-from semstab.configure import load_config
+from semstab.configure import require_named_code, settings_of_folder
 from semstab.core.files import write_json
 from semstab.core.prefetch import prefetch
 from semstab.core.types import Int64, UInt8, UInt16
@@ -18,7 +18,7 @@ from semstab.data.frames import Frame
 from semstab.data.records import Record
 from semstab.data.tiles import Tiles
 from semstab.data.voxels import VoxelTable
-from semstab.engine.folder import SETTINGS, load_result, model_of
+from semstab.engine.folder import load_result, model_of
 from semstab.engine.units import make_plan
 from semstab.errors import ConfigError, DataError
 from semstab.exports.fused_labels import Belief, FusedLabels, labels_of
@@ -42,6 +42,7 @@ def relabel(
     backend: str | None = None,
     name: str | None = None,
     overwrite: bool = False,
+    code: Sequence[str] = (),
     progress: Progress = lambda what, done, total: None,
 ) -> Relabelled:
     """Write the fused class of every pixel of every frame of a unit to OUT/labels/NAME.
@@ -58,6 +59,7 @@ def relabel(
         backend: Backend of the unit, the base backend where not given.
         name: Name of the new source, MODEL-fused where not given; its classes are in its folder.
         overwrite: Whether other predictions in the folder are replaced.
+        code: Code that the run's settings name and that may run, FILE.py:NAME each; other code is refused.
         progress: A function that is called with the task, the number of finished frames, and the number of all frames.
 
     Returns:
@@ -77,13 +79,16 @@ def relabel(
     run, model = model_of(run, model)
     result = load_result(run)
     record = result.record(scene=scene, model=model, backend=backend)
-    task, pixel_stride = task_of(run, record, result.manifest["inputs"])
     if record.voxels_file is None:
         raise DataError(f"{run}: the run stored no voxels of {record.unit.slug}; run it again")
-    belief, name, space = belief or Belief(), name or f"{record.unit.model}-fused", task.mapping.target
-    folder = _folder(Path(out), name, task, record, belief, overwrite=overwrite)
-    fused = FusedLabels(Tiles.open(record.voxels_file, VoxelTable), belief, len(space))
-    with contextlib.closing(folder):
+    belief, name = belief or Belief(), name or f"{record.unit.model}-fused"
+    with contextlib.ExitStack() as open_parts:
+        task, pixel_stride = open_parts.enter_context(task_of(run, record, result.manifest["inputs"], code))
+        space = task.mapping.target
+        folder = open_parts.enter_context(
+            contextlib.closing(_folder(Path(out), name, task, record, belief, overwrite=overwrite))
+        )
+        fused = FusedLabels(Tiles.open(record.voxels_file, VoxelTable), belief, len(space))
         tally = Tally(len(space))
         for done, (frame, rows, known) in enumerate(_fused_frames(task, fused, pixel_stride), start=1):
             _write_map(folder, record.key, task, frame, rows)
@@ -147,15 +152,23 @@ def _require_size_of_depth(task: Task, frame: Frame, maps: UInt8 | UInt16) -> No
     )
 
 
-def task_of(run: Path, record: Record, fused: Mapping[str, str]) -> tuple[Task, int]:
-    """Return the unit as it was fused, from inputs of these digests, and its pixel stride.
+@contextlib.contextmanager
+def task_of(
+    run: Path, record: Record, fused: Mapping[str, str], code: Sequence[str] = ()
+) -> Iterator[tuple[Task, int]]:
+    """Yield the unit as it was fused, from inputs of these digests, and its pixel stride.
+
+    Of the code that the run's settings name only that runs which the user named as `code`, as long as the block lasts.
 
     Raises:
+        ConfigError: If the settings name other code.
         DataError: If its data has changed since.
     """
-    plan = make_plan(load_config(run / SETTINGS))
-    scene, model = record.unit.scene, record.unit.model
-    task = next((task for task in plan.tasks if (task.scene.name, task.model) == (scene, model)), None)
-    if task is None or task.digest != fused.get(f"{scene}/{model}"):
-        raise DataError(f"{run}: the data of {scene}, {model} has changed since it was fused; run it again")
-    return task, plan.config.pixel_stride
+    with settings_of_folder(run, code) as config:
+        require_named_code(run)
+        plan = make_plan(config)
+        scene, model = record.unit.scene, record.unit.model
+        task = next((task for task in plan.tasks if (task.scene.name, task.model) == (scene, model)), None)
+        if task is None or task.digest != fused.get(f"{scene}/{model}"):
+            raise DataError(f"{run}: the data of {scene}, {model} has changed since it was fused; run it again")
+        yield task, plan.config.pixel_stride

@@ -12,13 +12,14 @@ from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
-from pydantic import Field
+from pydantic import AfterValidator, Field
 
 from semstab.comparison.runs import Entry, RunHandle, open_run, save_summary
 from semstab.config import Config, Settings, read_yaml, validated
+from semstab.core.code import only_named
 from semstab.core.json_form import from_json, to_json
 from semstab.data.records import Result
 from semstab.data.results import slug
@@ -46,16 +47,25 @@ PACKAGES = ("numpy", "numba", "open3d", "torch", "transformers", "tflite-runtime
 """Packages whose versions are told, where they are installed."""
 
 
+def _one_line(text: str) -> str:
+    if not text.isprintable():
+        raise ValueError("write one line, without control characters and marks of direction")
+    return text
+
+
+Line = Annotated[str, Field(max_length=500), AfterValidator(_one_line)]
+
+
 class ModelCard(Settings):
     """What whoever hands a result in says of the model."""
 
-    name: str = Field("", description="its name in the table; that of the label source where not given")
-    by: str = Field("", description="who made it")
-    url: str = Field("", pattern=r"^(https?://\S+)?$", description="where it is found")
-    license: str = Field("", description="licence of the weights")
+    name: Line = Field("", description="its name in the table; that of the label source where not given")
+    by: Line = Field("", description="who made it")
+    url: Line = Field("", pattern=r"^(https?://\S+)?$", description="where it is found")
+    license: Line = Field("", description="licence of the weights")
     parameters: float | None = Field(None, gt=0, description="number of its parameters, millions")
-    trained_on: str = Field("", description="training data")
-    notes: str = Field("", max_length=500, description="anything else, in a few words")
+    trained_on: Line = Field("", description="training data")
+    notes: Line = Field("", description="anything else, in a few words")
 
     @classmethod
     def load(cls, path: Path) -> ModelCard:
@@ -101,7 +111,9 @@ def submissions(run: Path, path: Path, card: ModelCard | None = None) -> Iterato
         ConfigError: If the run is not of a benchmark, its settings are others, or there are several models for a file.
         DataError: If the run is damaged.
     """
-    result, config = load_result(run), Config.build(read_yaml(run / "config.yaml"), str(run / "config.yaml"))
+    result, file = load_result(run), run / "config.yaml"
+    with only_named(file, ()):
+        config = Config.build(read_yaml(file), str(file))
     benchmark = _benchmark_of(run, config)
     models = [name for name in result.models if name != GROUND_TRUTH]
     if len(models) > 1 and (path.suffix or card is not None):

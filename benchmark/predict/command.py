@@ -14,10 +14,10 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from rich.console import Console
 from rich.progress import TextColumn
 
 from semstab.config import DatasetConfig, FrameSelection, validated
+from semstab.core.console import Console
 from semstab.core.progress import frame_progress
 from semstab.data.frames import Frame
 from semstab.datasets import Scene, open_dataset, options_model

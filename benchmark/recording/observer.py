@@ -6,7 +6,7 @@ import contextlib
 import dataclasses
 import logging
 import threading
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, cast
@@ -17,7 +17,7 @@ import rerun as rr
 
 from semstab.backends import FusionBackend, changes_of, create, expected_bytes
 from semstab.config import BACKENDS, BASE, Config
-from semstab.configure import load_config
+from semstab.configure import require_named_code, settings_of_folder
 from semstab.core.prefetch import prefetch
 from semstab.core.process import available_bytes
 from semstab.core.types import Float64, Int64
@@ -31,7 +31,7 @@ from semstab.datasets import Scene
 from semstab.engine.folder import load_result
 from semstab.engine.observer import Observer
 from semstab.engine.series import FrameRow
-from semstab.engine.units import Plan, Unit, make_plan
+from semstab.engine.units import Plan, Unit, make_plan, must_agree
 from semstab.errors import ConfigError, SemstabError, summarize_error
 from semstab.recording import timeline
 from semstab.recording.camera import COARSE_SIDE, SceneLog, over_camera, stride_of
@@ -406,13 +406,20 @@ def lacks_pictures(run: Path, file: Path) -> bool:
     return any(f"{entity}:SegmentationImage:buffer" not in columns for entity in labels)
 
 
-def record_finished(run: Path, file: Path) -> None:
-    """Write the recording of a finished run from its folder; pictures need the dataset that config.yaml names."""
-    result, config = load_result(run), load_config(run / "config.yaml")
-    recording = Recording(file)
-    recording.run_started(_plan_of(run, config, result), {})
-    with contextlib.closing(recording):
-        recording.log_finished(result, pictures=True)
+def record_finished(run: Path, file: Path, code: Sequence[str] = ()) -> None:
+    """Write the recording of a finished run from its folder; pictures need the dataset that config.yaml names.
+
+    Args:
+        run: The folder.
+        file: The recording.
+        code: Code that config.yaml names and that may run, FILE.py:NAME each; with other code there are no pictures.
+    """
+    result = load_result(run)
+    with settings_of_folder(run, code) as config:
+        recording = Recording(file)
+        recording.run_started(_plan_of(run, config, result), {})
+        with contextlib.closing(recording):
+            recording.log_finished(result, pictures=True)
 
 
 @dataclass(frozen=True)
@@ -429,12 +436,26 @@ class _ClosedScene:
         return np.eye(4)
 
 
+def _without_code(config: Config) -> Config:
+    """Return settings from which a plan of finished units follows without the backends that cannot be loaded."""
+    lost = set()
+    for backend in config.fused_by():
+        try:
+            must_agree(backend.model_copy(update={"check": None}))
+        except SemstabError:
+            lost.add(backend.name)
+    backends = [each.model_copy(update={"check": True}) if each.name in lost else each for each in config.backends]
+    return config.model_copy(update={"backends": backends, "check": None if lost else config.check})
+
+
 def _plan_of(run: Path, config: Config, result: Result) -> Plan:
     """Return the plan of the run; without its dataset that of its finished units."""
     try:
+        require_named_code(run)
         return make_plan(config)
     except SemstabError as error:
         logger.warning("%s: recorded without pictures (%s)", run, error)
+    config = _without_code(config)
     units = []
     for record in (*result.select(), *result.select(BACKENDS)):
         unit, up = record.unit, result.up.get(record.unit.scene)

@@ -7,6 +7,7 @@ import re
 import struct
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -16,7 +17,7 @@ from semstab.core.types import Float32
 from semstab.data.frames import Intrinsics
 from semstab.datasets.files.options import FileOptions, FrameSource
 from semstab.datasets.formats.disk import AGAIN, read_bytes
-from semstab.datasets.formats.images import MAX_PIXELS, MILLIMETRES, Read, color_size, read_depth
+from semstab.datasets.formats.images import ANY_SIZE, MAX_PIXELS, MILLIMETRES, FrameSize, Read, color_size, read_depth
 from semstab.datasets.geometry.cameras import planar
 from semstab.datasets.geometry.lenses import undistorted
 from semstab.errors import DataError
@@ -154,7 +155,11 @@ def stored_scale(frame: FrameSource, options: FileOptions) -> float:
 
 
 def stored_depth(
-    frame: FrameSource, options: FileOptions, read: Read, camera: Callable[[tuple[int, int]], Intrinsics]
+    frame: FrameSource,
+    options: FileOptions,
+    read: Read,
+    camera: Callable[[tuple[int, int]], Intrinsics],
+    own: FrameSize = ANY_SIZE,
 ) -> Float32:
     """Return depth (H, W) of a frame's file in metres along the optical axis; values that mean 'no depth' become 0.
 
@@ -163,9 +168,10 @@ def stored_depth(
         options: The settings of the dataset's files.
         read: Reads the content of a file.
         camera: Gives the intrinsics of the depth image of a shape.
+        own: The sizes that the frame's files may have.
     """
     scale = options.depth_scale or frame.depth_scale
-    reader = frame.depth_reader or FORMATS.get(frame.depth.suffix.lower(), read_depth)
+    reader = frame.depth_reader or FORMATS.get(frame.depth.suffix.lower(), partial(read_depth, own=own))
     depth = reader(frame.depth, scale, read)
     if np.isnan(depth[0, 0]) and np.isnan(depth).all():  # one frame that saw nothing ends no run; it is counted
         depth = np.zeros_like(depth)

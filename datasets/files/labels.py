@@ -16,7 +16,7 @@ from semstab.core.types import UInt16
 from semstab.data.labels import IGNORE_16BIT, LabelSpace, ignore_id
 from semstab.datasets.files.options import Folders, LabelOptions, Template, inside, matching_folders
 from semstab.datasets.formats import images
-from semstab.datasets.formats.images import Read, Size
+from semstab.datasets.formats.images import ANY_SIZE, FrameSize, Read, Size
 from semstab.datasets.geometry.lenses import Labels, Scores
 from semstab.datasets.scene import GROUND_TRUTH, listed
 from semstab.errors import ConfigError, DataError
@@ -309,13 +309,13 @@ class LabelMaps:
             )
         return space
 
-    def labels(self, model: str, path: Path, read: Read) -> Labels:
-        """Return ids (H, W) of one file, whose bytes `read` gives.
+    def labels(self, model: str, path: Path, read: Read, own: FrameSize = ANY_SIZE) -> Labels:
+        """Return ids (H, W) of one file, whose bytes `read` gives; `own` has the sizes that it may have.
 
         Raises:
             DataError: If that fails; the message names it.
         """
-        labels = images.read_labels(path, self.space(model), read)
+        labels = images.read_labels(path, self.space(model), read, own)
         if model in self.class_ids:
             ids: Labels = self.class_ids[model][labels]
             if (unknown := ids == NO_ID).any():
@@ -327,13 +327,15 @@ class LabelMaps:
             labels = np.where(np.isin(labels, void), labels.dtype.type(ignore_id(labels)), labels)
         return labels
 
-    def scores(self, model: str, path: Path, size: Size, read: Read) -> Scores:
+    def scores(self, model: str, path: Path, size: Size, read: Read, own: FrameSize = ANY_SIZE) -> Scores:
         """Return scores (H, W, K) of one file; `size` is (H, W) of the depth.
 
         Raises:
             DataError: If that fails; the message names it.
         """
-        scores = images.read_scores(path, self._options.scores_layout or "KHW", size, read)
+        known = self.space(model)
+        classes = None if known is None else len(known)
+        scores = images.read_scores(path, self._options.scores_layout or "KHW", size, read, own, classes)
         if void := self._options.void_ids.get(model):
             space = self.space(model)
             ids = range(scores.shape[2]) if space is None else space.ids

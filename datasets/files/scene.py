@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import hashlib
 import json
 import os
@@ -23,9 +24,29 @@ from semstab.datasets.files.options import FileOptions, Folders, FrameSource
 from semstab.datasets.files.surfaces import Surface, View
 from semstab.datasets.formats import disk
 from semstab.datasets.formats.disk import read_pose
-from semstab.datasets.formats.images import Read, read_color, read_confidence, read_mask
+from semstab.datasets.formats.images import (
+    DENSEST,
+    MAX_PHOTOGRAPH,
+    MAX_PIXELS,
+    FrameSize,
+    Read,
+    Size,
+    color_size,
+    read_color,
+    read_confidence,
+    read_mask,
+)
 from semstab.datasets.geometry.cameras import UP_AXES, Camera, Poses, to_camera_to_world
-from semstab.datasets.geometry.lenses import Labels, Pixels, Scores, at_image, fit, fitted, undistorted
+from semstab.datasets.geometry.lenses import (
+    Labels,
+    Pixels,
+    Scores,
+    at_image,
+    fit,
+    fitted,
+    require_same_view,
+    undistorted,
+)
 from semstab.datasets.scene import Scene, fingerprint, view_fingerprint
 from semstab.errors import ConfigError, DataError
 
@@ -163,9 +184,11 @@ class FileScene(Scene):
         read = self._reader(index, LABELS + model)
         depth, labels, scores = self.depth(index), None, None
         if kind == "labels":
-            labels = self._stored(index, self._maps.labels(model, file, read), depth.shape, file, "labels are")
+            own = self._sizes(index, depth.shape, file, "labels are")
+            labels = self._stored(index, self._maps.labels(model, file, read, own), depth.shape, file, "labels are")
         else:
-            stored = self._maps.scores(model, file, (depth.shape[0], depth.shape[1]), read)
+            own = self._sizes(index, depth.shape, file, "scores are")
+            stored = self._maps.scores(model, file, (depth.shape[0], depth.shape[1]), read, own)
             scores = self._stored(index, stored, depth.shape, file, "scores are")
         return self._framed(index, depth, labels, scores, color=color, files={kind: file})
 
@@ -217,7 +240,8 @@ class FileScene(Scene):
     def _read_depth(self, index: int) -> Float32:
         if self._surface is None:
             source, read = self._frame(index), self._reader(index, DEPTH)
-            depth = stored_depth(source, self.options, read, lambda shape: self.intrinsics(index, shape))
+            own = FrameSize(lambda: self._image_pixels(index, of_depth=True))
+            depth = stored_depth(source, self.options, read, lambda shape: self.intrinsics(index, shape), own)
             return depth if source.confidence is None else self._confident(index, depth, source.confidence)
         depth = self._surface.depth(self._view(index))
         if not self._surface_seen and not depth.any():
@@ -229,10 +253,13 @@ class FileScene(Scene):
 
     def _confident(self, index: int, depth: Float32, file: Path) -> Float32:
         """Return depth without that of pixels whose confidence is too low."""
-        confidence = read_confidence(file, self._reader(index, CONFIDENCE))
-        if confidence.shape != depth.shape:
-            (h, w), (H, W) = confidence.shape, depth.shape
-            raise DataError(f"{file}: confidence is {w}x{h} but depth is {W}x{H}; export them again")
+
+        def require(size: Size) -> None:
+            if size != depth.shape:
+                (h, w), (H, W) = size, depth.shape
+                raise DataError(f"{file}: confidence is {w}x{h} but depth is {W}x{H}; export them again")
+
+        confidence = read_confidence(file, self._reader(index, CONFIDENCE), FrameSize(require=require))
         return np.where(confidence >= self._frame(index).least_confidence, depth, np.float32(0))
 
     def color(self, index: int) -> UInt8 | None:
@@ -357,7 +384,8 @@ class FileScene(Scene):
         image = self._color_file(source)  # named also where it is not read: a recording takes the file as it is
         mask, masked = self._maps.mask_file(source), None
         if mask is not None:  # outside of the mask's view nothing is masked
-            values = read_mask(mask, self._reader(index, MASK)).astype(np.uint8)
+            own = self._sizes(index, depth.shape, mask, "the mask is")
+            values = read_mask(mask, self._reader(index, MASK), own).astype(np.uint8)
             masked = self._stored(index, values, depth.shape, mask, "the mask is") == 1
         shown = image if source.color_lens is None else None  # a distorted one shows another view than the depth
         known = {"depth": self.surface or source.depth, "pose": source.pose_file, "color": shown, "mask": mask}
@@ -388,6 +416,40 @@ class FileScene(Scene):
             return fitted(values, shape, where, what)
         K = camera.at(values.shape, self.options.pixel_centre or 0.0)
         return fit(values, K, self.intrinsics(index, shape), (shape[0], shape[1]))
+
+    def _sizes(self, index: int, shape: tuple[int, ...], path: Path, what: str) -> FrameSize:
+        """Return the sizes that a map of a frame may have, whose depth has that shape, by its file's header."""
+        source = self._frame(index)
+        elsewhere = source.label_lens is not None or source.label_camera is not None
+
+        def require(size: Size) -> None:
+            if elsewhere:
+                return
+            if self.labels_like_depth and size != shape:
+                (h, w), (H, W) = size, shape
+                raise DataError(f"{path}: {what} {w}x{h} but depth is {W}x{H}; bring them to one size")
+            require_same_view(size, shape, str(path), f"{what} {{}} but depth is {{}}")
+
+        return FrameSize(lambda: self._image_pixels(index), require)
+
+    def _image_pixels(self, index: int, *, of_depth: bool = False) -> int:
+        """Return the pixels of a frame's image, of depth also of its camera; 0 where neither is known.
+
+        What an image's header claims counts as far as its file has bytes for it.
+        """
+        source = self._frame(index)
+        lenses = (each.camera for each in (source.label_lens, source.color_lens) if each is not None)
+        cameras = [*lenses, *([] if source.label_camera is None else [source.label_camera])]
+        sizes = [each.size for each in [*cameras, *([source.camera] if of_depth else [])]]
+        sizes += [self.options.intrinsics_size] if of_depth else []
+        known = [min(size[0] * size[1], MAX_PHOTOGRAPH) for size in sizes if size is not None]
+        for file in (self._color_file(source), source.photograph):
+            if file is not None and self._folders.has(file):
+                with contextlib.suppress(DataError, OSError):
+                    width, height = color_size(file)
+                    likely = max(MAX_PIXELS, DENSEST * file.stat().st_size)
+                    known.append(min(width * height, likely, MAX_PHOTOGRAPH))
+        return max(known, default=0)
 
     def _reader(self, index: int, what: str) -> Read:
         """Give the content of a frame's file; its digest is remembered, so that `digest` need not read it again."""

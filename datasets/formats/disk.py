@@ -10,9 +10,9 @@ import re
 import reprlib
 import zipfile
 from array import array
-from collections.abc import Container, Iterator, Mapping
+from collections.abc import Callable, Container, Iterator, Mapping
 from pathlib import Path
-from typing import Any, BinaryIO
+from typing import IO, Any, BinaryIO, Literal
 
 import numpy as np
 import numpy.typing as npt
@@ -114,13 +114,41 @@ NPY_ORDER = re.compile(rb"""['"]fortran_order['"]\s*:\s*(True|False)""")
 NPY_SHAPE = re.compile(rb"""['"]shape['"]\s*:\s*\(([\d\s,]{0,200})\)""")
 
 
-def decode_array(path: Path, data: bytes, key: str) -> npt.NDArray[Any]:
+LONGEST_HEADER = 2**16
+"""Bytes at the beginning of an .npy file that hold its header, where it is one of plain numbers."""
+
+MAX_UNPACKED = 2**32
+"""Bytes that an array in an .npz file may take."""
+
+ORDINARY, DENSEST = 2**28, 64
+"""Bytes that an array which is no image may take whatever its file's size; and times the size of the file above."""
+
+Claimed = Callable[[tuple[int, ...], "np.dtype[Any]"], None]
+"""Is shown the shape and type that a header claims before anything is unpacked; raises DataError to refuse it."""
+
+
+def decode_array(path: Path, data: bytes, key: str, claimed: Claimed | None = None) -> npt.NDArray[Any]:
     """Return the array of an .npy file, or of an .npz file the one called `key` or the only one; read-only."""
-    return _decode_npz(path, data, key) if path.suffix.lower() == ".npz" else _decode_npy(str(path), data)
+    if path.suffix.lower() == ".npz":
+        return _decode_npz(path, data, key, claimed)
+    return _decode_npy(str(path), data, claimed)
 
 
-def _decode_npy(where: str, data: bytes) -> npt.NDArray[Any]:
+def _decode_npy(where: str, data: bytes | bytearray, claimed: Claimed | None = None) -> npt.NDArray[Any]:
     """Return the array; numpy itself would evaluate the header as Python, and allocate the claimed size."""
+    sizes, kind, order, start = _claims(where, data)
+    needed, there = math.prod(sizes) * kind.itemsize, len(data) - start
+    if there != needed:
+        raise DataError(f"{where}: the array {sizes} of {kind} needs {needed} bytes, the file has {there}; {AGAIN}")
+    if claimed is not None:
+        claimed(sizes, kind)
+    array = np.frombuffer(data, kind, offset=start)
+    array.flags.writeable = False
+    return array.reshape(sizes, order=order).astype(kind.newbyteorder("="), copy=False)
+
+
+def _claims(where: str, data: bytes | bytearray) -> tuple[tuple[int, ...], np.dtype[Any], Literal["C", "F"], int]:
+    """Return the shape, the type and the order that an .npy header claims, and where it ends."""
     if not data.startswith(b"\x93NUMPY") or len(data) < 12:
         raise DataError(f"{where}: not an .npy array; {AGAIN}")
     width = 2 if data[6] == 1 else 4
@@ -133,28 +161,49 @@ def _decode_npy(where: str, data: bytes) -> npt.NDArray[Any]:
         raise DataError(f"{where}: the .npy header is damaged, or the array does not hold plain numbers; save it anew")
     kind = np.dtype(dtype[1].decode())
     sizes = tuple(int(n) for n in re.findall(rb"\d+", shape[1]))
-    needed, there = math.prod(sizes) * kind.itemsize, len(data) - start
-    if needed == 0 or len(sizes) > 4:
+    if math.prod(sizes) == 0 or len(sizes) > 4:
         raise DataError(f"{where}: an array of shape {sizes} cannot hold an image; {AGAIN}")
-    if there != needed:
-        raise DataError(f"{where}: the array {sizes} of {kind} needs {needed} bytes, the file has {there}; {AGAIN}")
-    array = np.frombuffer(data, kind, offset=start).reshape(sizes, order="F" if order[1] == b"True" else "C")
-    return array.astype(kind.newbyteorder("="), copy=False)
+    return sizes, kind, "F" if order[1] == b"True" else "C", start
 
 
-def _decode_npz(path: Path, data: bytes, key: str) -> npt.NDArray[Any]:
+def _decode_npz(path: Path, data: bytes, key: str, claimed: Claimed | None) -> npt.NDArray[Any]:
     try:
         with zipfile.ZipFile(io.BytesIO(data)) as archive:
             members = {name.removesuffix(".npy"): name for name in archive.namelist()}
             name = next(iter(members.values())) if len(members) == 1 else members.get(key)
             if name is None:
                 raise DataError(f"{path}: holds arrays {reprlib.repr(sorted(members))}; name one '{key}'")
-            content = archive.read(name)
+            where, size = f"{path} ({reprlib.repr(name)})", archive.getinfo(name).file_size
+            with archive.open(name) as member:
+                head = member.read(min(size, LONGEST_HEADER))
+                shape, kind, _, start = _claims(where, head)
+                needed = math.prod(shape) * kind.itemsize
+                if size != start + needed or size > MAX_UNPACKED:
+                    raise DataError(
+                        f"{where}: the array {shape} of {kind} needs {needed} bytes, the file has {size - start};"
+                        f" {AGAIN}"
+                    )
+                if claimed is not None:
+                    claimed(shape, kind)
+                elif size > max(ORDINARY, DENSEST * len(data)):
+                    raise DataError(f"{where}: claims an array of shape {shape} in {len(data)} bytes; {AGAIN}")
+                content = _unpacked(member, head, size)
     except DataError:
         raise
     except Exception as error:
         raise DataError(f"{path}: not a whole .npz archive ({summarize_error(error)}); {AGAIN}") from error
-    return _decode_npy(f"{path} ({reprlib.repr(name)})", content)
+    return _decode_npy(where, content)
+
+
+def _unpacked(member: IO[bytes], head: bytes, size: int) -> bytearray:
+    """Return a member of an archive, piece by piece: `read` would hold it twice."""
+    content, at = bytearray(size), len(head)
+    content[:at] = head
+    with memoryview(content) as view:
+        while piece := member.read(2**20):
+            view[at : at + len(piece)] = piece
+            at += len(piece)
+    return content if at == size else content[:at]
 
 
 # JSON files of datasets: an object with numbers where numbers are expected, or one DataError with the file.

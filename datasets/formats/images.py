@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import functools
 import io
+import math
 import os
 import re
 import struct
@@ -15,7 +16,7 @@ from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from types import ModuleType
+from types import MappingProxyType, ModuleType
 from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
@@ -23,7 +24,7 @@ import numpy.typing as npt
 
 from semstab.core.types import Float32, Mask, UInt8, UInt16, UInt32
 from semstab.data.labels import IGNORE_8BIT, IGNORE_16BIT, LabelSpace
-from semstab.datasets.formats.disk import AGAIN, decode_array, read_bytes
+from semstab.datasets.formats.disk import AGAIN, Claimed, decode_array, read_bytes
 from semstab.datasets.geometry.lenses import Labels
 from semstab.errors import ConfigError, DataError, summarize_error
 
@@ -38,9 +39,26 @@ MASK_SUFFIXES = (".png",)
 
 MILLIMETRES = 1000.0
 NO_CLASS = IGNORE_16BIT
-MAX_PIXELS = 2**28
-MAX_IMAGE_BYTES = 2**29
-"""Largest decoded image: RGB of 178 megapixels."""
+MOST_SCORES = 4096
+"""Most classes of scores whose classes are not known."""
+
+MAX_PIXELS = 2**26
+"""Most pixels of depth, labels and masks of a frame whose image is not larger."""
+
+MAX_IMAGE_BYTES = 3 * 2**27
+"""Most bytes at once that an image may take while it is decoded: 16-bit depth of 67 megapixels, RGB labels of 44."""
+
+ORDINARY = 2**22
+"""Pixels up to which a file may be larger than its frame's image."""
+
+BEYOND_IMAGE = 4
+"""Times the pixels of its frame's image that a larger file may have."""
+
+MAX_PHOTOGRAPH = 2**28
+"""Most pixels of a colour image."""
+
+DENSEST = 64
+"""Pixels that a byte of a colour image may stand for, if that takes more than `MAX_IMAGE_BYTES`: of photographs ten."""
 
 MAX_SIDE = 2**16
 """Most pixels of a side: a few bytes of a damaged header can claim 16 x 8,388,364, which takes seconds to unpack."""
@@ -49,7 +67,23 @@ Size = tuple[int, int]
 Read = Callable[[Path], bytes]
 
 
-def read_depth(path: Path, scale: float | None = None, read: Read = read_bytes) -> Float32:
+@dataclass(frozen=True)
+class FrameSize:
+    """What a frame says of the sizes of its files before one is decoded.
+
+    Attributes:
+        pixels: Gives the pixels of its image, 0 where they are not known; asked where a file claims many.
+        require: Raises DataError for a size (H, W) that cannot be of the frame's view.
+    """
+
+    pixels: Callable[[], int] = lambda: 0
+    require: Callable[[Size], None] = lambda size: None
+
+
+ANY_SIZE = FrameSize()
+
+
+def read_depth(path: Path, scale: float | None = None, read: Read = read_bytes, own: FrameSize = ANY_SIZE) -> Float32:
     """Return depth (H, W) in metres, float32, as stored: values that mark a pixel invalid stay.
 
     `scale` is units per metre; not given, a 16-bit PNG holds millimetres and float files hold metres.
@@ -60,7 +94,7 @@ def read_depth(path: Path, scale: float | None = None, read: Read = read_bytes) 
     data = read(path)
     suffix = path.suffix.lower()
     if suffix == ".png":
-        with _whole_png(path, data) as png:
+        with _whole_png(path, data, own, {"grey": 4, "RGBA": 16}) as png:
             packed = _unpacked(png.samples()) if (png.kind, png.bits) == ("RGBA", 8) else None
             if packed is None and (png.kind != "grey" or png.bits != 16):
                 raise DataError(
@@ -70,11 +104,11 @@ def read_depth(path: Path, scale: float | None = None, read: Read = read_bytes) 
             depth = png.samples() if packed is None else packed
             scale = scale or (MILLIMETRES if packed is None else 1.0)
     elif suffix in (".tiff", ".tif"):
-        depth = _decode_tiff(path, data)
+        depth = _decode_tiff(path, data, own)
     elif suffix == ".exr":
-        depth = _decode_exr(path, data)
+        depth = _decode_exr(path, data, own)
     else:
-        depth = decode_array(path, data, "depth")
+        depth = decode_array(path, data, "depth", _claimed(path, own, 4))
     if depth.ndim != 2 or depth.dtype.kind not in "fui":
         raise DataError(f"{path}: depth is {depth.dtype} of shape {depth.shape}; store float32 metres (H, W)")
     if scale is None and depth.dtype.kind != "f":
@@ -95,7 +129,9 @@ def _unpacked(samples: npt.NDArray[Any]) -> Float32 | None:
     return depth if len(known) and bool(((known >= NEAREST) & np.isfinite(known)).all()) else None
 
 
-def read_labels(path: Path, space: LabelSpace | None = None, read: Read = read_bytes) -> Labels:
+def read_labels(
+    path: Path, space: LabelSpace | None = None, read: Read = read_bytes, own: FrameSize = ANY_SIZE
+) -> Labels:
     """Return the class ids (H, W) uint8 or uint16, in the ids of the file; RGB maps through the colours of `space`.
 
     Wider integers are narrowed.
@@ -106,8 +142,8 @@ def read_labels(path: Path, space: LabelSpace | None = None, read: Read = read_b
     """
     data = read(path)
     if path.suffix.lower() != ".png":
-        return _narrow(path, decode_array(path, data, "labels"), space)
-    with _whole_png(path, data) as png:
+        return _narrow(path, decode_array(path, data, "labels", _claimed(path, own, 2)), space)
+    with _whole_png(path, data, own, {"grey": 1, "palette": 1, "RGB": 6, "RGBA": 8}) as png:
         if png.kind not in ("grey", "palette") and (png.kind not in ("RGB", "RGBA") or png.bits != 8):
             raise DataError(
                 f"{path}: a {png.bits}-bit {png.kind} PNG cannot hold labels; save ids as 8- or 16-bit grey"
@@ -121,46 +157,56 @@ def read_labels(path: Path, space: LabelSpace | None = None, read: Read = read_b
 
 
 def read_scores(
-    path: Path, layout: Literal["KHW", "HWK"], size: Size, read: Read = read_bytes
+    path: Path,
+    layout: Literal["KHW", "HWK"],
+    size: Size,
+    read: Read = read_bytes,
+    own: FrameSize = ANY_SIZE,
+    classes: int | None = None,
 ) -> npt.NDArray[np.floating[Any]]:
     """Return soft scores (H, W, K) float16, float32 or float64, C-contiguous; `layout` is the file's.
 
-    `size` is (H, W) of the depth, to recognise the other layout.
+    `size` is (H, W) of the depth, to recognise the other layout; `classes` the number of classes, where it is known.
 
     Raises:
-        DataError: If the file has another type or layout, or is damaged.
+        DataError: If the file has another type or layout, too many classes, or is damaged.
     """
-    scores = decode_array(path, read(path), "scores")
-    if scores.ndim != 3 or scores.dtype.kind != "f":
-        raise DataError(
-            f"{path}: scores must be float16 or float32 with three axes, got {scores.dtype} of shape {scores.shape}"
-        )
-    sizes = {"KHW": scores.shape[1:], "HWK": scores.shape[:2]}
-    other = "HWK" if layout == "KHW" else "KHW"
-    if sizes[layout] != size and sizes[other] == size:
-        raise DataError(f"{path}: scores of shape {scores.shape} are not {layout}; set scores_layout: {other}")
+
+    def claimed(shape: tuple[int, ...], dtype: np.dtype[Any]) -> None:
+        if len(shape) != 3 or dtype.kind != "f":
+            raise DataError(f"{path}: scores must be float16 or float32 with three axes, got {dtype} of shape {shape}")
+        sizes = {"KHW": shape[1:], "HWK": shape[:2]}
+        other = "HWK" if layout == "KHW" else "KHW"
+        if sizes[layout] != size and sizes[other] == size:
+            raise DataError(f"{path}: scores of shape {shape} are not {layout}; set scores_layout: {other}")
+        (H, W), K = sizes[layout], shape[0 if layout == "KHW" else 2]
+        if (classes or MOST_SCORES) < K:
+            raise DataError(f"{path}: has scores of {K} classes, but there are {classes or f'at most {MOST_SCORES}'}")
+        _check_pixels(path, W, H, own=own)
+
+    scores = decode_array(path, read(path), "scores", claimed)
     return np.ascontiguousarray(scores.transpose(1, 2, 0) if layout == "KHW" else scores)
 
 
-def read_confidence(path: Path, read: Read = read_bytes) -> UInt8 | UInt16:
+def read_confidence(path: Path, read: Read = read_bytes, own: FrameSize = ANY_SIZE) -> UInt8 | UInt16:
     """Return (H, W) how sure depth is, as stored.
 
     Raises:
         DataError: If it is no one-channel PNG, or damaged.
     """
-    with _whole_png(path, read(path)) as png:
+    with _whole_png(path, read(path), own, {"grey": 1}) as png:
         if png.kind != "grey":
             raise DataError(f"{path}: a {png.bits}-bit {png.kind} PNG is no image of confidence; export it again")
         return png.samples()
 
 
-def read_mask(path: Path, read: Read = read_bytes) -> Mask:
+def read_mask(path: Path, read: Read = read_bytes, own: FrameSize = ANY_SIZE) -> Mask:
     """Return mask (H, W) bool, True where the image is 0: black is left out, as COLMAP and nerfstudio have it.
 
     Raises:
         DataError: If it is no one-channel PNG, or damaged.
     """
-    with _whole_png(path, read(path)) as png:
+    with _whole_png(path, read(path), own, {"grey": 1, "palette": 1}) as png:
         if png.kind not in ("grey", "palette"):
             raise DataError(f"{path}: a {png.bits}-bit {png.kind} PNG is no mask; save it as grey, 0 where left out")
         mask: Mask = png.samples() == 0
@@ -182,6 +228,7 @@ def read_color(path: Path, read: Read = read_bytes) -> UInt8:
         return color
     if suffix == ".png":
         with _whole_png(path, data) as png:
+            _check_photograph(path, data, *png.image.size)
             if png.kind == "grey" and png.bits == 16:
                 return np.repeat((png.samples() >> 8).astype(np.uint8)[..., None], 3, axis=2)
             png.image.info.pop("transparency", None)  # Pillow warns of it
@@ -259,6 +306,7 @@ def _packed(rgb: UInt8) -> UInt32:
 # --- PNG and JPEG by Pillow, because OpenCV fills the rest of a truncated image with grey -----------------------------
 
 PNG_SIGNATURE = b"\x89PNG\r\n\x1a\n"
+PNG_CHANNELS: Mapping[int, int] = {0: 1, 2: 3, 3: 1, 4: 2, 6: 4}
 PNG_KINDS: Mapping[int, str] = {0: "grey", 2: "RGB", 3: "palette", 4: "grey+alpha", 6: "RGBA"}
 
 
@@ -297,16 +345,24 @@ def _critical_chunks(data: bytes) -> bytes:
 
 
 @contextmanager
-def _whole_png(path: Path, data: bytes) -> Iterator[Png]:
-    """Yield a PNG that is whole; it is decoded within the context."""
+def _whole_png(
+    path: Path, data: bytes, own: FrameSize | None = None, more: Mapping[str, int] = MappingProxyType({})
+) -> Iterator[Png]:
+    """Yield a PNG that is whole; it is decoded within the context.
+
+    Its size is checked first where it is a file of a frame; `more` has by kind what a pixel takes beyond the file's.
+    """
     from PIL import PngImagePlugin
 
     if not data.startswith(PNG_SIGNATURE) or data[12:16] != b"IHDR":
         raise DataError(f"{path}: not a PNG image (it begins with {data[:8]!r}); {AGAIN}")
     with _one_line(path, "PNG"):
+        if own is not None and len(data) > 26:
+            width, height, bits, colors = struct.unpack_from(">IIBB", data, 16)
+            stored = PNG_CHANNELS.get(colors, 4) * max(1, bits // 8)
+            _check_pixels(path, width, height, stored + more.get(PNG_KINDS.get(colors, ""), 0), own)
         PngImagePlugin.PngImageFile(io.BytesIO(data)).verify()  # while it decodes, Pillow leaves out the checksums
         image = PngImagePlugin.PngImageFile(io.BytesIO(data))
-        _check_pixels(path, *image.size, len(image.getbands()))
         yield Png(path, data, PNG_KINDS[data[25]], data[24], image)
 
 
@@ -326,7 +382,7 @@ def _decode_jpeg(path: Path, data: bytes) -> UInt8:
 
     with _one_line(path, "JPEG"):
         image = JpegImagePlugin.JpegImageFile(io.BytesIO(data))
-        _check_pixels(path, *image.size, 3)
+        _check_photograph(path, data, *image.size)
         return np.array(image.convert("RGB"))
 
 
@@ -335,26 +391,29 @@ def _decode_jpeg(path: Path, data: bytes) -> UInt8:
 
 def _decode_color_tiff(path: Path, data: bytes) -> UInt8:
     """Return RGB (H, W, 3) of an 8-bit image, or of a deeper one its upper bits."""
-    channels = _checked_tags(path, data, pixel_bytes=3).get(277, 1)
+    tags = _tags(path, data)
+    _check_photograph(path, data, tags[256], tags[257])
+    channels = tags.get(277, 1)
     if channels not in (1, 3, 4):
         raise DataError(f"{path}: {channels} channels are no colour; save RGB")
     return np.ascontiguousarray(_imdecode(path, data, "IMREAD_COLOR")[..., ::-1])
 
 
-def _decode_tiff(path: Path, data: bytes) -> npt.NDArray[Any]:
+def _decode_tiff(path: Path, data: bytes, own: FrameSize) -> npt.NDArray[Any]:
     """Return one channel (H, W), of the type it was stored in."""
-    tags = _checked_tags(path, data)
+    tags = _tags(path, data)
     bits, channels, sample = tags.get(258, 1), tags.get(277, 1), tags.get(339, 1)
     if channels != 1:
         raise DataError(f"{path}: expected one channel of 32-bit float, got {channels} channels")
     if (sample, bits) not in ((3, 32), (3, 64), (1, 16)):
         kind = {1: "unsigned", 2: "signed", 3: "float"}.get(sample, "other")
         raise DataError(f"{path}: expected 32-bit float metres, got {bits}-bit {kind}; convert it")
+    _check_pixels(path, tags[256], tags[257], bits // 8 + (0 if bits == 32 else 4), own)
     return _imdecode(path, data, "IMREAD_UNCHANGED")
 
 
-def _checked_tags(path: Path, data: bytes, pixel_bytes: int = 1) -> dict[int, int]:
-    """Return the first value of each short or long tag of the first image of a TIFF whose size can be read."""
+def _tags(path: Path, data: bytes) -> dict[int, int]:
+    """Return the first value of each short or long tag of the first image of a TIFF, its size among them."""
     tags = {}
     try:
         order = {b"II*\0": "<", b"MM\0*": ">"}[data[:4]]
@@ -364,20 +423,20 @@ def _checked_tags(path: Path, data: bytes, pixel_bytes: int = 1) -> dict[int, in
             tag, kind, _, value = struct.unpack_from(order + "HHII", data, entry)
             (short,) = struct.unpack_from(order + "H", data, entry + 8)
             tags[tag] = short if kind == 3 else value
-        width, height = tags[256], tags[257]
     except (struct.error, KeyError) as error:
         raise DataError(f"{path}: not a whole TIFF image; {AGAIN}") from error
-    _check_pixels(path, width, height, pixel_bytes)
+    if not {256, 257} <= tags.keys():
+        raise DataError(f"{path}: a TIFF image without a size; {AGAIN}")
     return tags
 
 
-def _decode_exr(path: Path, data: bytes) -> npt.NDArray[Any]:
+def _decode_exr(path: Path, data: bytes, own: FrameSize) -> npt.NDArray[Any]:
     """Return one channel (H, W), where the installed OpenCV reads EXR at all (the wheels of OpenCV 5 do not)."""
     window = data.find(b"dataWindow\0box2i\0")
     if not data.startswith(b"v/1\x01") or window < 0 or len(data) < window + 37:
         raise DataError(f"{path}: not a whole EXR image; {AGAIN}")
     left, top, right, bottom = struct.unpack_from("<4i", data, window + 21)
-    _check_pixels(path, right - left + 1, bottom - top + 1)
+    _check_pixels(path, right - left + 1, bottom - top + 1, 4, own)
     if not reads_exr():
         raise DataError(
             f"{path}: the installed OpenCV cannot read EXR; convert the depth to .npy (float32 metres),"
@@ -417,9 +476,40 @@ def _imdecode(path: Path, data: bytes, mode: str) -> npt.NDArray[Any]:
     return image
 
 
-def _check_pixels(path: Path, width: int, height: int, pixel_bytes: int = 1) -> None:
-    """Check an image's size before memory is allocated for the size that a header claims."""
+def _claimed(path: Path, own: FrameSize, more: int) -> Claimed:
+    """Check the size of an array (H, W) before it is unpacked; a pixel takes `more` bytes beyond the file's."""
+
+    def check(shape: tuple[int, ...], dtype: np.dtype[Any]) -> None:
+        if len(shape) == 2:  # others are refused by what they are for
+            _check_pixels(path, shape[1], shape[0], dtype.itemsize + more, own)
+        elif math.prod(shape) * dtype.itemsize > MAX_IMAGE_BYTES:
+            raise DataError(f"{path}: claims an array of shape {shape}; expected (H, W)")
+
+    return check
+
+
+def _check_pixels(path: Path, width: int, height: int, pixel_bytes: int = 1, own: FrameSize = ANY_SIZE) -> None:
+    """Check an image's size before memory is allocated for the size that a header claims, by its frame's image."""
+    pixels = width * height
+    _check_sides(path, width, height)
     most = min(MAX_PIXELS, MAX_IMAGE_BYTES // pixel_bytes)
-    if not (0 < width <= MAX_SIDE and 0 < height <= MAX_SIDE and width * height <= most):
-        limits = f"at most {most} are read, {MAX_SIDE} on a side"
-        raise DataError(f"{path}: claims {width}x{height} pixels ({limits}); is it damaged?")
+    if pixels > ORDINARY and (image := own.pixels()):
+        most = max(ORDINARY, image, min(most, BEYOND_IMAGE * image))
+        if pixels > most:
+            raise DataError(f"{path}: claims {width}x{height} pixels, but the image has {image}; export them again")
+    if pixels > most:
+        raise DataError(f"{path}: claims {width}x{height} pixels (at most {most} are read); is it damaged?")
+    own.require((height, width))
+
+
+def _check_photograph(path: Path, data: bytes, width: int, height: int) -> None:
+    """Check a colour image's size: one that takes much memory has the bytes of a photograph."""
+    _check_sides(path, width, height)
+    pixels, free = width * height, MAX_IMAGE_BYTES // 10  # Pillow's four bytes, and two copies of three
+    if pixels > max(free, min(MAX_PHOTOGRAPH, DENSEST * len(data))):
+        raise DataError(f"{path}: claims {width}x{height} pixels in {len(data)} bytes; is it damaged?")
+
+
+def _check_sides(path: Path, width: int, height: int) -> None:
+    if not (0 < width <= MAX_SIDE and 0 < height <= MAX_SIDE):
+        raise DataError(f"{path}: claims {width}x{height} pixels (at most {MAX_SIDE} on a side); is it damaged?")

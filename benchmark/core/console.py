@@ -1,0 +1,26 @@
+"""The console on which all is printed: names of folders and of files of others cannot steer the terminal."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from typing import Any
+
+import rich.console
+from rich.segment import Segment
+
+from semstab.errors import shown
+
+
+class Console(rich.console.Console):
+    """A console that writes a character without a shape, as ESC and marks of direction are, as its code.
+
+    Colours and the cursor's moves come from rich, apart from the text.
+    """
+
+    def render(self, renderable: Any, options: Any = None) -> Iterable[Segment]:
+        """Return what rich makes of it, its text as people can read it."""
+        for segment in super().render(renderable, options):
+            if segment.control or segment.text.isprintable():
+                yield segment
+            else:
+                yield Segment(shown(segment.text, keep="\n"), segment.style)

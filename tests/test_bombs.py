@@ -1,0 +1,181 @@
+"""Small files that claim to be large are refused by their headers, in the memory and time that are promised."""
+
+from __future__ import annotations
+
+import bombs
+import cv2
+import numpy as np
+import pytest
+import tiny_scene
+from bombs import MOST_MB, MOST_SECONDS, Taken
+from image_files import refused
+from posed_config import configure
+
+import semstab
+from semstab.comparison.runs import open_run, save_summary
+from semstab.datasets.formats.images import FrameSize, read_color, read_depth, read_labels, read_mask, read_scores
+
+SETUP = """
+from pathlib import Path
+from semstab.datasets.formats import images
+from semstab.datasets.posed_folder import PosedFolder
+import cv2, pyarrow.parquet
+images._opencv()
+"""
+
+
+def within(taken: Taken) -> None:
+    assert taken.message is not None
+    assert "\n" not in taken.message
+    assert taken.megabytes < MOST_MB
+    assert taken.seconds < MOST_SECONDS
+
+
+FILES = {
+    "depth": lambda folder: ("read_depth", bombs.png(folder / "d.png", 12000, 12000)),
+    "packed depth": lambda folder: ("read_depth", bombs.png(folder / "d.png", 8000, 8000, 8, 6)),
+    "depth of floats": lambda folder: ("read_depth", bombs.npz(folder / "d.npz", "depth", (12000, 12000), "<f8")),
+    "labels": lambda folder: ("read_labels", bombs.npz(folder / "l.npz", "labels", (30000, 30000))),
+    "labels of a PNG": lambda folder: ("read_labels", bombs.png(folder / "l.png", 20000, 20000, 8)),
+    "labels in colours": lambda folder: ("read_labels", bombs.png(folder / "l.png", 8000, 8000, 8, 2)),
+    "long ids": lambda folder: ("read_labels", bombs.npz(folder / "l.npz", "labels", (9000, 9000), "<i8")),
+    "labels of three axes": lambda folder: ("read_labels", bombs.npz(folder / "l.npz", "labels", (9, 9000, 9000))),
+    "a mask": lambda folder: ("read_mask", bombs.png(folder / "m.png", 20000, 20000, 8)),
+    "confidence": lambda folder: ("read_confidence", bombs.png(folder / "c.png", 20000, 20000, 8)),
+    "colour": lambda folder: ("read_color", bombs.png(folder / "c.png", 12000, 12000, 8, 2)),
+}
+
+
+@pytest.mark.parametrize("kind", FILES)
+def test_a_small_file_of_many_pixels_is_refused_by_its_header(tmp_path, kind):
+    function, file = FILES[kind](tmp_path)
+    assert file.stat().st_size < 3_000_000
+    taken = bombs.read(SETUP, f"images.{function}(Path({str(file)!r}))")
+    within(taken)
+    assert taken.megabytes < 50
+    assert "claims" in taken.message
+
+
+def test_the_largest_depth_that_is_read_stays_in_bounds(tmp_path):
+    file = bombs.png(tmp_path / "d.png", 8192, 8192)
+    taken = bombs.read(SETUP, f"images.read_depth(Path({str(file)!r}))")
+    assert taken.message is None
+    assert taken.megabytes < MOST_MB
+    assert taken.seconds < MOST_SECONDS
+
+
+def test_scores_of_other_classes_or_sizes_are_refused_before_they_are_unpacked(tmp_path):
+    file = bombs.npz(tmp_path / "s.npz", "scores", (1000, 240, 320), "<f4")
+    taken = bombs.read(SETUP, f"images.read_scores(Path({str(file)!r}), 'KHW', (240, 320), classes=7)")
+    within(taken)
+    assert "1000 classes, but there are 7" in taken.message
+    assert taken.megabytes < 50
+
+
+@pytest.fixture
+def scene(tmp_path):
+    """A scene of 8 x 6 pixels, which its settings say, too."""
+    return tiny_scene.write(tmp_path / "scene", models=("a",))
+
+
+@pytest.mark.parametrize(
+    ("name", "match"),
+    [
+        ("labels/a/0000", r"labels are 3000x3000 but depth is 8x6"),
+        ("depth/0000", r"claims 3000x3000 pixels, but the image has 48"),
+    ],
+)
+def test_a_file_of_another_size_than_its_frame_is_refused_first(scene, name, match, monkeypatch):
+    file = next(scene.glob(f"{name}.*"))
+    bombs.png(file, 3000, 3000, 16 if "depth" in name else 8)
+    monkeypatch.setattr("semstab.datasets.formats.images.ORDINARY", 2**20)
+    monkeypatch.setattr("semstab.datasets.formats.images._imdecode", _fails_on(file))
+    action = frame_of(scene)
+    with pytest.raises(semstab.SemstabError, match=match):
+        action()
+
+
+def _fails_on(file):
+    from semstab.datasets.formats import images
+
+    decode = images._imdecode
+
+    def decoded(path, data, mode):
+        assert path != file, "it was decoded before it was refused"
+        return decode(path, data, mode)
+
+    return decoded
+
+
+def frame_of(scene):
+    from semstab.datasets import open_dataset
+
+    opened = open_dataset("posed_folder", {"root": str(scene), "intrinsics_size": [8, 6]})
+    return lambda: opened.scene(opened.scenes[0]).frame(0, "a")
+
+
+def test_a_frame_with_a_large_image_may_have_large_maps(tmp_path):
+    file = bombs.png(tmp_path / "l.png", 10000, 8000, 8)
+    refused(read_labels, file, match="at most 67108864 are read")
+    assert read_labels(file, own=FrameSize(lambda: 80_000_000)).shape == (8000, 10000)
+    small = bombs.png(tmp_path / "s.png", 3000, 3000, 8)
+    assert read_labels(small, own=FrameSize(lambda: 2_300_000)).shape == (3000, 3000)
+    with pytest.raises(semstab.DataError, match="but the image has 2000000"):
+        read_labels(small, own=FrameSize(lambda: 2_000_000))
+
+
+def test_a_large_photograph_is_read(tmp_path, monkeypatch):
+    image = np.random.default_rng(0).integers(0, 255, (300, 400, 3), dtype=np.uint8)
+    for suffix in (".png", ".jpg", ".tif"):
+        cv2.imwrite(str(tmp_path / f"c{suffix}"), image)
+    monkeypatch.setattr("semstab.datasets.formats.images.MAX_IMAGE_BYTES", 1000)
+    for suffix in (".png", ".jpg", ".tif"):
+        assert read_color(tmp_path / f"c{suffix}").shape == image.shape
+
+
+@pytest.fixture(scope="module")
+def summary(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("summary")
+    tiny_scene.write(folder / "scene", models=("a",))
+    semstab.run(configure(folder / "scene", check=None, statistics=True), out=folder / "run", report=False)
+    save_summary(open_run(folder / "run"), folder / "small.semstab")
+    return folder / "small.semstab"
+
+
+LOAD = "from semstab.comparison.runs import load_summary; import pyarrow.parquet, semstab.statistics.cluster_sums"
+
+
+@pytest.mark.parametrize("make", [bombs.semstab, bombs.semstab_of_text])
+def test_a_small_summary_of_many_numbers_is_refused(tmp_path, summary, make):
+    size = 2**22 if make is bombs.semstab else 60_000_000
+    file = make(tmp_path / "small.semstab", summary, size)
+    assert file.stat().st_size < 300_000
+    taken = bombs.read(LOAD, f"load_summary({str(file)!r})")
+    within(taken)
+    assert taken.megabytes < 200
+
+
+def test_a_parquet_file_of_many_rows_is_refused(tmp_path):
+    import pyarrow as pa
+    import pyarrow.parquet as pq
+
+    file = tmp_path / "voxels.parquet"
+    zeros = pa.array(np.zeros(2**20, np.int64))
+    table = pa.table({name: pa.chunked_array([zeros] * 64) for name in "abcd"})
+    pq.write_table(table, file, row_group_size=2**26)
+    assert file.stat().st_size < 2_000_000
+    taken = bombs.read(
+        "from pathlib import Path; from semstab.data import parquet; import pyarrow.parquet",
+        f"parquet.columns(Path({str(file)!r}), ['a', 'b', 'c', 'd'])",
+    )
+    within(taken)
+    assert "unpack to" in taken.message
+
+
+def test_readers_that_know_no_frame_are_bounded_too(tmp_path):
+    for read, kind in ((read_depth, 16), (read_mask, 8)):
+        refused(read, bombs.png(tmp_path / "x.png", 9000, 9000, kind), match="claims 9000x9000")
+    refused(
+        read_scores, bombs.npz(tmp_path / "s.npz", "scores", (5000, 4, 4), "<f4"), "KHW", (4, 4),
+        match="5000 classes, but there are at most 4096",
+    )  # fmt: skip
