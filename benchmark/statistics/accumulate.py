@@ -157,10 +157,22 @@ def with_spots(whole: ClusterSums, spots: SpotObservations, edge: float | None =
         edge: Edge of the cubes of the spots in metres, a power of 2; the smallest that leaves at most MOST_CELLS by
             default, whatever the voxels of the map.
     """
-    near, far = spots.logs()
-    cubes = Cubes.of_log(near[0], edge)
-    parts = [replace(_sums_of_log(log, cubes, square=square), classes=whole.classes) for log, square in (near, far)]
+    (first, near), (second, far), third = spots.logs()
+    cubes = Cubes.of_log(first, edge)
+    parts = [
+        replace(_sums_of_log(log, cubes, further=further), classes=whole.classes)
+        for log, further in (
+            (first, {"square": near}),
+            (second, {"square": far, "agreeing_beyond": agreement_of(third)}),
+        )
+    ]
     return replace(whole, near=parts[0], far=parts[1])
+
+
+def agreement_of(log: Events) -> Float64:
+    """Return the share (m,) of the other observations of its location that agree, for the mean of each location."""
+    table = log.table()
+    return np.asarray(np.nan_to_num(psa(table))[log.voxel], np.float64)
 
 
 def sums_of_spots(spots: SpotObservations, edge: float | None = None) -> ClusterSums:
@@ -183,11 +195,11 @@ def _sums_of_log(
     fused: Int64 | None = None,
     true_label: Int64 | None = None,
     likely: Float64 | None = None,
-    square: Float64 | None = None,
+    further: Mapping[str, Float64] | None = None,
 ) -> ClusterSums:
     """Return the sums by cube and group of frames of the locations of a log, whose dominant classes are `fused`.
 
-    square (m,) is the squared distance of each observation from its location, metres^2.
+    further has numbers (m,) of observations whose sums are kept, too.
     """
     from semstab.core.compiled import in_chunks
     from semstab.statistics.loops.clusters import add_influences
@@ -209,10 +221,11 @@ def _sums_of_log(
         add_influences, order, bounds, (events.starts, events.ends), longest, events.evidence.entries, K, group, own,
         label, consistent, FirstColumns.of(K, truth=truth), len(groups), sums,
     )  # fmt: skip
-    if square is not None:
+    if further:
         counted = np.flatnonzero(cubes.at[events.voxel] >= 0)
         at = cubes.at[events.voxel[counted]].astype(np.int64) * len(groups) + group[counted]
-        sums[:, slices["square"].start] = np.bincount(at, square[counted], len(sums))
+        for name, values in further.items():
+            sums[:, slices[name].start] = np.bincount(at, values[counted], len(sums))
     rows = np.flatnonzero(sums[:, slices["observations"].start])
     cell, frame = np.divmod(rows, max(len(groups), 1))
     return ClusterSums(

@@ -63,8 +63,10 @@ def correlogram(spots: SpotObservations) -> Correlogram:
     the bin. Bands are at CONFIDENCE, for this scene flown again where the bin has enough frames for that, else for
     these frames.
     """
-    (seen, near), (beside, far) = spots.logs()
-    labels = np.unique(np.concatenate([seen.evidence.label, beside.evidence.label]))  # the other classes change nothing
+    (seen, near), (beside, far), further = spots.logs()
+    labels = np.unique(
+        np.concatenate([log.evidence.label for log in (seen, beside, further)])
+    )  # the other classes change nothing
     cubes, of, edge = _cubes(seen)
     step, most = 1, min(MOST_GROUPS, max(1, MOST_SUMS // (max(len(cubes), 1) * (4 + len(labels)))))
     while len(frames := np.unique(seen.frame // step)) > most:
@@ -80,7 +82,11 @@ def correlogram(spots: SpotObservations) -> Correlogram:
         distance += np.bincount(bins.ravel(), weights=apart.ravel(), minlength=len(pairs))
         by_lag.append((first, second, bins))
     sums = [_sums(log, labels, square, by_lag, cluster, len(keys)) for log, square in ((seen, near), (beside, far))]
-    columns = side_by_side(dict(zip((*ALPHA_SUMS, "square"), (1, 1, 1, len(labels), 1), strict=True)))
+    third = _sums(further, labels, far, by_lag, cluster, len(keys))[:, :, :1]
+    sums = [np.concatenate([each, third], axis=2) for each in sums]
+    columns = side_by_side(
+        dict(zip((*ALPHA_SUMS, "square", "agreeing_beyond"), (1, 1, 1, len(labels), 1, 1), strict=True))
+    )
     rows, specs = [], []
     for k in np.flatnonzero(pairs[:-1] >= LEAST_PAIRS):
         some = np.flatnonzero(sums[0][k, :, 1])

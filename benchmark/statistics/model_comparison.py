@@ -153,7 +153,7 @@ def _by_cube(spots: Mapping[str, ClusterSums]) -> dict[str, Float64]:
     for name, each in parts.items():
         sums = []
         for own in each:
-            columns = np.hstack([columns_of(own, FUNCTIONALS[ALPHA.key]), own["square"]])
+            columns = np.hstack([columns_of(own, FUNCTIONALS[ALPHA.key]), own["square"], own["agreeing_beyond"]])
             sums.append(np.zeros((len(cubes), columns.shape[1])))
             np.add.at(sums[-1], next(ends), columns)
         result[name] = np.hstack(sums)

@@ -81,8 +81,8 @@ class Views:
 
 
 TYPES: Mapping[str, type[np.generic]] = {
-    "spot": np.int32, "view": np.int32, "label": np.uint16, "neighbour": np.uint16, "near": np.float32,
-    "far": np.float32,
+    "spot": np.int32, "view": np.int32, "label": np.uint16, "neighbour": np.uint16, "beyond": np.uint16,
+    "near": np.float32, "far": np.float32,
 }  # fmt: skip
 """Columns of answers."""
 
@@ -99,15 +99,16 @@ class SpotObservations:
     """Answers of views for spots of the surface: a row (m,) for each spot and frame.
 
     A spot is a point of the surface, one in a coarse cell; it does not depend on the voxels of a map. The answer of a
-    frame is the label of the pixel which the spot falls into. A second answer, of a pixel next to it on the same
-    surface, tells how agreement falls with the distance of the points that answer: at a border of two classes the first
-    one is wrong if the pixel's centre and the spot lie on different sides.
+    frame is the label of the pixel which the spot falls into. A second and a third answer, of the next two pixels on the
+    same surface, tell how agreement falls with the distance of the points that answer: at a border of two classes the
+    first one is wrong if the pixel's centre and the spot lie on different sides.
 
     Attributes:
         spot: (m,) int32 row of `point`.
         view: (m,) int32 row of `views`.
         label: (m,) uint16 class; K for pixels that have no label.
-        neighbour: (m,) uint16 class of the second answer; the first one if no pixel next to it shows the surface.
+        neighbour, beyond: (m,) uint16 classes of the second and the third answer; the first one if no two pixels to one
+            side show the surface.
         near, far: (m,) float32 squared distances of the two pixels' centres from the spot, across the ray, metres^2.
         point: (n, 3) spots in metres.
         drawn: (n,) uint32 hash of the spot's coarse cell; cells below `share` are in the sample.
@@ -123,6 +124,7 @@ class SpotObservations:
     view: Int32
     label: UInt16
     neighbour: UInt16
+    beyond: UInt16
     near: Float32
     far: Float32
     point: Float64
@@ -139,8 +141,8 @@ class SpotObservations:
 
     @property
     def cell(self) -> Int64:
-        """(n, 3) coarse cell of each spot: floor(point / spacing)."""
-        return np.floor(self.point / self.spacing).astype(np.int64)
+        """(n, 3) coarse cell of each spot."""
+        return cells_of(self.point, self.spacing)
 
     @property
     def distance(self) -> Float64:
@@ -193,10 +195,10 @@ class SpotObservations:
         """Return the log of spots: the class that a view gives each of them, by the first answers."""
         return self._log(self.label)[0]
 
-    def logs(self) -> tuple[tuple[Events, Float64], tuple[Events, Float64]]:
-        """Return the logs of the first and of the second answers, each with (m,) squared distances, metres^2."""
+    def logs(self) -> tuple[tuple[Events, Float64], tuple[Events, Float64], Events]:
+        """Return the logs of the three answers, the first two with (m,) squared distances, metres^2."""
         near, far = self._log(self.label, self.near), self._log(self.neighbour, self.far)
-        return (near[0], near[2]), (far[0], far[2])
+        return (near[0], near[2]), (far[0], far[2]), self._log(self.beyond)[0]
 
     def _log(self, label: UInt16, square: Float32 | None = None) -> tuple[Events, Int64, Float64]:
         """Return a log of these labels, (n,) the spot of each of its voxels, and (m,) squared distances.
@@ -283,12 +285,19 @@ class SpotObservations:
         """Raise DataError if a number is one that no sample has."""
         if len(self) and not (self.view.min() >= 0 and self.view.max() < len(self.views)):
             raise DataError("a view that is not there")
-        if len(self) and max(self.label.max(), self.neighbour.max()) > self.K:
+        if len(self) and max(self.label.max(), self.neighbour.max(), self.beyond.max()) > self.K:
             raise DataError(f"a label above {self.K}")
         if not (np.isfinite(self.point).all() and 0 < self.spacing < np.inf):
             raise DataError("a spot without a place")
         if np.abs(self.point).max(initial=0.0) * PARTS / self.spacing > 2**31:
             raise DataError("a spot that lies too far away")
+
+
+def cells_of(point: Float64, edge: float) -> Int64:
+    """Return the coarse cells (n, 3) of points (n, 3)."""
+    from semstab.statistics.loops.spots import PHASE
+
+    return np.floor(point / edge + PHASE).astype(np.int64)
 
 
 def same_spots(samples: Sequence[SpotObservations]) -> list[SpotObservations]:
@@ -301,7 +310,7 @@ def same_spots(samples: Sequence[SpotObservations]) -> list[SpotObservations]:
     views = Views.joined([sample.views for sample in samples])
     views = views.take(np.sort(np.unique(views.frame, return_index=True)[1]))
     samples = [sample.within(share) for sample in samples]
-    cells = [np.floor(sample.point / spacing).astype(np.int64) for sample in samples]
+    cells = [cells_of(sample.point, spacing) for sample in samples]
     distinct, of = distinct_rows(np.concatenate(cells))
     firsts = []
     for own in np.split(of, np.cumsum([len(cell) for cell in cells])[:-1]):

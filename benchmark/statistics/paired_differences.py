@@ -292,7 +292,7 @@ def _filled(sample: SpotObservations, asked: SpotObservations, ignored: Float64)
     """Return a model's answers, with a further class for the answers that it `ignored` (n,) of each observation."""
     further = asked.only(np.repeat(np.arange(len(asked)), ignored.astype(np.int64)))
     none = np.full(len(further), sample.K, np.uint16)
-    further = dataclasses.replace(further, label=none, neighbour=none)
+    further = dataclasses.replace(further, label=none, neighbour=none, beyond=none)
     return dataclasses.replace(SpotObservations.stacked([sample, further]), K=sample.K + 1, classes=())
 
 

@@ -32,11 +32,11 @@ MOST_SPOTS = 1 << 17
 MOST_NEW = 1 << 16
 """Most spots that one frame adds."""
 
-LOOKED_AT = 40_000
+LOOKED_AT = 16_000
 """Blocks of pixels, about, in which new spots are looked for."""
 
-APART = 1.0
-"""Edge of a coarse cell, in distances of the pixels in which new spots are looked for, or more."""
+APART = 0.7
+"""Edge of a coarse cell, by the mean area that a block of pixels shows, or up to twice as much."""
 
 SIDE = 640
 """Most pixels on a side of the labels by which frames that repeat another are found."""
@@ -46,6 +46,9 @@ FEW = 4
 
 REACH = 1 << 20
 """Coarse cells from the first camera within which there are spots."""
+
+OBLIQUE = 2.0
+"""How much wider than a surface that faces the sensor points of sparse depth lie apart, about."""
 
 CHANGE = 8.0
 """Growth or fall of the median footprint from which on the sample begins again, as after a take-off."""
@@ -59,9 +62,6 @@ which depth noise and errors of poses cause; the least and the most of this tole
 
 GATE, ENOUGH = 0.05, 50
 """That standard deviation is taken of differences up to this, relative, if a frame has at least so many."""
-
-SLACK = 0.25
-"""Share of the slope of inverse depth in a pixel that is added: surfaces are curved."""
 
 SPARSE, DENSE = 0.3, 0.1
 """Share of an image's pixels that have depth below which depth is sparse, as a LiDAR's in an image is; and share of the
@@ -137,6 +137,7 @@ class Sampler:
         self._anchor: Anchor | None = None
         self._seen: dict[bytes, Anchor] = {}
         self._errors: list[float] = []
+        self._widths: list[float] = []
         self._known = 0
         self._clear()
 
@@ -154,8 +155,7 @@ class Sampler:
         if not len(few):
             few = frame.depth[(frame.depth > 0) & (frame.depth < np.inf)]
         sparse = _sparse(frame, self.K)
-        spacing = _stride(frame.shape) if sparse is None else sparse.spacing
-        view = self._view_of(frame, float(np.median(few)), spacing) if len(few) else None
+        view = self._view_of(frame, float(np.median(few)), sparse) if len(few) else None
         if view is None:
             return
         self._known = self._spots
@@ -167,11 +167,8 @@ class Sampler:
             self._find_in_points(sparse, T, seed)
             self._take(view, *self._answers_of_points(frame, sparse, T, seed))
 
-    def _view_of(self, frame: Frame, depth: float, spacing: float) -> int | None:
-        """Return the view of a frame, which may be a new one; None if the frame repeats another.
-
-        depth is the median; new spots are looked for in pixels that lie `spacing` pixels apart.
-        """
+    def _view_of(self, frame: Frame, depth: float, sparse: Sparse | None) -> int | None:
+        """Return the view of a frame of this median depth, which may be a new one; None if the frame repeats another."""
         small = frame.predicted[:: max(1, -(-frame.shape[0] // SIDE)), :: max(1, -(-frame.shape[1] // SIDE))]
         digest = hashlib.blake2b(np.ascontiguousarray(small).tobytes(), digest_size=16).digest()
         same = self._seen.get(digest)
@@ -183,8 +180,8 @@ class Sampler:
         self._anchor = self._seen[digest] = Anchor(len(self._views), frame.T_wc.copy(), focal, depth)
         centre, when = frame.T_wc[:3, 3], math.nan if frame.timestamp is None else frame.timestamp
         self._views.append([frame.index, *centre.tolist(), when, depth / focal])
-        footprint = float(np.median(self._views.table()[:, -1]))
-        edge = 2.0 ** math.ceil(math.log2(APART * spacing * footprint))
+        self._widths.append(_width(frame, sparse, depth / focal))
+        edge = 2.0 ** math.ceil(math.log2(APART * float(np.median(self._widths))))
         if not self._edge / CHANGE < edge < self._edge * CHANGE:
             self._edge = edge
             self._low = np.floor(centre / edge).astype(np.int64) - REACH
@@ -249,15 +246,14 @@ class Sampler:
         n = project(self._point[:n], fixed(frame.depth), camera, T, spot, x, y, error, room)
         spot, x, y, error, room = spot[:n], x[:n], y[:n], error[:n], room[:n]
         self._learn(self._known, spot, error)
-        out = np.empty(n, np.int32), np.empty(n, np.uint16), np.empty(n, np.uint16), np.empty((n, 2), np.float32)
+        out = _room(n)
         m = answer(
-            spot, x, y, error, room, self._allowed(), SLACK, fixed(frame.depth), *_labels(frame), self.K, camera,
-            seed, *out,
+            spot, x, y, room, self._allowed(), fixed(frame.depth), *_labels(frame), self.K, camera, seed, *out,
         )  # fmt: skip
         return tuple(column[:m] for column in out)
 
     def _answers_of_points(self, frame: Frame, sparse: Sparse, T: Float64, seed: int) -> tuple[Any, ...]:
-        from semstab.statistics.loops.spots import answer_image_sparse, answer_points, project_sparse
+        from semstab.statistics.loops.spots import answer_sparse, answer_points, project_sparse
 
         n = self._spots
         spot, nearest, (x, y, error, room) = np.empty(n, np.int32), np.empty(n, np.int64), np.empty((4, n))
@@ -265,9 +261,9 @@ class Sampler:
         n = project_sparse(self._point[:n], *sparse.arrays, *place, T, spot, x, y, error, room, nearest)
         spot, x, y, error, room, nearest = spot[:n], x[:n], y[:n], error[:n], room[:n], nearest[:n]
         self._learn(self._known, spot, error)
-        out = np.empty(n, np.int32), np.empty(n, np.uint16), np.empty(n, np.uint16), np.empty((n, 2), np.float32)
+        out = _room(n)
         if sparse.labels is None:
-            m = answer_image_sparse(
+            m = answer_sparse(
                 spot,
                 x,
                 y,
@@ -287,12 +283,12 @@ class Sampler:
             )
         return tuple(column[:m] for column in out)
 
-    def _take(self, view: int, spot: Any, label: UInt16, far: UInt16, square: Any) -> None:
+    def _take(self, view: int, spot: Any, label: UInt16, second: UInt16, third: UInt16, square: Any) -> None:
         """Add the answers of a view; drop every second spot while there are too many of them."""
         end = self._answers + len(spot)
         if end > len(self._columns["spot"]):
             self._columns = {name: _longer(each, max(2 * len(each), end)) for name, each in self._columns.items()}
-        values = spot, np.full(len(spot), view), label, far, square[:, 0], square[:, 1]
+        values = spot, np.full(len(spot), view), label, second, third, square[:, 0], square[:, 1]
         for name, own in zip(COLUMNS, values, strict=True):
             self._columns[name][self._answers : end] = own
         self._answers = end
@@ -328,6 +324,12 @@ class Sampler:
         )
 
 
+def _room(n: int) -> tuple[Any, ...]:
+    """Return room for n answers: spot, three labels, two squared distances."""
+    labels = (np.empty(n, np.uint16) for _ in range(3))
+    return np.empty(n, np.int32), *labels, np.empty((n, 2), np.float32)
+
+
 def _longer(array: npt.NDArray[Any], length: int) -> npt.NDArray[Any]:
     """Return an array with room for more rows."""
     longer = np.empty((length, *array.shape[1:]), array.dtype)
@@ -348,6 +350,16 @@ def _labels(frame: Frame) -> tuple[Any, Any]:
 def _stride(shape: tuple[int, int]) -> int:
     """Return the distance of the pixels in which new spots are looked for."""
     return max(1, round(math.sqrt(shape[0] * shape[1] / LOOKED_AT)))
+
+
+def _width(frame: Frame, sparse: Sparse | None, footprint: float) -> float:
+    """Return the edge, metres, of a square as large as the mean area that a block of pixels, or a point, shows."""
+    from semstab.statistics.loops.spots import mean_area
+
+    if sparse is not None:
+        return OBLIQUE * sparse.spacing * footprint
+    stride = _stride(frame.shape)
+    return stride * math.sqrt(mean_area(fixed(frame.depth), _camera(frame), 2 * stride)) or footprint
 
 
 @functools.lru_cache(maxsize=64)

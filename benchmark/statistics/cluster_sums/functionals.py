@@ -79,31 +79,55 @@ class Functional:
 
 SPOTS: tuple[tuple[Part, float], ...] = (("near", 1.0), ("far", -1.0))
 """alpha + lever (alpha - alpha'), with alpha' of the second answers: agreement falls with the distance of the points that
-answer from the spot, to first order linearly, as a border of two classes lies between them. See `lever_of`."""
-
-LARGEST_LEVER = 2.0
+answer from the spot, as a border of two classes may lie between them. See `lever_of`."""
 
 
 def lever_of(near: ClusterSums, far: ClusterSums) -> float:
-    """Return d / (d' - d), from root mean square distances d of the first and d' of the second answers from spots.
+    """Return by how much of the fall from first to second answers alpha lies above alpha of the first ones.
 
-    The line through alpha at d and alpha' at d' is read at 0. It is 0 if the second answers are the first ones.
+    The parabola through disagreement D, D', D'' at the root mean square distances d < d' < d'' of three answers is read
+    at 0: lever = (D - D(0)) / (D' - D). A sharp border of classes gives a line, one that models place differently by
+    more than a pixel a parabola, and labels finer than pixels a curve that levels off.
     """
-    return float(lever(*(part["square"].sum() for part in (near, far))))
+    n = float(near["observations"].sum())
+    if not n > 0:
+        return 0.0
+    agreeing = [float(part.sum()) / n for part in (near["agreeing"], far["agreeing"], far["agreeing_beyond"])]
+    return float(lever(near["square"].sum(), far["square"].sum(), *agreeing))
 
 
-def lever(near: Any, far: Any) -> Float64:
-    """Return the lever (...,) from sums (...,) of squared distances of as many first and second answers."""
-    first, second = np.sqrt(near), np.sqrt(far)
+LEAST_FALL, LARGEST_RATIO = 1e-3, 3.0
+"""Fall of agreement from first to second answers from on which its form is told, else it is a line; and the largest
+ratio of the further fall to it, which a parabola around 0 has."""
+
+
+def lever(near: Any, far: Any, first: Any, second: Any, third: Any) -> Float64:
+    """Return the lever (...,) from sums (...,) of squared distances of first and second answers, and three agreements.
+
+    It is 0 if the second answers are the first ones.
+    """
     with np.errstate(invalid="ignore", divide="ignore"):
-        ratio = np.where(second > first, first / (second - first), 0.0)
-    return np.minimum(ratio, LARGEST_LEVER)
+        d, d1 = np.ones_like(near, np.float64), np.sqrt(far / near)  # the last one is two steps away, not one
+        d2 = np.sqrt(1 + 4 * (d1**2 - 1))
+        ratio = np.where(first - second > LEAST_FALL, (second - third) / (first - second), (d2 - d1) / (d1 - d))
+        at_second, at_third = d * d2 / ((d - d1) * (d2 - d1)), d * d1 / ((d - d2) * (d1 - d2))
+        read = -at_second - at_third - at_third * np.clip(ratio, 0.0, LARGEST_RATIO)
+    return np.where(far > SAME * near, read, 0.0)
+
+
+SAME = 1.2
+"""Second answers are farther than first ones if their squared distances are larger by this factor."""
 
 
 def alpha_of_spots(near: Float64, far: Float64) -> Float64:
-    """Return alpha (...,) from the sums (..., C + 1) of `ALPHA_SUMS` and squares of first and of second answers."""
-    first, second = alpha_of(near[..., :-1]), alpha_of(far[..., :-1])
-    return first + lever(near[..., -1], far[..., -1]) * (first - second)
+    """Return alpha (...,) from sums (..., C + 2) of first and of second answers.
+
+    They are `ALPHA_SUMS`, squared distances, and the agreement of the third answers.
+    """
+    first, second, n = alpha_of(near[..., :-2]), alpha_of(far[..., :-2]), near[..., 1]
+    with np.errstate(invalid="ignore", divide="ignore"):
+        agreeing = near[..., 0] / n, far[..., 0] / n, far[..., -1] / n
+    return first + lever(near[..., -2], far[..., -2], *agreeing) * (first - second)
 
 
 ALPHA_SUMS = ("agreeing", "observations", "own", "evidence")

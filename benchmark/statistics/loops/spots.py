@@ -22,12 +22,26 @@ plane the same sum comes again soon (Roberts 2018, The Unreasonable Effectivenes
 GOLDEN = np.uint64(0x9E3779B97F4A7C15)
 EMPTY = np.int64(-1)
 
-PLACES, MOST_PLACES = 3.0, np.int64(64)
+PHASE = 0.3819660113
+"""Part of its edge by which coarse cells are moved from the origin: the golden section."""
+
+PLACES, MOST_PLACES = 2.0, np.int64(64)
 """Places that are looked at in the area of a coarse cell's face, so that few cells are left out by chance; and the most
-of them for one pixel, or point of a scan."""
+of them for one block of pixels, or point of a scan."""
 
 STEEPEST = 32.0
 """Largest area that a pixel shows, in those that it would show if the surface faced it."""
+
+SLACK = 0.25
+"""Share of the slope of inverse depth by which a pixel next to another on the same surface may differ from its plane."""
+
+EDGE, JUMP = 4.0, 0.01
+"""A slope of inverse depth to one side that is larger than that to the other side by this factor, and this share of the
+inverse depth, is an edge."""
+
+OFF = 0.35
+"""A pixel answers for a spot if its centre is at most so many pixels away from it along each axis: a pixel at a border of
+classes tells the class at its centre. Every second view is lost by this, whatever the labels."""
 
 ON_A_PLANE = 0.03
 """Sparse points lie on a plane if it leaves at most this over of their inverse depth, relative."""
@@ -109,13 +123,20 @@ def is_new(table, key, added):
 
 
 @serial
+def cell_of(x, y, z, edge):
+    """Return the coarse cell of a point; no face of a cell lies in a plane such as z = 0, where floors lie."""
+    return (
+        np.int64(np.floor(x / edge + PHASE)), np.int64(np.floor(y / edge + PHASE)),
+        np.int64(np.floor(z / edge + PHASE)),
+    )  # fmt: skip
+
+
+@serial
 def fill(point, edge, low, table):
     """Add the coarse cells of points (n, 3) to a table."""
     for i in range(len(point)):
-        a = np.int64(np.floor(point[i, 0] / edge)) - low[0]
-        b = np.int64(np.floor(point[i, 1] / edge)) - low[1]
-        c = np.int64(np.floor(point[i, 2] / edge)) - low[2]
-        is_new(table, (a << (2 * BITS)) | (b << BITS) | c, True)
+        a, b, c = cell_of(point[i, 0], point[i, 1], point[i, 2], edge)
+        is_new(table, ((a - low[0]) << (2 * BITS)) | ((b - low[1]) << BITS) | (c - low[2]), True)
 
 
 @serial
@@ -131,7 +152,7 @@ def in_world(x, y, z, T):
 @serial
 def free(px, py, pz, edge, share, low, table, taken):
     """Return the hash of a point's coarse cell if it is in the sample and has no spot, else -1; it is taken if so."""
-    i, j, k = np.int64(np.floor(px / edge)), np.int64(np.floor(py / edge)), np.int64(np.floor(pz / edge))
+    i, j, k = cell_of(px, py, pz, edge)
     own = np.int64(hash_cell(i, j, k))
     if own >= share:
         return np.int64(-1)
@@ -146,7 +167,7 @@ def area(here, along_x, along_y, x, y, fx, fy):
     """Return the area of the surface that a pixel at ray (x, y, 1) shows, m^2, from inverse depth and its slopes.
 
     Inverse depth of a plane n . X = 1 is n . (x, y, 1). So n follows from the slopes, and the area is z^3 |n| / (fx fy);
-    at most as at an angle of incidence of about 88 degrees.
+    at most STEEPEST times that of a surface that faces the camera.
     """
     nx, ny = along_x * fx, along_y * fy
     nz = here - nx * x - ny * y
@@ -211,11 +232,37 @@ def new_in_image(depth, camera, T, edge, share, low, stride, factor, seed, table
 
 
 @serial
+def outside(depth, row, column, here, dx, dy, w):
+    """Return how far inverse depth w is from the range that a pixel's surface may have at (dx, dy) from its centre.
+
+    The surface goes on with the slopes to the pixels before and after, of which one that belongs to another surface,
+    behind an edge, does not count.
+    """
+    low = high = here
+    for side in range(2):
+        before = inverse(depth, row, column - 1) if side == 0 else inverse(depth, row - 1, column)
+        after = inverse(depth, row, column + 1) if side == 0 else inverse(depth, row + 1, column)
+        apart = dx if side == 0 else dy
+        left = here - before if before > 0.0 else after - here
+        right = after - here if after > 0.0 else left
+        if before == 0.0 and after == 0.0:
+            left = right = 0.0
+        if abs(left) > EDGE * abs(right) + JUMP * here:
+            left = right
+        elif abs(right) > EDGE * abs(left) + JUMP * here:
+            right = left
+        if left * right < 0.0 and min(abs(left), abs(right)) > JUMP * here:
+            left = right = 0.0
+        low, high = low + min(left * apart, right * apart), high + max(left * apart, right * apart)
+    return max(low - w, w - high, 0.0)
+
+
+@serial
 def project(point, depth, camera, T, spot, x, y, error, room):
     """Find the spots that fall on a pixel with depth, in front of the camera; return how many.
 
-    For each it writes its number, its image coordinates, how much nearer than the spot the surface is (relative), and
-    `room`: by how much the surface's slope changes that within a pixel.
+    For each it writes its number, its image coordinates, how much nearer than the spot the surface is by the pixel's
+    slope, and `room`: how far the spot is from all that the slopes to the pixels around allow; both relative.
     """
     H, W = depth.shape
     fx, fy, cx, cy = camera
@@ -231,12 +278,12 @@ def project(point, depth, camera, T, spot, x, y, error, room):
             continue
         column, row = np.int64(np.floor(u + 0.5)), np.int64(np.floor(v + 0.5))
         here = inverse(depth, row, column)
-        if here == 0.0:
+        if here == 0.0 or abs(u - column) > OFF or abs(v - row) > OFF:
             continue
         along_x, along_y = slopes(depth, row, column, here)
         spot[n], x[n], y[n] = i, u, v
         error[n] = (here + along_x * (u - column) + along_y * (v - row)) * z - 1.0
-        room[n] = (abs(along_x) + abs(along_y)) * z
+        room[n] = outside(depth, row, column, here, u - column, v - row, 1.0 / z) * z
         n += 1
     return n
 
@@ -251,38 +298,76 @@ def own_label(labels, unlabelled, row, column, K):
 
 
 @serial
-def answer(spot, x, y, error, room, allowed, slack, depth, labels, unlabelled, K, camera, seed, out, near, far, square):
-    """Write the answers of the pixels that show a spot: its number, two labels, and two squared distances, metres^2.
+def aside(side):
+    """Return a step of one pixel to one of four sides."""
+    sign = np.int64(1) if side & 2 else np.int64(-1)
+    return (sign, np.int64(0)) if side & 1 else (np.int64(0), sign)
 
-    A pixel shows a spot if both are at the same depth, but for `allowed` (relative) and `slack` of the slope. The first
-    label is that of the pixel which the spot falls into, the second one that of a pixel next to it, if it shows the
-    same surface. The distances are those of the pixels' centres from the spot, across the ray. unlabelled (H, W) marks
-    pixels to which the model gave no label; (0, 0) without such pixels. Returns the number of answers.
+
+@serial
+def answer(spot, x, y, room, allowed, depth, labels, unlabelled, K, camera, seed, out, near, far, beyond, square):
+    """Write the answers of the pixels that show a spot: its number, three labels, and two squared distances, metres^2.
+
+    A pixel shows a spot if both are at the same depth, but for `allowed` (relative). The first label is that of the
+    pixel which the spot falls into; the second and the third one those of the next two pixels to one side, if they
+    show the same surface. The distances are those of the first two pixels' centres from the spot, across the ray.
+    unlabelled (H, W) marks pixels to which the model gave no label; (0, 0) without such pixels. Returns the number of
+    answers.
     """
     fx, fy, _, _ = camera
     n = 0
     for i in range(len(spot)):
-        if abs(error[i]) > allowed + slack * room[i]:
+        if room[i] > allowed:
             continue
         column, row = np.int64(np.floor(x[i] + 0.5)), np.int64(np.floor(y[i] + 0.5))
         own, here = own_label(labels, unlabelled, row, column, K), inverse(depth, row, column)
-        other, dx, dy = own, column - x[i], row - y[i]
+        second, third, dx, dy = own, own, column - x[i], row - y[i]
         ex, ey = dx, dy
-        side = mixed(np.uint32(np.uint32(seed) ^ np.uint32(spot[i])))
-        sign = np.int64(1) if side & np.uint32(2) else np.int64(-1)
-        step_x, step_y = (sign, np.int64(0)) if side & np.uint32(1) else (np.int64(0), sign)
-        there = inverse(depth, row + step_y, column + step_x)
-        if there > 0.0 and own < K:
+        if own < K:
             along_x, along_y = slopes(depth, row, column, here)
-            expected = here + along_x * step_x + along_y * step_y
-            its = own_label(labels, unlabelled, row + step_y, column + step_x, K)
-            if its < K and abs(there - expected) <= (1.5 * allowed + slack * room[i]) * here:
-                other, ex, ey = its, dx + step_x, dy + step_y
-        out[n], near[n], far[n] = spot[i], own, other
+            start = np.int64(mixed(np.uint32(np.uint32(seed) ^ np.uint32(spot[i]))) & np.uint32(3))
+            for turn in range(4):
+                step_x, step_y = aside((start + turn) & 3)
+                labelled = np.int64(K)
+                for times in range(2, 0, -1):
+                    a, b = column + times * step_x, row + times * step_y
+                    there = inverse(depth, b, a)
+                    expected = here + times * (along_x * step_x + along_y * step_y)
+                    slack = 1.5 * allowed + SLACK * times * (abs(along_x) + abs(along_y)) / here
+                    if there == 0.0 or abs(there - expected) > slack * here:
+                        labelled = np.int64(K)
+                        break
+                    its = own_label(labels, unlabelled, b, a, K)
+                    if its >= K:
+                        labelled = np.int64(K)
+                        break
+                    if times == 2:
+                        labelled = its
+                    else:
+                        second, third = its, labelled
+                        ex, ey = dx + step_x, dy + step_y
+                if labelled < K:
+                    break
+        out[n], near[n], far[n], beyond[n] = spot[i], own, second, third
         square[n, 0] = ((dx / fx) ** 2 + (dy / fy) ** 2) / (here * here)
         square[n, 1] = ((ex / fx) ** 2 + (ey / fy) ** 2) / (here * here)
         n += 1
     return n
+
+
+@serial
+def mean_area(depth, camera, stride):
+    """Return the mean area of the surface that a pixel shows, m^2, over every stride-th pixel of each axis."""
+    fx, fy, cx, cy = camera
+    total, count = 0.0, 0
+    for row in range(stride // 2, depth.shape[0], stride):
+        for column in range(stride // 2, depth.shape[1], stride):
+            here = inverse(depth, row, column)
+            if here > 0.0:
+                along_x, along_y = slopes(depth, row, column, here)
+                total += area(here, along_x, along_y, (column - cx) / fx, (row - cy) / fy, fx, fy)
+                count += 1
+    return total / max(count, 1)
 
 
 # --- Sparse depth: points of a scan, or of one that is drawn into an image --------------------------------------------
@@ -467,8 +552,8 @@ def project_sparse(point, grid, u, v, w, camera, around, reach, T, spot, x, y, e
 
 
 @serial
-def answer_image_sparse(
-    spot, x, y, error, allowed, labels, unlabelled, K, w, nearest, camera, seed, out, near, far, square
+def answer_sparse(
+    spot, x, y, error, allowed, labels, unlabelled, K, w, nearest, camera, seed, out, near, far, beyond, square
 ):
     """Write the answers of the pixels of an image with sparse depth and dense labels, as `answer` does."""
     H, W = labels.shape
@@ -479,15 +564,20 @@ def answer_image_sparse(
             continue
         column, row, here = np.int64(np.floor(x[i] + 0.5)), np.int64(np.floor(y[i] + 0.5)), w[nearest[i]]
         own, dx, dy = own_label(labels, unlabelled, row, column, K), column - x[i], row - y[i]
-        other, ex, ey = own, dx, dy
-        side = mixed(np.uint32(np.uint32(seed) ^ np.uint32(spot[i])))
-        sign = np.int64(1) if side & np.uint32(2) else np.int64(-1)
-        step_x, step_y = (sign, np.int64(0)) if side & np.uint32(1) else (np.int64(0), sign)
-        if own < K and 0 <= row + step_y < H and 0 <= column + step_x < W:
-            its = own_label(labels, unlabelled, row + step_y, column + step_x, K)
-            if its < K:
-                other, ex, ey = its, dx + step_x, dy + step_y
-        out[n], near[n], far[n] = spot[i], own, other
+        second, third, ex, ey = own, own, dx, dy
+        if own < K:
+            start = np.int64(mixed(np.uint32(np.uint32(seed) ^ np.uint32(spot[i]))) & np.uint32(3))
+            for turn in range(4):
+                step_x, step_y = aside((start + turn) & 3)
+                a, b = column + 2 * step_x, row + 2 * step_y
+                if a < 0 or b < 0 or a >= W or b >= H:
+                    continue
+                first = own_label(labels, unlabelled, row + step_y, column + step_x, K)
+                last = own_label(labels, unlabelled, b, a, K)
+                if first < K and last < K:
+                    second, third, ex, ey = first, last, dx + step_x, dy + step_y
+                    break
+        out[n], near[n], far[n], beyond[n] = spot[i], own, second, third
         square[n, 0] = ((dx / fx) ** 2 + (dy / fy) ** 2) / (here * here)
         square[n, 1] = ((ex / fx) ** 2 + (ey / fy) ** 2) / (here * here)
         n += 1
@@ -495,66 +585,60 @@ def answer_image_sparse(
 
 
 @serial
+def next_point(grid, u, v, w, at, goal_x, goal_y, reach, around, allowed, steep):
+    """Return the point nearest to a goal in the image that shows the surface of point `at`, not `at`; -1 without any."""
+    rows, columns = grid.shape
+    other, least = np.int64(-1), 1e18
+    column, row = np.int64(np.floor(goal_x + 0.5)), np.int64(np.floor(goal_y + 0.5))
+    for b in range(max(row - reach, 0), min(row + reach + 1, rows)):
+        for a in range(column - reach, column + reach + 1):
+            c = a % columns if around else a
+            if c < 0 or c >= columns or grid[b, c] < 0 or grid[b, c] == at:
+                continue
+            j = grid[b, c]
+            dx, dy = u[j] - goal_x, v[j] - goal_y
+            if around:
+                dx = dx - columns * np.round(dx / columns)
+            apart = abs(dx + goal_x - u[at]) + abs(dy + goal_y - v[at])
+            if dx * dx + dy * dy < least and abs(w[j] / w[at] - 1.0) <= 1.5 * allowed + steep * apart:
+                other, least = np.int64(j), dx * dx + dy * dy
+    return other
+
+
+@serial
 def answer_points(
-    spot,
-    x,
-    y,
-    error,
-    room,
-    allowed,
-    grid,
-    u,
-    v,
-    w,
-    labels,
-    nearest,
-    camera,
-    around,
-    reach,
-    seed,
-    out,
-    near,
-    far,
-    square,
-):
+    spot, x, y, error, room, allowed, grid, u, v, w, labels, nearest, camera, around, reach, seed, out, near, far,
+    beyond, square,
+):  # fmt: skip
     """Write the answers of the nearest points, whose labels (n,) are given, as `answer` does.
 
-    The second label is that of a point which lies further to one side, half of `reach` away from the nearest one.
+    The second and the third label are those of points which lie further to one side, half of `reach` and all of it.
     """
-    rows, columns = grid.shape
+    columns = grid.shape[1]
     fx, fy, _, _ = camera
     n = 0
     for i in range(len(spot)):
         if abs(error[i]) > allowed:
             continue
         at = nearest[i]
-        side = mixed(np.uint32(np.uint32(seed) ^ np.uint32(spot[i])))
-        sign = 0.5 * reach if side & np.uint32(2) else -0.5 * reach
-        goal_x, goal_y = (u[at] + sign, v[at]) if side & np.uint32(1) else (u[at], v[at] + sign)
-        other, least = np.int64(-1), 1e18
-        column, row = np.int64(np.floor(goal_x + 0.5)), np.int64(np.floor(goal_y + 0.5))
-        for b in range(max(row - reach, 0), min(row + reach + 1, rows)):
-            for a in range(column - reach, column + reach + 1):
-                c = a % columns if around else a
-                if c < 0 or c >= columns or grid[b, c] < 0 or grid[b, c] == at:
-                    continue
-                j = grid[b, c]
-                dx, dy = u[j] - goal_x, v[j] - goal_y
-                if around:
-                    dx = dx - columns * np.round(dx / columns)
-                apart = abs(dx + goal_x - u[at]) + abs(dy + goal_y - v[at])
-                if dx * dx + dy * dy < least and abs(w[j] / w[at] - 1.0) <= 1.5 * allowed + room[i] * apart:
-                    other, least = np.int64(j), dx * dx + dy * dy
+        step_x, step_y = aside(np.int64(mixed(np.uint32(np.uint32(seed) ^ np.uint32(spot[i]))) & np.uint32(3)))
+        half = 0.5 * reach
+        first = next_point(
+            grid, u, v, w, at, u[at] + half * step_x, v[at] + half * step_y, reach, around, allowed, room[i]
+        )
+        last = next_point(
+            grid, u, v, w, at, u[at] + reach * step_x, v[at] + reach * step_y, reach, around, allowed, room[i]
+        )
         narrow = np.cos(y[i] / fy - 0.5 * np.pi) if around else 1.0
-        out[n], near[n], far[n] = spot[i], labels[at], labels[at]
+        out[n], near[n], far[n], beyond[n] = spot[i], labels[at], labels[at], labels[at]
+        if first >= 0 and last >= 0:
+            far[n], beyond[n] = labels[first], labels[last]
         for k in range(2):
-            j = at if k == 0 or other < 0 else other
+            j = first if k == 1 and first >= 0 and last >= 0 else at
             dx, dy = u[j] - x[i], v[j] - y[i]
             if around:
                 dx = dx - columns * np.round(dx / columns)
             square[n, k] = ((narrow * dx / fx) ** 2 + (dy / fy) ** 2) / (w[at] * w[at])
-        if other >= 0:
-            far[n] = labels[other]
         n += 1
     return n
 
