@@ -66,7 +66,7 @@ def invariance(scenes: int, seed: int) -> None:
                 for frame in frames(views, labels, stride):
                     backend.integrate(frame)
                     sampler.add(frame)
-                summary = describe(backend.table(), cells=sampler.sample())
+                summary = describe(backend.table(), spots=sampler.sample())
                 found.append(summary.headline.alpha.value)
                 cells.append(f"{found[-1]:.3f} {level_of(found[-1])}")
             print(f"| {kind}, {rate:.2f} | {' | '.join(cells)} | {max(found) - min(found):.3f} |", flush=True)

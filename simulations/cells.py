@@ -4,7 +4,7 @@
 
 A camera walks about a furnished room (tests/room_scene.py) whose classes are those of its furniture, or cubes of 17 cm.
 Blobs of labels are wrong, anew in each frame. Prints a table in Markdown: alpha of points of the true surface in the
-sampled cells; alpha of sampled cells at strides of 1 to 8 pixels; and alpha of voxels of 1 to 8 cm.
+spots; alpha of spots at strides of 1 to 8 pixels; and alpha of voxels of 1 to 8 cm.
 """
 
 from __future__ import annotations
@@ -95,7 +95,7 @@ def at_the_same_spot(
 
 
 def of_cells(frames: list[Frame], stride: int) -> float:
-    """Alpha of sampled cells."""
+    """Alpha of spots."""
     sampler = Sampler(K)
     for frame in frames:
         sampler.add(frame.every(stride))

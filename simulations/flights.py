@@ -12,7 +12,7 @@ from semstab.data.voxels import VoxelTable
 from semstab.statistics.accumulate import cluster_sums_of
 from semstab.statistics.agreement import consistency_posterior
 from semstab.statistics.cluster_sums import FUNCTIONALS, ClusterSums, columns_of, parts_of
-from semstab.statistics.observations import SpotObservations, Views, keys_of
+from semstab.statistics.observations import SpotObservations, Views
 
 ROUGH = 0.5
 """How abruptly a place is one on which the model errs."""
@@ -191,7 +191,7 @@ def sums_of(
     log = log_of(labels, over, flight)
     table, truth = table_of(log), over.truth[(labels >= 0).any(axis=1)]
     observed = sample_of(labels, over, flight, rng)
-    return cluster_sums_of(table, log, truth, cells=observed, consistent=consistency_posterior(table))
+    return cluster_sums_of(table, log, truth, spots=observed, consistent=consistency_posterior(table))
 
 
 def sample_of(
@@ -208,17 +208,15 @@ def sample_of(
         mixed = over.mixed[voxel]
         part = np.where(mixed > 0, np.clip(mixed + 0.3 * rng.standard_normal(len(voxel)), 0, 1), 0.0)
         pixels = np.rint(part * PIXELS).astype(int)
-    keys, low = keys_of(np.concatenate([2 * over.index, 2 * over.index + [1, 0, 0]]))
-    frames, size = labels.shape[1], VOXEL / 2
+    label = first if rng is None else np.where(rng.random(len(voxel)) * PIXELS < pixels, (first + 1) % flight.K, first)
+    frames = labels.shape[1]
     along, middle = (np.arange(frames) + 0.5) / frames * flight.side * VOXEL, flight.side * VOXEL / 2
     centres = np.stack([along, np.full(frames, middle), np.full(frames, 10.0)], axis=1)
-    views = Views(np.arange(frames), centres, np.full(frames, np.nan), np.full(frames, size))
-    cell = np.concatenate([voxel, voxel + len(over.index)])
-    label, weight = np.concatenate([first, (first + 1) % flight.K]), np.concatenate([PIXELS - pixels, pixels])
-    there = weight > 0
+    views = Views(np.arange(frames), centres, np.full(frames, np.nan), np.full(frames, VOXEL))
+    label, distance = label.astype(np.uint16), np.ones(len(label), np.float32)
     return SpotObservations(
-        keys[cell][there], np.tile(frame, 2).astype(np.int32)[there], label.astype(np.uint16)[there],
-        weight.astype(np.float64)[there], np.zeros(there.sum(), np.uint32), low, views, size, flight.K, frames=frames,
+        voxel.astype(np.int32), frame.astype(np.int32), label, label, label, distance, distance,
+        (over.index + 0.5) * VOXEL, np.zeros(len(over.index), np.uint32), views, VOXEL, flight.K, frames=frames,
     )  # fmt: skip
 
 
@@ -229,5 +227,5 @@ def totals_of(sums: ClusterSums, key: str) -> np.ndarray:
 
 
 def number_of(totals: np.ndarray, key: str) -> np.ndarray:
-    """Return the number (...,) of such totals (..., parts, C)."""
-    return FUNCTIONALS[key].of_parts(np.moveaxis(totals, -2, 0))
+    """Return the number (...,) of such totals (..., parts, C), whose answers are one, so that the first part tells."""
+    return FUNCTIONALS[key].of(totals[..., 0, :])

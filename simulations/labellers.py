@@ -55,7 +55,7 @@ def rows(scene: str, frames: int, width: int) -> Iterator[list[str]]:
             ]
             numbers = right.headline.wrong_of_consistent.value, right.correctness.accuracy.value
             yield [
-                name, f"{found.headline.alpha.value:.2f}", f"{100 * found.cells.labelled:.0f}",
+                name, f"{found.headline.alpha.value:.2f}", f"{100 * found.spots.labelled:.0f}",
                 f"{100 * own.image_space.edge_recall:.0f}", f"{own.image_space.compensated_flicker_percent:.1f}",
                 found.verdict.level, ", ".join(reasons), right.verdict.level, f"{100 * numbers[0]:.0f}",
                 f"{100 * numbers[1]:.0f}",

@@ -42,8 +42,8 @@ def main() -> None:
         backend.integrate(made)
         sampler.add(made)
     cells, table = sampler.sample(), backend.table()
-    found = describe(table, backend.events(), cells=cells)
-    images = describe(table, backend.events(), cells=dataclasses.replace(cells, sparse=False))
+    found = describe(table, backend.events(), spots=cells)
+    images = describe(table, backend.events(), spots=dataclasses.replace(cells, sparse=False))
     print(f"alpha {found.headline.alpha.text()}, extrapolated {images.headline.alpha.text()}")
     assert found.ranges is not None
     print(found.ranges.text)

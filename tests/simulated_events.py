@@ -8,7 +8,6 @@ import numpy as np
 
 from semstab.data.events import Events
 from semstab.statistics import SpotObservations, Views
-from semstab.statistics.observations import keys_of
 
 
 def log_of(labels, K=3, index=None, frames=None, voxel_size=0.2):
@@ -41,17 +40,26 @@ def soft(rng, n, F, K=3, alpha=0.5):
     return rng.dirichlet(np.full(K, alpha), size=(n, F))
 
 
-def cells_of(labels, K=3, index=None, centres=None, cell_size=0.125):
-    """The same labels (n, F), -1 where there is none, of sampled cells, one in each coarse cell: both alphas are alike.
+def spots_of(labels, K=3, index=None, centres=None, spacing=0.125):
+    """The same labels (n, F), -1 where there is none, of spots, one in a cell (n, 3); the three answers are one.
 
-    One pixel shows a cell in each frame; the cameras at (F, 3) are 9 m above the first cell if not given.
+    The cameras at (F, 3) are 9 m above the first cell if not given.
     """
     labels = np.asarray(labels)
     n, F = labels.shape
-    index = np.stack([np.zeros(n), np.zeros(n), np.arange(n)], axis=1) if index is None else index
-    key, low = keys_of(2 * np.asarray(index, np.int64))
-    cell, view = np.nonzero(labels >= 0)
+    index = np.stack([np.zeros(n), np.zeros(n), np.arange(n)], axis=1) if index is None else np.asarray(index)
+    spot, view = np.nonzero(labels >= 0)
+    return spots_at(index * spacing, spot, view, labels[spot, view], F, K, centres, spacing)
+
+
+def spots_at(point, spot, view, label, F, K=3, centres=None, spacing=0.125):
+    """Answers of F views for spots at points (n, 3), each given once."""
+    m = len(spot)
     centres = np.tile([0.0, 0.0, 9.0], (F, 1)) if centres is None else np.asarray(centres, float)
-    views = Views(np.arange(F), centres, np.full(F, math.nan), np.full(F, cell_size))
-    entries = key[cell], view.astype(np.int32), labels[cell, view].astype(np.uint16), np.ones(len(cell))
-    return SpotObservations(*entries, np.zeros(len(cell), np.uint32), low, views, cell_size, K, frames=F)
+    views = Views(np.arange(F), centres, np.full(F, math.nan), np.full(F, spacing))
+    label = np.asarray(label).astype(np.uint16)
+    return SpotObservations(
+        np.asarray(spot, np.int32), np.asarray(view, np.int32), label, label, label, np.ones(m, np.float32),
+        np.ones(m, np.float32), np.asarray(point, float).reshape(-1, 3), np.zeros(len(point), np.uint32), views,
+        spacing, K, frames=F,
+    )  # fmt: skip

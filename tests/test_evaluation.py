@@ -29,7 +29,7 @@ from semstab.report import terminal
 from semstab.report.tables import tables
 from semstab.report.tables import to_json as table_content
 from semstab.report.terminal import common_beginning, print_summary
-from semstab.statistics import SpotObservations, MapSample, analyse, describe
+from semstab.statistics import MapSample, SpotObservations, analyse, describe
 from semstab.statistics.correctness import ACCURACY
 
 MODELS = ("a", "b", "gt")
@@ -105,7 +105,7 @@ def listed_classes(result) -> tuple[list[str], str]:
 def test_the_classes_with_most_of_the_disagreement_are_listed(tmp_path, monkeypatch) -> None:
     root = tiny_scene.write(tmp_path / "wall", ("a", "b"))
     one = semstab.run(configure(root, models=["a"]), out=tmp_path / "one", report=False)
-    classes = one.record().statistics.cells.classes
+    classes = one.record().statistics.spots.classes
     largest = sorted((row for row in classes if row.disagreement >= 0.01), key=lambda row: -row.disagreement)
     assert listed_classes(one)[0] == [row.name for row in largest]
     covering = max(one.record().summary.table.classes, key=lambda row: row.share)
@@ -122,7 +122,7 @@ def test_without_asking_there_is_what_the_map_alone_tells(tmp_path) -> None:
     (entry,) = result.runs
     table = VoxelTable.load(tmp_path / "run" / "voxels" / f"{entry.unit.slug}.parquet")
     cells = SpotObservations.load(tmp_path / "run" / "observations" / f"{entry.unit.slug}.parquet")
-    assert to_json(entry.statistics) == to_json(describe(table, cells=cells, name="a"))
+    assert to_json(entry.statistics) == to_json(describe(table, spots=cells, name="a"))
     assert entry.statistics.drift.trend is None
     assert result.comparisons == ()
     again = semstab.run(configure(root, events=True), out=tmp_path / "run", report=False)  # kept

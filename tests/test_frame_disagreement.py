@@ -2,6 +2,7 @@
 
 import base64
 import csv
+import dataclasses
 import io
 import re
 from pathlib import Path
@@ -13,6 +14,7 @@ from hypothesis import strategies as st
 from PIL import Image
 from posed_config import configure
 from posed_writer import write_posed
+from simulated_events import spots_at
 
 from semstab.api import run_study
 from semstab.data.frames import Frame, Intrinsics
@@ -20,7 +22,7 @@ from semstab.recording.voxel_maps import agreement_report
 from semstab.report.page import render
 from semstab.report.tables import tables
 from semstab.report.terminal import screen
-from semstab.statistics import SpotObservations, Views
+from semstab.statistics import Views
 from semstab.statistics.frame_disagreement import (
     LoneDisagreement,
     largest_deviate,
@@ -29,7 +31,6 @@ from semstab.statistics.frame_disagreement import (
     outlying_rows,
     stands_alone,
 )
-from semstab.statistics.observations import keys_of
 
 W, H, FOCAL, DEPTH, BLOCK, FRAMES = 192, 128, 128.0, 2.03, 16, 15
 BAD = {"clean": set(), "every-third": {0, 3, 6, 9, 12}}
@@ -38,21 +39,18 @@ CLASSES = ["wall", "door", "window"]
 
 def cells(places):
     """Observations of places, each with its labels in order of the views that see it: {view: label}."""
-    index = np.array([[8 * k, 0, 0] for k, place in enumerate(places) for _ in place])
+    spot = np.array([k for k, place in enumerate(places) for _ in place])
     view, label = (np.array([row[i] for place in places for row in place.items()]) for i in (0, 1))
-    key, low = keys_of(index)
     views = Views.of([[10 * t, t, 0.0, 0.0, np.nan, 1.0] for t in range(int(view.max()) + 1)])
-    n = len(key)
-    return SpotObservations(
-        key, view.astype(np.int32), label.astype(np.uint16), np.ones(n), np.zeros(n, np.uint32), low, views, 1.0, K=3
-    )
+    point = np.array([[8.0 * k, 0, 0] for k in range(len(places))])
+    return dataclasses.replace(spots_at(point, spot, view, label, len(views)), views=views)
 
 
 def test_a_view_stands_alone_where_those_before_and_after_agree_on_another_class() -> None:
     seen = cells(
         [dict(enumerate(labels)) for labels in ((0, 1, 0), (0, 0, 1, 1), (1, 1, 1, 1, 1, 0), (0, 1), (2, 0, 1))]
     )
-    alone = stands_alone(seen.observations(4)).tolist()
+    alone = stands_alone(seen.observations()).tolist()
     assert alone == [False, True, False, *4 * [False], *5 * [False], True, False, False, *3 * [False]]
 
 

@@ -108,10 +108,10 @@ def models(frames=20, side=16, seed=0):
 
 def sums(labels, truth, side=16):
     log = log_of(labels, K=2, index=grid(side))
-    return cluster_sums_of(log.table(), log, truth, cells=cells_of(labels, side))
+    return cluster_sums_of(log.table(), log, truth, spots=spots_of(labels, side))
 
 
-def cells_of(labels, side=16, K=2):
+def spots_of(labels, side=16, K=2):
     """A cell for each voxel of the floor."""
     over = World(grid(side), *[np.zeros(side * side)] * 4)
     return sample_of(labels, over, Flight(side, frames=labels.shape[1], K=K))
@@ -186,7 +186,7 @@ def test_what_has_no_label_counts_as_disagreeing_in_a_rule_on_alpha(run, tmp_pat
     found = gate(tmp_path / "silent", None, gate_config(rules=["alpha > 0.1", "psa > 0"]))
     alpha, _ = found.judgements
     (record,) = semstab.load(tmp_path / "silent").result.select()
-    cells, own = record.statistics.cells, record.statistics.headline.alpha
+    cells, own = record.statistics.spots, record.statistics.headline.alpha
     assert 0.5 < cells.pairs_labelled < 0.8
     assert alpha.new == pytest.approx(own.value * cells.pairs_labelled)
     assert alpha.interval.high <= cells.pairs_labelled

@@ -40,7 +40,7 @@ def test_what_is_left_out_counts_and_caps_the_verdict(result):
     assert of(result, "sim-steady").cells.labelled > 0.95
     for name in ("trick-border-ignoring", "trick-hard-ignoring"):
         found = of(result, name)
-        assert found.cells.labelled < 0.9
+        assert found.spots.labelled < 0.9
         assert found.verdict.level != "stable"
         assert any("have no label in most frames" in text and name in text for text in warnings(result))
     assert "of the locations have no label" in of(result, "trick-border-ignoring").verdict.line
@@ -61,4 +61,4 @@ def test_the_limits_of_a_verdict_are_settings(result, tmp_path):
     found = of(labelled(tmp_path / "run", ["sim-steady"], verdict=verdict), "sim-steady")
     assert found.verdict.level == "usable"
     assert np.isfinite(of(result, "sim-steady").cells.critical_classes[0].unstable)
-    assert not found.cells.critical_classes
+    assert not found.spots.critical_classes

@@ -247,8 +247,8 @@ def stated(content, scene):
 @pytest.mark.parametrize(("change", "line"), [
     (lambda c: stated(c, 0)["alpha"].update(value=0.99), "alpha is stated as 0.99"),
     (lambda c: stated(c, 1)["accuracy"].update(value=0.5), "accuracy is stated as 0.5"),
-    (lambda c: statistics_of(c, 0)["cells"]["classes"][1]["alpha"].update(value=0.99), "is stated as 0.99"),
-    (lambda c: statistics_of(c, 0)["cells"].update(chance=0.99), "chance is stated as 0.99"),
+    (lambda c: statistics_of(c, 0)["spots"]["classes"][1]["alpha"].update(value=0.99), "is stated as 0.99"),
+    (lambda c: statistics_of(c, 0)["spots"].update(chance=0.99), "chance is stated as 0.99"),
     (lambda c: stated(c, 0)["alpha"].update(value=None), "alpha is stated as nan"),
     (lambda c: statistics_of(c, 1)["verdict"].update(level="misleading"), "the level is stated as 'misleading'"),
     (lambda c: c["about"].update(digest="0123456789abcdef"), "of another definition of walls@1 (0123456789abcdef"),

@@ -314,7 +314,7 @@ def test_alpha_of_scans_is_not_extrapolated(street):
         sampler.add(frame)
         backend.integrate(frame)
     assert sampler.sample().sparse
-    assert describe(backend.table(), cells=sampler.sample()).headline.alpha.value == pytest.approx(0, abs=0.03)
+    assert describe(backend.table(), spots=sampler.sample()).headline.alpha.value == pytest.approx(0, abs=0.03)
 
 
 def test_a_scan_cannot_be_looked_up_in_an_image(street):

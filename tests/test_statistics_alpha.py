@@ -1,4 +1,4 @@
-"""Alpha: its definition over sampled cells, and all that it must not depend on."""
+"""Alpha: its definition over spots, and all that it must not depend on."""
 
 from __future__ import annotations
 
@@ -11,13 +11,13 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from simulated_events import cells_of, grid, log_of, log_of_evidence, soft
+from simulated_events import grid, log_of, log_of_evidence, soft, spots_of
 from striped_floor import K, flight, fused, numbered, sampled
 
 from semstab import backends
 from semstab.datasets import open_dataset
 from semstab.errors import DataError
-from semstab.statistics import SpotObservations, Sampler, Views, describe, disagreement, psa
+from semstab.statistics import Sampler, SpotObservations, Views, describe, disagreement, psa
 from semstab.statistics.accumulate import sums_of_spots
 from semstab.statistics.cluster_sums import value
 from semstab.statistics.intervals import estimate
@@ -89,7 +89,7 @@ SIZES = (0.15, 0.3, 0.6)
 
 def verdicts(**options):
     frames = list(flight(16, step=0.35, **options))
-    return [describe(fused(frames, size).table(), cells=sampled(frames)) for size in SIZES]
+    return [describe(fused(frames, size).table(), spots=sampled(frames)) for size in SIZES]
 
 
 @pytest.mark.parametrize("options", [{}, {"flicker": 0.3, "patch": 5}, {"flicker": 0.2}])
@@ -124,7 +124,7 @@ def test_alpha_is_about_the_same_where_only_every_second_or_third_pixel_is_taken
 def test_scores_have_the_alpha_and_the_level_of_their_likeliest_class():
     frames = list(flight(12, flicker=0.2, patch=5))
     unsure = [dataclasses.replace(f, labels=None, scores=0.2 + 0.4 * np.eye(K)[f.labels]) for f in frames]
-    by_labels, by_scores = (describe(fused(own, 0.3).table(), cells=sampled(own)) for own in (frames, unsure))
+    by_labels, by_scores = (describe(fused(own, 0.3).table(), spots=sampled(own)) for own in (frames, unsure))
     assert by_scores.headline.alpha == by_labels.headline.alpha
     assert by_scores.verdict.level == by_labels.verdict.level
     assert by_scores.agreement.voxel_alpha.value < by_labels.agreement.voxel_alpha.value - 0.1
@@ -170,8 +170,8 @@ def test_of_the_frames_of_one_view_all_labels_count():
 
 def test_a_camera_that_stood_still_has_no_verdict():
     frames = list(flight(12, step=0.0, flicker=0.3))
-    found = describe(fused(frames, 0.3).table(), cells=sampled(frames))
-    assert (found.cells.frames, found.cells.views) == (12, 1)
+    found = describe(fused(frames, 0.3).table(), spots=sampled(frames))
+    assert (found.spots.frames, found.spots.views) == (12, 1)
     assert found.verdict.level == "no verdict"
     assert "the camera stood still" in found.verdict.line
 
@@ -186,15 +186,15 @@ def test_a_map_of_nearly_one_class_is_uninformative():
         labels = np.zeros((60, 80), np.uint8)
         labels[:rows] = 1
         frames = [dataclasses.replace(frame, labels=labels) for frame in flight(16)]
-        found = describe(fused(frames, 0.3).table(), cells=sampled(frames))
-        assert found.cells.largest_share == pytest.approx(1 - rows / 60, abs=0.01)
+        found = describe(fused(frames, 0.3).table(), spots=sampled(frames))
+        assert found.spots.largest_share == pytest.approx(1 - rows / 60, abs=0.01)
         levels.append(found.verdict.level)
     assert levels == ["uninformative", "stable"]
 
 
 def test_one_class_alone_is_uninformative():
     frames = [dataclasses.replace(frame, labels=np.zeros_like(frame.labels)) for frame in flight(16)]
-    found = describe(fused(frames, 0.3).table(), cells=sampled(frames))
+    found = describe(fused(frames, 0.3).table(), spots=sampled(frames))
     assert math.isnan(found.headline.alpha.value)
     assert found.verdict.level == "uninformative"
     assert "100% of the observations are 0" in found.verdict.line
@@ -207,16 +207,16 @@ def test_a_class_that_flips_a_coin_is_unstable_though_it_is_rare():
     own = rng.integers(0, 2, size=(n, 1))
     rare = np.arange(n)[:, None] % 50 == 0
     labels = np.where(rare, rng.integers(2, 4, size=(n, 4)), own)
-    table, cells = log_of(labels, K=4, index=grid(102)).table(), cells_of(labels, K=4, index=grid(102))
-    found = describe(table, cells=cells)
+    table, cells = log_of(labels, K=4, index=grid(102)).table(), spots_of(labels, K=4, index=grid(102))
+    found = describe(table, spots=cells)
     assert found.headline.alpha.value > 0.95
     assert found.verdict.level == "stable"
-    first = found.cells.critical_classes[0]
+    first = found.spots.critical_classes[0]
     assert (first.name, first.unstable > 0.99) == ("2", True)
     assert "probably unstable: 2 (100%)" in found.verdict.line
-    assert {row.name: row.counts_for_verdict for row in found.cells.classes}["3"] is False  # 68 voxels
+    assert {row.name: row.counts_for_verdict for row in found.spots.classes}["3"] is False  # 68 voxels
     named = dataclasses.replace(table, classes=("road", "grass", "car", "person"))
-    critical = describe(named, cells=cells, critical=["person"])
+    critical = describe(named, spots=cells, critical=["person"])
     assert [row.name for row in critical.cells.critical_classes] == ["person"]
 
 
@@ -226,7 +226,7 @@ def test_places_that_flip_between_two_common_classes_are_said_beside_the_verdict
     n = 10404
     own, coin = np.arange(n)[:, None] % 3, np.arange(n)[:, None] % 50 == 0
     labels = np.where(coin, rng.integers(0, 2, size=(n, 8)), own)
-    found = describe(log_of(labels, index=grid(102)).table(), cells=cells_of(labels, index=grid(102)))
+    found = describe(log_of(labels, index=grid(102)).table(), spots=spots_of(labels, index=grid(102)))
     assert found.flipping.share.low < 0.02 < found.flipping.share.high < 0.045
     assert (found.flipping.a, found.flipping.b) == ("0", "1")
     assert found.flipping.part > 0.9
@@ -234,7 +234,7 @@ def test_places_that_flip_between_two_common_classes_are_said_beside_the_verdict
     assert "1.9% of the locations of this map flip" in found.verdict.line
     assert "of them between 0 and 1" in found.verdict.line
     labels = np.repeat(own, 2, axis=1)
-    twice = describe(log_of(labels, index=grid(102)).table(), cells=cells_of(labels, index=grid(102)))
+    twice = describe(log_of(labels, index=grid(102)).table(), spots=spots_of(labels, index=grid(102)))
     assert "seen too seldom to tell which of them flip" in twice.verdict.line
 
 
@@ -418,7 +418,7 @@ def test_the_ground_truth_of_a_real_scene_is_stable_at_every_voxel_size(voxel_si
     for frame in shelf:
         sampler.add(frame)
         backend.integrate(frame)
-    assert describe(backend.table(), cells=sampler.sample()).verdict.level == "stable"
+    assert describe(backend.table(), spots=sampler.sample()).verdict.level == "stable"
 
 
 @pytest.fixture(scope="module")

@@ -96,7 +96,7 @@ def stripes(voxel_size=0.3, **options):
     """The sums of a flight over stripes, with those of its cells, and the cells."""
     frames = list(over_stripes(8, flicker=0.3, patch=5, **options))
     backend, cells = fused(frames, voxel_size), sampled(frames)
-    return cluster_sums_of(backend.table(), backend.events(), cells=cells), cells
+    return cluster_sums_of(backend.table(), backend.events(), spots=cells), cells
 
 
 def test_the_sums_of_spots_give_alpha_back():

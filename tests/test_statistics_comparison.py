@@ -7,7 +7,7 @@ import math
 
 import numpy as np
 import pytest
-from simulated_events import cells_of, grid, log_of
+from simulated_events import grid, log_of, spots_of
 from statsmodels.stats.multitest import multipletests
 
 from semstab.core.types import THESE_FRAMES, THIS_SCENE
@@ -113,7 +113,7 @@ def two_models(rng, gap, side=32, F=8):
         "b": drawn(rng, F, np.clip(error + gap + shift, 0, 1), side)[0],
     }
     tables = {name: log_of(own, index=grid(side)).table() for name, own in labels.items()}
-    return tables, {name: cells_of(own, index=grid(side)) for name, own in labels.items()}
+    return tables, {name: spots_of(own, index=grid(side)) for name, own in labels.items()}
 
 
 def pair_of(rng, gap, **options):

@@ -6,7 +6,7 @@ import math
 
 import numpy as np
 import pytest
-from simulated_events import cells_of, grid, log_of
+from simulated_events import grid, log_of, spots_of
 
 from semstab.core.types import THESE_FRAMES, THIS_SCENE
 from semstab.recording.voxel_maps import agreement_report
@@ -17,7 +17,7 @@ SIDE = 20
 
 def sample_of(labels, centres, K=3):
     """Labels (n, F) of cells of 0.1 m on a floor, 0.2 m apart, seen from cameras at (F, 3)."""
-    return cells_of(labels, K=K, index=grid(SIDE), centres=centres, cell_size=0.1)
+    return spots_of(labels, K=K, index=grid(SIDE), centres=centres, cell_size=0.1)
 
 
 def flown(step, frames=8, height=10.0):
@@ -82,10 +82,10 @@ def test_observations_of_one_view_have_no_correlogram_and_all_outputs_take_it():
     found = correlogram(sample_of(once, flown(1.0, 2)))
     assert found.time == found.angle == ()
     assert (found.standard.pairs, math.isnan(found.standard.alpha.value)) == (0, True)
-    summary = describe(log_of(once).table(), cells=sample_of(once, flown(1.0, 2)))
+    summary = describe(log_of(once).table(), spots=sample_of(once, flown(1.0, 2)))
     assert "no verdict" in agreement_report(summary)
     labels = tied_to_the_view(np.random.default_rng(3))
-    report = agreement_report(describe(log_of(labels).table(), cells=sample_of(labels, flown(1.0))))
+    report = agreement_report(describe(log_of(labels).table(), spots=sample_of(labels, flown(1.0))))
     assert report.count("| for |") == 4
 
 

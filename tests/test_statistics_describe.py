@@ -9,13 +9,13 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from compare_summaries import differences
-from simulated_events import cells_of, grid, log_of
+from simulated_events import grid, log_of, spots_of
 
 from semstab.core.files import read_json, write_json
 from semstab.core.json_form import from_json, to_json
 from semstab.core.types import THESE_FRAMES, THIS_SCENE
 from semstab.data.contrast import ModelComparison
-from semstab.data.statistics import UNKNOWN, SpotAgreement, ClassAlpha, HeadlineStatistics, Interval, MapStatistics
+from semstab.data.statistics import UNKNOWN, ClassAlpha, HeadlineStatistics, Interval, MapStatistics, SpotAgreement
 from semstab.data.voxels import VoxelTable
 from semstab.errors import ConfigError, DataError
 from semstab.metrics import sbd
@@ -44,8 +44,8 @@ def model(*arguments, **options):
 
 
 def cells(*arguments, **options):
-    """The same of sampled cells."""
-    return cells_of(said(*arguments, **options), index=grid(SIDE))
+    """The same of spots."""
+    return spots_of(said(*arguments, **options), index=grid(SIDE))
 
 
 def ground_truth():
@@ -97,8 +97,8 @@ def test_a_description_holds_what_the_functions_say(described):
     assert (summary.repeated.voxels, summary.repeated.share) == (repeated.sum(), pytest.approx(repeated.mean()))
     assert summary.agreement.voxel_alpha.value == pytest.approx(krippendorff_alpha(table))
     assert summary.headline.alpha.value == pytest.approx(krippendorff_alpha(table))  # each cell is alone in its voxel
-    found = summary.cells
-    assert (found.cells, found.views, found.frames, found.cell_size) == (repeated.sum(), F, F, 0.125)
+    found = summary.spots
+    assert (found.spots, found.views, found.frames, found.cell_size) == (repeated.sum(), F, F, 0.125)
     shares = table.evidence[:][repeated].sum(axis=0) / table.op[repeated].sum()
     assert found.chance == pytest.approx((shares**2).sum(), abs=0.001)
     assert (found.largest_class, found.largest_share) == (str(shares.argmax()), pytest.approx(shares.max()))
@@ -142,7 +142,7 @@ def values(section):
 
 def test_a_number_has_one_interval_wherever_it_stands():
     events = model(0.2, 0)
-    found = describe(events.table(), events, events.table(), cells=cells(0.2, 0))
+    found = describe(events.table(), events, events.table(), spots=cells(0.2, 0))
     assert found.agreement.psa == found.headline.psa
     assert found.correctness.accuracy == found.headline.accuracy
     assert found.correctness.quadrants.wrong_of_consistent == found.headline.wrong_of_consistent
@@ -153,7 +153,7 @@ def test_a_number_has_one_interval_wherever_it_stands():
 def test_a_table_alone_is_described_as_far_as_it_goes():
     events = model(0.2, 0)
     observed = cells(0.2, 0)
-    alone, logged = describe(events.table(), cells=observed), describe(events.table(), events, cells=observed)
+    alone, logged = describe(events.table(), spots=observed), describe(events.table(), events, spots=observed)
     assert alone.correctness is alone.geometry is alone.drift.trend is None
     assert to_json(alone.drift.null) == to_json(logged.drift.null)
     assert values(alone.agreement) == pytest.approx(values(logged.agreement), abs=1e-12)
@@ -166,7 +166,7 @@ def test_a_table_alone_is_described_as_far_as_it_goes():
 def test_without_cells_there_is_no_verdict_and_the_line_says_what_to_give():
     events = model(0.2, 0)
     found = describe(events.table(), events)
-    assert (found.cells, found.correlogram, found.verdict.level) == (None, None, "no verdict")
+    assert (found.spots, found.correlogram, found.verdict.level) == (None, None, "no verdict")
     assert math.isnan(found.headline.alpha.value)
     assert "no cells were sampled; give the observations of a `Sampler`" in found.verdict.line
 
@@ -175,7 +175,7 @@ def test_without_cells_there_is_no_verdict_and_the_line_says_what_to_give():
 def test_maps_that_say_nothing_are_described_too(labels):
     events = log_of(labels)
     table = events.table()
-    summary = describe(table, events, table, limit=table, cells=cells_of(labels))
+    summary = describe(table, events, table, limit=table, spots=spots_of(labels))
     assert summary.verdict.level == "no verdict"
     assert "no verdict" in summary.verdict.line
 
@@ -213,7 +213,7 @@ def judged(low, high, wrong=UNKNOWN, voxels=5000, **cells):
         "largest_class": "grass", "largest_share": 0.5, "labelled": 1.0, "classes": (),
     } | cells  # fmt: skip
     return verdict(
-        "net", headline=replace(numbers, wrong_of_consistent=wrong), cells=SpotAgreement(**own), voxels=voxels,
+        "net", headline=replace(numbers, wrong_of_consistent=wrong), spots=SpotAgreement(**own), voxels=voxels,
         share=0.5,
     )  # fmt: skip
 
@@ -244,18 +244,18 @@ def test_stable_errors_are_misleading():
 
 
 def test_few_locations_have_no_verdict():
-    assert judged(0.9, 0.95, cells=99).level == judged(0.9, 0.95, cubes=15).level == "no verdict"
-    assert judged(0.9, 0.95, cells=0).level == "no verdict"
-    assert "more overlap between frames" in judged(0.9, 0.95, cells=99).line
-    assert judged(0.9, 0.95, voxels=100, cells=100, cubes=16).level == "stable"
-    few = judged(0.9, 0.95, voxels=99, cells=100, cubes=16)
+    assert judged(0.9, 0.95, spots=99).level == judged(0.9, 0.95, cubes=15).level == "no verdict"
+    assert judged(0.9, 0.95, spots=0).level == "no verdict"
+    assert "more overlap between frames" in judged(0.9, 0.95, spots=99).line
+    assert judged(0.9, 0.95, voxels=100, spots=100, cubes=16).level == "stable"
+    few = judged(0.9, 0.95, voxels=99, spots=100, cubes=16)
     assert few.level == "no verdict"
     assert "too few locations to act on; use smaller voxels" in few.line
 
 
 def test_a_camera_that_stood_still_has_no_verdict_and_a_single_frame_needs_more_overlap():
     assert "no verdict, the camera stood still: all frames show one view;" in judged(0.9, 0.95, views=1).line
-    assert "stood still" not in judged(math.nan, math.nan, views=1, frames=1, cells=0).line
+    assert "stood still" not in judged(math.nan, math.nan, views=1, frames=1, spots=0).line
 
 
 def test_a_map_of_nearly_one_class_is_uninformative_whatever_its_alpha_is():

@@ -10,7 +10,7 @@ import pytest
 from flights import Flight, fly, sums_of, world
 from intervals import trials
 from scipy import stats
-from simulated_events import cells_of, grid, log_of
+from simulated_events import grid, log_of, spots_of
 
 from semstab.core.types import OTHER_SCENES, THESE_FRAMES, THIS_SCENE
 from semstab.data.statistics import Interval
@@ -36,7 +36,7 @@ from semstab.statistics.variance import Spread
 def sums_from(labels, side, voxel_size=0.125):
     index = grid(side)[: len(labels)]
     log = log_of(labels, K=2, index=index, voxel_size=voxel_size)
-    return cluster_sums_of(log.table(), log, cells=cells_of(labels, 2, index, cell_size=voxel_size / 2))
+    return cluster_sums_of(log.table(), log, spots=spots_of(labels, 2, index, cell_size=voxel_size / 2))
 
 
 def moved(sums, by):
@@ -89,9 +89,9 @@ def test_no_error_seen_is_not_no_error_and_next_to_nothing_is_nowhere():
 def test_a_few_errors_leave_an_interval_that_is_narrow_and_holds_one(wrong):
     """Of 10,404 places in eight frames so many err once; the ends are no narrower than without a single error."""
     labels = np.repeat(np.arange(102 * 102)[:, None] % 3, 8, axis=1)
-    none = estimate(sums_of_spots(cells_of(labels, index=grid(102))), "alpha")
+    none = estimate(sums_of_spots(spots_of(labels, index=grid(102))), "alpha")
     labels[:wrong, 0] = (labels[:wrong, 0] + 1) % 3
-    found = estimate(sums_of_spots(cells_of(labels, index=grid(102))), "alpha")
+    found = estimate(sums_of_spots(spots_of(labels, index=grid(102))), "alpha")
     assert 0.9 < found.low < found.value < found.high == 1
     assert found.low <= none.low + 0.05
     assert probability_above(found, 0.8, "agreement") > 0.99

@@ -33,7 +33,7 @@ def fused(classes=("road", "grass", "car", "person"), **settings):
 
 def test_all_disagreement_is_where_things_move() -> None:
     result = fused()
-    cells = result.record().statistics.cells
+    cells = result.record().statistics.spots
     assert cells.moving.classes == ("car", "person")
     assert cells.moving.disagreement == pytest.approx(1, abs=0.02)
     assert cells.moving.alpha == pytest.approx(1, abs=0.01)
@@ -46,7 +46,7 @@ def test_all_disagreement_is_where_things_move() -> None:
 
 def test_alpha_without_them_is_that_of_a_run_without_them() -> None:
     result = semstab.fuse(frames(elsewhere=0.1), voxel_size=0.25, classes=("road", "grass", "car", "person"))
-    moving = result.record().statistics.cells.moving
+    moving = result.record().statistics.spots.moving
     rest = semstab.fuse(
         frames(elsewhere=0.1), voxel_size=0.25, classes=("road", "grass", "car", "person"),
         exclude={"classes": ["car", "person"]},
@@ -57,22 +57,22 @@ def test_alpha_without_them_is_that_of_a_run_without_them() -> None:
 
 def test_nothing_is_said_where_names_are_of_things_that_stay() -> None:
     result = fused(("road", "grass", "parked car", "bench"))
-    assert result.record().statistics.cells.moving is None
+    assert result.record().statistics.spots.moving is None
     assert not [text for text in warnings(result) if "move" in text]
 
 
 def test_nothing_is_said_where_most_disagreement_is_elsewhere() -> None:
     result = fused(("car", "grass", "road", "kerb"))
-    cells = result.record().statistics.cells
+    cells = result.record().statistics.spots
     assert cells.moving is None or cells.moving.disagreement < 0.1
 
 
 def test_nothing_is_said_where_alpha_leaves_no_disagreement(monkeypatch) -> None:
     """Alpha of cells without a size may come out as 1 where there are few, though their labels differ."""
     monkeypatch.setattr(spot_agreement, "value", lambda sums, key: 1.2)
-    assert fused().record().statistics.cells.moving is None
+    assert fused().record().statistics.spots.moving is None
 
 
 def test_it_is_kept_with_the_result() -> None:
     statistics = fused().record().statistics
-    assert from_json(MapStatistics, to_json(statistics), "there").cells.moving == statistics.cells.moving
+    assert from_json(MapStatistics, to_json(statistics), "there").cells.moving == statistics.spots.moving

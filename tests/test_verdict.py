@@ -7,11 +7,11 @@ import math
 
 import numpy as np
 import pytest
-from simulated_events import cells_of, grid, log_of
+from simulated_events import grid, log_of, spots_of
 from striped_floor import flight, fused, sampled
 from test_statistics_ignored import errs_silently, without
 
-from semstab.data.statistics import UNKNOWN, SpotAgreement, HeadlineStatistics, Interval
+from semstab.data.statistics import UNKNOWN, HeadlineStatistics, Interval, SpotAgreement
 from semstab.statistics import describe
 from semstab.statistics.intervals import probability_above
 from semstab.statistics.silence import silence
@@ -22,7 +22,7 @@ CELLS = SpotAgreement(0.1, 1000, 100, 20, 20, 0.5, "road", 0.6, 1.0, (), None, 1
 
 def judged(alpha, **cells):
     headline = HeadlineStatistics(Interval(*alpha, degrees=20), UNKNOWN, UNKNOWN, UNKNOWN, UNKNOWN)
-    return verdict("m", headline=headline, cells=dataclasses.replace(CELLS, **cells), voxels=1000, share=0.5)
+    return verdict("m", headline=headline, spots=dataclasses.replace(CELLS, **cells), voxels=1000, share=0.5)
 
 
 @pytest.mark.parametrize(("alpha", "level"), [
@@ -73,19 +73,19 @@ def test_the_share_of_pairs_is_that_of_views_that_both_label():
     """Three views of 400 places: the first labels all, the second every second one, the third none of 100."""
     labels = np.zeros((400, 3), int)
     labels[::2, 1] = labels[:100, 2] = 3  # K: no label
-    found = silence(cells_of(labels, index=grid(20)))
+    found = silence(spots_of(labels, index=grid(20)))
     assert found.pixels == pytest.approx((400 + 200 + 300) / 1200)
     both = labels != 3
     pairs = [(both[:, a] & both[:, b]).sum() for a, b in ((0, 1), (0, 2), (1, 2))]
     assert found.pairs == pytest.approx(sum(pairs) / 1200)
-    nothing = silence(cells_of(np.full((0, 3), 0), index=np.zeros((0, 3))))
+    nothing = silence(spots_of(np.full((0, 3), 0), index=np.zeros((0, 3))))
     assert math.isnan(nothing.pixels)
 
 
 def test_a_model_that_leaves_out_its_errors_is_no_better_of_all():
     """It leaves out 60 % of its errors: alpha rises, and what it left out is said."""
     frames, (silent, _) = list(flight(8, flicker=0.3, patch=10, seed=1)), errs_silently()
-    open_, closed = (describe(fused(own, 0.2).table(), cells=sampled(own)) for own in (frames, silent))
+    open_, closed = (describe(fused(own, 0.2).table(), spots=sampled(own)) for own in (frames, silent))
     assert open_.cells.pixels_labelled == open_.cells.pairs_labelled == 1
     assert closed.headline.alpha.value > open_.headline.alpha.value + 0.05
     of_all = closed.headline.alpha.value * closed.cells.pairs_labelled
@@ -98,8 +98,8 @@ def test_a_model_that_leaves_out_its_errors_is_no_better_of_all():
 def test_silence_at_random_keeps_alpha_and_is_said():
     rng = np.random.default_rng(0)
     half = without(list(flight(12)), lambda frame: rng.random(frame.shape) < 0.3)
-    found = describe(fused(half, 0.2).table(), cells=sampled(half))
-    assert found.cells.pixels_labelled == pytest.approx(0.7, abs=0.02)
+    found = describe(fused(half, 0.2).table(), spots=sampled(half))
+    assert found.spots.pixels_labelled == pytest.approx(0.7, abs=0.02)
     assert found.verdict.decisive != "stable"
 
 
@@ -107,7 +107,7 @@ def test_a_moving_box_on_perfect_labels_is_stable_and_may_be_perfect():
     """One of 10,404 places changes once."""
     labels = np.repeat(np.arange(102 * 102)[:, None] % 3, 8, axis=1)
     labels[0, 4] = 2
-    found = describe(log_of(labels, index=grid(102)).table(), cells=cells_of(labels, index=grid(102)))
+    found = describe(log_of(labels, index=grid(102)).table(), spots=spots_of(labels, index=grid(102)))
     alpha = found.headline.alpha
     assert 0.9 < alpha.low < alpha.value < alpha.high == 1
     assert found.verdict.level == "stable"

@@ -106,6 +106,7 @@ def lever(near: Any, far: Any, first: Any, second: Any, third: Any) -> Float64:
 
     It is 0 if the second answers are the first ones.
     """
+    near, far, first, second, third = map(np.asarray, (near, far, first, second, third))
     with np.errstate(invalid="ignore", divide="ignore"):
         d, d1 = np.ones_like(near, np.float64), np.sqrt(far / near)  # the last one is two steps away, not one
         d2 = np.sqrt(1 + 4 * (d1**2 - 1))
