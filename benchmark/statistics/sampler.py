@@ -58,7 +58,11 @@ STILL = 1.0
 
 SIGMAS, LEAST, MOST = 4.0, 0.002, 0.05
 """A pixel shows a spot if their depths differ by at most so many standard deviations of how they differ in the flight,
-which depth noise and errors of poses cause; the least and the most of this tolerance, relative."""
+which depth noise and errors of poses cause; the least and the most of this tolerance, relative. Of a first frame, which
+has nothing to differ from, it is the noise within the frame."""
+
+SMOOTH = 0.0005
+"""Noise within a frame, relative, from which on depth is that of planes through the pixels around."""
 
 GATE, ENOUGH = 0.05, 50
 """That standard deviation is taken of differences up to this, relative, if a frame has at least so many."""
@@ -137,6 +141,7 @@ class Sampler:
         self._anchor: Anchor | None = None
         self._seen: dict[bytes, Anchor] = {}
         self._errors: list[float] = []
+        self._noise = 0.0
         self._widths: list[float] = []
         self._known = 0
         self._clear()
@@ -161,6 +166,7 @@ class Sampler:
         self._known = self._spots
         T, seed = fixed(frame.T_wc), (frame.index + 1) * 0x9E3779B9 & 0xFFFFFFFF
         if sparse is None:
+            self._noise = _noise(frame)
             self._find(frame, T, seed)
             self._take(view, *self._answers_of_image(frame, T, seed))
         else:
@@ -196,7 +202,7 @@ class Sampler:
 
         (H, W), stride = frame.shape, _stride(frame.shape)
         blocks = -(-H // stride) * -(-W // stride)
-        where = self._edge, self._share, self._low, stride, _factor(blocks), seed
+        where = SIGMAS * self._noise, self._edge, self._share, self._low, stride, _factor(blocks), seed
         self._new(lambda *room: new_in_image(fixed(frame.depth), _camera(frame), T, *where, *room))
 
     def _find_in_points(self, sparse: Sparse, T: Float64, seed: int) -> None:
@@ -229,7 +235,7 @@ class Sampler:
 
     def _allowed(self) -> float:
         """Return the tolerance of depth, relative: it follows from the flight's own differences so far."""
-        sigma = float(np.median(self._errors)) if self._errors else LEAST
+        sigma = float(np.median(self._errors)) if self._errors else self._noise
         return min(max(SIGMAS * sigma, LEAST), MOST)
 
     def _learn(self, earlier: int, spot: npt.NDArray[np.int32], error: Float64) -> None:
@@ -243,7 +249,8 @@ class Sampler:
 
         n, camera = self._spots, _camera(frame)
         spot, (x, y, error, room) = np.empty(n, np.int32), np.empty((4, n))
-        n = project(self._point[:n], fixed(frame.depth), camera, T, spot, x, y, error, room)
+        noise = SIGMAS * self._noise if self._noise > SMOOTH else 0.0
+        n = project(self._point[:n], fixed(frame.depth), camera, T, noise, spot, x, y, error, room)
         spot, x, y, error, room = spot[:n], x[:n], y[:n], error[:n], room[:n]
         self._learn(self._known, spot, error)
         out = _room(n)
@@ -258,7 +265,9 @@ class Sampler:
         n = self._spots
         spot, nearest, (x, y, error, room) = np.empty(n, np.int32), np.empty(n, np.int64), np.empty((4, n))
         place = sparse.camera, sparse.around, sparse.reach
-        n = project_sparse(self._point[:n], *sparse.arrays, *place, T, spot, x, y, error, room, nearest)
+        n = project_sparse(
+            self._point[:n], *sparse.arrays, *place, sparse.labels is None, T, spot, x, y, error, room, nearest
+        )
         spot, x, y, error, room, nearest = spot[:n], x[:n], y[:n], error[:n], room[:n], nearest[:n]
         self._learn(self._known, spot, error)
         out = _room(n)
@@ -279,7 +288,7 @@ class Sampler:
             )
         else:
             m = answer_points(
-                spot, x, y, error, room, self._allowed(), *sparse.arrays, sparse.labels, nearest, *place, seed, *out
+                spot, x, y, error, room, self._allowed(), *sparse.arrays, sparse.labels, self.K, nearest, *place, seed, *out
             )
         return tuple(column[:m] for column in out)
 
@@ -359,7 +368,17 @@ def _width(frame: Frame, sparse: Sparse | None, footprint: float) -> float:
     if sparse is not None:
         return OBLIQUE * sparse.spacing * footprint
     stride = _stride(frame.shape)
-    return stride * math.sqrt(mean_area(fixed(frame.depth), _camera(frame), 2 * stride)) or footprint
+    return stride * math.sqrt(mean_area(fixed(frame.depth), _camera(frame), 2 * stride, stride)) or footprint
+
+
+def _noise(frame: Frame) -> float:
+    """Return the noise of a frame's depth, relative, by which one pixel differs from the next ones."""
+    from semstab.statistics.loops.spots import second_differences
+
+    stride = 2 * _stride(frame.shape)
+    found = np.empty((frame.shape[0] // stride + 1) * (frame.shape[1] // stride + 1))
+    n = second_differences(fixed(frame.depth), stride, found)
+    return float(np.median(found[:n])) / 0.6745 / math.sqrt(6) if n else 0.0
 
 
 @functools.lru_cache(maxsize=64)
@@ -402,5 +421,5 @@ def _sparse(frame: Frame, K: int) -> Sparse | None:
     unlabelled = np.False_ if frame.unlabelled is None else frame.unlabelled[valid]
     labels = frame.predicted[valid].astype(np.uint16)
     labels = np.where(labels < K, labels, np.where(unlabelled, K, K + 1)).astype(np.uint16)
-    reach = min(max(math.ceil(1.6 * spacing), 2), 12)
+    reach = min(max(math.ceil(1.1 * spacing), 2), 12)
     return Sparse(grid, u, v, w, _camera(frame), False, reach, spacing, spacing, None if dense else labels)
