@@ -26,14 +26,14 @@ from semstab.statistics.observations import COLUMNS, TYPES, VIEW, SpotObservatio
 BUDGET = 1 << 19
 """Most answers (spot, view)."""
 
-MOST_SPOTS = 1 << 17
+MOST_SPOTS = 1 << 16
 """Most spots, of which many may have been seen once."""
 
-MOST_NEW = 1 << 16
+MOST_NEW = 1 << 15
 """Most spots that one frame adds."""
 
 LOOKED_AT = 16_000
-"""Blocks of pixels, about, in which new spots are looked for."""
+"""Blocks of pixels, about, or points of a scan, in which new spots are looked for."""
 
 APART = 0.7
 """Edge of a coarse cell, by the mean area that a block of pixels shows, or up to twice as much."""
@@ -210,7 +210,7 @@ class Sampler:
         from semstab.statistics.loops.spots import new_in_points
 
         place = sparse.camera, sparse.around, sparse.reach, sparse.pixels
-        where = self._allowed(), T, self._edge, self._share, self._low, _factor(len(sparse.w)), seed
+        where = self._allowed(), T, self._edge, self._share, self._low, _factor(len(sparse.w)), LOOKED_AT, seed
         self._new(lambda *room: new_in_points(*sparse.arrays, *place, *where, *room))
 
     def _new(self, find: Any) -> None:
@@ -288,7 +288,19 @@ class Sampler:
             )
         else:
             m = answer_points(
-                spot, x, y, error, room, self._allowed(), *sparse.arrays, sparse.labels, self.K, nearest, *place, seed, *out
+                spot,
+                x,
+                y,
+                error,
+                room,
+                self._allowed(),
+                *sparse.arrays,
+                sparse.labels,
+                self.K,
+                nearest,
+                *place,
+                seed,
+                *out,
             )
         return tuple(column[:m] for column in out)
 

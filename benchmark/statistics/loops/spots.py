@@ -515,16 +515,36 @@ def surface(grid, u, v, w, x, y, reach, around):
 
 @serial
 def new_in_points(
-    grid, u, v, w, camera, around, reach, spacing, allowed, T, edge, share, low, factor, seed, table, point, hashed
+    grid,
+    u,
+    v,
+    w,
+    camera,
+    around,
+    reach,
+    spacing,
+    allowed,
+    T,
+    edge,
+    share,
+    low,
+    factor,
+    most,
+    seed,
+    table,
+    point,
+    hashed,
 ):
     """Add spots where points show a coarse cell without one; return how many.
 
-    Places are looked at evenly over the surface, as in `new_in_image`: on the plane through the points around a point,
+    Places are looked at evenly over the surface, as in `new_in_image`, at `most` of the points: on the plane through the points around a point,
     up to half of `spacing` (pixels) away from it; at the point itself if there is no plane.
     """
-    total, n, at = len(w), 0, np.int64(0)
+    total, n, at = len(w), 0, np.int64(seed % len(w))
+    looked = min(total, most)
     fx, fy, cx, cy = camera
-    for _ in range(total):
+    spacing = spacing * np.sqrt(total / looked)
+    for _ in range(looked):
         at += factor
         if at >= total:
             at -= total
@@ -647,8 +667,12 @@ def answer_sparse(
 
 @serial
 def next_point(grid, u, v, w, at, goal_x, goal_y, reach, around, allowed, steep):
-    """Return the point nearest to a goal in the image that shows the surface of point `at`, not `at`; -1 without any."""
+    """Return the point nearest to a goal in the image that shows the surface of point `at`, not `at`; -1 without any.
+
+    It is looked for within half of `reach`.
+    """
     rows, columns = grid.shape
+    reach = (reach + 1) // 2
     other, least = np.int64(-1), 1e18
     column, row = np.int64(np.floor(goal_x + 0.5)), np.int64(np.floor(goal_y + 0.5))
     for b in range(max(row - reach, 0), min(row + reach + 1, rows)):
