@@ -56,19 +56,22 @@ CHANGE = 8.0
 STILL = 1.0
 """Pixels by which no point of an image moves while a camera stands still."""
 
-SIGMAS, LEAST, MOST = 4.0, 0.002, 0.05
+SIGMAS, LEAST, MOST = 1.0, 0.002, 0.05
 """A pixel shows a spot if their depths differ by at most so many standard deviations of how they differ in the flight,
-which depth noise and errors of poses cause; the least and the most of this tolerance, relative. Of a first frame, which
-has nothing to differ from, it is the noise within the frame."""
+which depth noise and errors of poses cause; the least and the most of this tolerance, relative. A third of the answers
+is lost by this, whatever the labels; with a wider tolerance more answers come from other surfaces than the spot's. Of a
+first frame, which has nothing to differ from, the noise within it counts."""
 
-SMOOTH = 0.0005
-"""Noise within a frame, relative, from which on depth is that of planes through the pixels around."""
+SURE, SMOOTH = 4.0, 0.0005
+"""Standard deviations of the noise within a frame by which pixels of one surface differ at most; and the noise, relative,
+from which on depth is that of planes through the pixels around."""
 
 GATE, ENOUGH = 0.05, 50
 """That standard deviation is taken of differences up to this, relative, if a frame has at least so many."""
 
-SPARSE, DENSE = 0.3, 0.1
-"""Share of an image's pixels that have depth below which depth is sparse, as a LiDAR's in an image is; and share of the
+SPARSE, ALONE, DENSE = 0.3, 0.7, 0.1
+"""Share of an image's pixels that have depth below which depth is sparse, as a LiDAR's in an image is, if fewer than
+this share of these pixels have one next to them; and share of the
 labels at pixels without depth from which on labels are read where a spot falls, not at the next pixel with depth."""
 
 
@@ -202,7 +205,7 @@ class Sampler:
 
         (H, W), stride = frame.shape, _stride(frame.shape)
         blocks = -(-H // stride) * -(-W // stride)
-        where = SIGMAS * self._noise, self._edge, self._share, self._low, stride, _factor(blocks), seed
+        where = SURE * self._noise, self._edge, self._share, self._low, stride, _factor(blocks), seed
         self._new(lambda *room: new_in_image(fixed(frame.depth), _camera(frame), T, *where, *room))
 
     def _find_in_points(self, sparse: Sparse, T: Float64, seed: int) -> None:
@@ -249,7 +252,7 @@ class Sampler:
 
         n, camera = self._spots, _camera(frame)
         spot, (x, y, error, room) = np.empty(n, np.int32), np.empty((4, n))
-        noise = SIGMAS * self._noise if self._noise > SMOOTH else 0.0
+        noise = SURE * self._noise if self._noise > SMOOTH else 0.0
         n = project(self._point[:n], fixed(frame.depth), camera, T, noise, spot, x, y, error, room)
         spot, x, y, error, room = spot[:n], x[:n], y[:n], error[:n], room[:n]
         self._learn(self._known, spot, error)
@@ -421,7 +424,8 @@ def _sparse(frame: Frame, K: int) -> Sparse | None:
         labels = np.where(labels < K, labels, np.where(unlabelled, K, K + 1)).astype(np.uint16)
         return Sparse(grid, u, v, w, (1 / unit, 1 / unit, 0.0, 0.0), True, 5, 1.0, 2.0, labels)
     valid = (frame.depth > 0) & (frame.depth < np.inf)
-    if not 0 < (n := int(np.count_nonzero(valid))) < SPARSE * valid.size:
+    n, pairs = int(np.count_nonzero(valid)), int(np.count_nonzero(valid[:, 1:] & valid[:, :-1]))
+    if not 0 < n < SPARSE * valid.size or pairs >= ALONE * n:
         return None
     row, column = np.nonzero(valid)
     spacing = math.sqrt((np.ptp(row) + 1) * (np.ptp(column) + 1) / n)
