@@ -263,7 +263,7 @@ class Sampler:
         return tuple(column[:m] for column in out)
 
     def _answers_of_points(self, frame: Frame, sparse: Sparse, T: Float64, seed: int) -> tuple[Any, ...]:
-        from semstab.statistics.loops.spots import answer_sparse, answer_points, project_sparse
+        from semstab.statistics.loops.spots import answer_points, answer_sparse, project_sparse
 
         n = self._spots
         spot, nearest, (x, y, error, room) = np.empty(n, np.int32), np.empty(n, np.int64), np.empty((4, n))
