@@ -260,7 +260,7 @@ MOST_CLASSES = 4
 """Most classes that a sentence names."""
 
 BASES: dict[Basis, str] = {
-    "observations": "paired; alpha is of the observations (a cell in a view) that all runs made, with the same weights",
+    "observations": "paired; alpha is of the answers (a spot in a view) to which all runs gave a label",
     "voxels": "paired on the voxels that all runs saw twice or more",
     "cubes": "paired on cubes of space",
     "flights": "not paired",

@@ -87,8 +87,8 @@ class RangeStratum:
     Attributes:
         low, high: Ends of the range in metres; the high one is not part of it.
         share: Share of all sampled observations.
-        cells: Cells that two views saw from there.
-        alpha: Alpha of these observations; NaN where they were not assessed: two views saw too few cells from there, or
+        spots: Spots that two views saw from there.
+        alpha: Alpha of these observations; NaN where they were not assessed: two views saw too few spots from there, or
             nearly all of them are one class.
     """
 
