@@ -15,7 +15,7 @@ from semstab.errors import DataError
 from semstab.report.tables import tables
 
 NOW = {new: old for old, new in KEYS.items()}
-GONE = ("cells", "correlogram", "outlying_frames")
+GONE = ("spots", "correlogram", "outlying_frames")
 """What version 0.3 did not have."""
 
 
@@ -80,11 +80,11 @@ def test_a_run_of_version_0_3_is_read_with_a_warning(old_run, caplog):
     assert [row.voxel_alpha for row in old.summary.sizes] == [row.voxel_alpha for row in new.summary.sizes]
     assert new.summary.reduced is not None
     assert to_json(old.summary.reduced) == to_json(new.summary.reduced)
-    assert one.cells is one.correlogram is None
+    assert one.spots is one.correlogram is None
     assert math.isnan(one.headline.alpha.value)
     assert one.verdict.level == "no verdict"
     assert math.isnan(one.verdict.probability)
-    assert one.verdict.line.startswith("sim-soft: no verdict, run it again for alpha of cells")
+    assert one.verdict.line.startswith("sim-soft: no verdict, run it again for alpha of spots")
     assert one.verdict.line.endswith(f"said {other.verdict.level}")
 
 

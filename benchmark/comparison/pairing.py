@@ -68,7 +68,7 @@ class Common:
         sums: Sums of each run for the common locations; for `cubes` and `flights` of its whole map.
         mixed: True if labels are compared with scores.
         tables: Tables of the common locations; none for `cubes` and `flights`.
-        logs: Logs of the common observations of cells, where there are some.
+        logs: Logs of the common observations of spots, where there are some.
         label: (n,) the true class of each of their voxels, -1 where it is unknown; None without ground truth.
         observations: The comparison of the common observations.
         regions: The whole maps with the ground truth, where there are voxels of the same frames, all of labels or all
@@ -163,7 +163,7 @@ def joint_class(tables: Iterable[VoxelTable]) -> Int64:
 
 
 def _by_voxels(entries: Sequence[Entry], regions: Regions) -> Common:
-    """Return the voxels that all saw twice or more, or a sample of very many. Alpha is of each run's own cells."""
+    """Return the voxels that all saw twice or more, or a sample of very many. Alpha is of each run's own spots."""
     common = common_voxels(regions)
     tables, share = tuple(common.tables.values()), common.share
     label = None if common.truth is None else join_truth(tables[0], common.truth).label
@@ -182,8 +182,8 @@ def _with_observations(common: Common, names: Sequence[str], records: Sequence[R
     if not samples:
         return replace(common, notes=(OTHER_OBSERVATIONS, *common.notes), same_frames=False, frames_differ=True)
     shared, pixels = _compared(names, samples)
-    cells = shared.sums.values()
-    sums = (replace(part, near=of.near, far=of.far) for part, of in zip(common.sums, cells, strict=True))
+    spots = shared.sums.values()
+    sums = (replace(part, near=of.near, far=of.far) for part, of in zip(common.sums, spots, strict=True))
     notes, logs = _fewer_frames(samples), tuple(shared.logs.values())
     return replace(
         common, basis="observations", notes=(*common.notes, *notes, *pixels), sums=tuple(sums), logs=logs,

@@ -20,20 +20,14 @@ KEYS: Mapping[str, str] = {
 }  # fmt: skip
 """Keys of schema 2, and what they are called now."""
 
-SUMS: Mapping[str, str] = {
-    "looks": "observed", "looks_right": "observed_right", "stable": "consistent", "stable_wrong": "consistent_wrong",
-    "judged": "calibrated",
-}  # fmt: skip
-"""Names of sums in files without cells, and what they are called now."""
-
 GONE = ("beyond_coin", "fusion_rules", "reach", "correlogram", "alpha_between", "each_place")
-"""Keys of schema 2 that are not read any more: its looks were at voxels, and alpha is of cells."""
+"""Keys of schema 2 that are not read any more: its looks were at voxels, and alpha is of spots."""
 
 VOXEL_ALPHA = ({"psa", "kappa"}, {"voxel_size", "frames", "alpha"}, {"vss", "recurrent_vss"}, {"name", "kappa"})
 """Keys beside which 'alpha' was that of voxels: of a map, of a size, of reduced scores, of a class."""
 
 JUDGED_BEFORE = (
-    "{model}: no verdict, run it again for alpha of cells: version 0.3 judged alpha of voxels by a ceiling, and said"
+    "{model}: no verdict, run it again for alpha of spots: version 0.3 judged alpha of voxels by a ceiling, and said"
     " {level}"
 )
 

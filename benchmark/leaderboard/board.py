@@ -196,8 +196,8 @@ def _over_places(values: Sequence[Interval], places: Sequence[str]) -> Interval:
 def _classes(entries: Sequence[Entry]) -> dict[str, float]:
     alphas: dict[str, list[float]] = {}
     for entry in entries:
-        cells = None if entry.summary.statistics is None else entry.summary.statistics.spots
-        for own in () if cells is None else cells.classes:
+        spots = None if entry.summary.statistics is None else entry.summary.statistics.spots
+        for own in () if spots is None else spots.classes:
             if own.counts_for_verdict and math.isfinite(own.alpha.value):
                 alphas.setdefault(own.name, []).append(own.alpha.value)
     return {name: float(np.mean(values)) for name, values in alphas.items()}

@@ -141,9 +141,9 @@ class _Map:
         table = self._backend.table()
         if self._one_in > 1:
             table = table.rows(in_sample(table.index.T, self._one_in))
-        cells = None if self._sampler is None else self._sampler.sample()
+        spots = None if self._sampler is None else self._sampler.sample()
         flicker = self._flicker, self._pairs
-        return State(self._frames, table, table.op.astype(np.int64) - 1, cells, flicker, self._one_in)
+        return State(self._frames, table, table.op.astype(np.int64) - 1, spots, flicker, self._one_in)
 
 
 class TemporalStability:
@@ -156,7 +156,7 @@ class TemporalStability:
         voxel_size: The edge of a voxel, metres.
         ignore_index: The label of pixels without a class.
         soft: True to fuse scores; else the likeliest class of each pixel is fused, as from label maps on disk.
-        alpha: True to sample the cells that give alpha and a verdict: half of the time of an update.
+        alpha: True to sample the spots that give alpha and a verdict: half of the time of an update.
         max_voxels: The most voxels of a sequence; a larger map is sampled at random, so that its memory is bounded.
         backend: The backend that fuses.
         of_torchmetrics: The arguments of `torchmetrics.Metric`, where it is installed.

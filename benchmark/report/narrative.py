@@ -56,10 +56,10 @@ def warnings(result: Result) -> Iterator[str]:
                 f"{_name(run, result)}: {run.frames_empty} of {run.frames} frames have no pixel with both depth and"
                 " a label: semstab-bench check"
             )
-        cells = None if run.statistics is None else run.statistics.spots
-        if cells is not None and 2 * cells.views <= cells.frames:
+        spots = None if run.statistics is None else run.statistics.spots
+        if spots is not None and 2 * spots.views <= spots.frames:
             yield (
-                f"{_name(run, result)}: {cells.frames} frames show {cells.views} distinct views: the camera stands"
+                f"{_name(run, result)}: {spots.frames} frames show {spots.views} distinct views: the camera stands"
                 " still, or frames repeat; the statistics count views, not frames"
             )
         if (cut := run.scores_left_out) is not None:
@@ -179,8 +179,8 @@ def _suspicions(record: Record) -> Iterator[str]:
 
 def _traffic(record: Record) -> Iterator[str]:
     """Yield a warning where most disagreement is at classes that move, and frames agree much better without them."""
-    cells = None if record.statistics is None else record.statistics.spots
-    if cells is None or (moving := cells.moving) is None or moving.disagreement < MOSTLY_MOVING:
+    spots = None if record.statistics is None else record.statistics.spots
+    if spots is None or (moving := spots.moving) is None or moving.disagreement < MOSTLY_MOVING:
         return
     yield (
         f"{moving.disagreement:.0%} of the disagreement is where the map has classes that move"

@@ -333,7 +333,7 @@ def _distance(records: Sequence[Record], colors: Mapping[str, int]) -> Iterator[
                     Line(name, [each.mean for each in bins], [alpha.value for alpha in alphas], ends, colors[name])
                 )
         if lines:
-            yield {"title": title, "chart": line_chart(lines, unit, "alpha of single cells", zero=True)}
+            yield {"title": title, "chart": line_chart(lines, unit, "alpha", zero=True)}
 
 
 # --- All scenes together ----------------------------------------------------------------------------------------------

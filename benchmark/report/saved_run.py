@@ -50,7 +50,7 @@ class Run:
         """
         rows: list[dict[str, Any]] = []
         for unit in (each for each in self.result.runs if each.statistics is not None):
-            cells = None if unit.statistics is None else unit.statistics.spots
+            spots = None if unit.statistics is None else unit.statistics.spots
             rows += [
                 {
                     "scene": unit.unit.scene, "model": unit.unit.model, "backend": unit.unit.backend, "class": row.name,
@@ -58,7 +58,7 @@ class Run:
                     "alpha": row.alpha.value, "alpha_low": row.alpha.low, "alpha_high": row.alpha.high,
                     "unstable": row.unstable, "disagreement": row.disagreement,
                 }
-                for row in (() if cells is None else cells.classes)
+                for row in (() if spots is None else spots.classes)
             ]  # fmt: skip
         return voxels.to_pandas({name: np.array([row[name] for row in rows]) for name in (rows[0] if rows else ())})
 

@@ -290,10 +290,10 @@ def correlogram(result: Result) -> list[Table]:
         *(_of(_end(axis, last)) for axis in _AXES for last in (0, -1)),
     )
     caption = (
-        "The table shows alpha of pairs of observations of a cell, by their distance. Models and flights are compared"
+        "The table shows alpha of pairs of observations of a spot, by their distance. Models and flights are compared"
         " at a stated angle between the directions of view, not over all pairs that a flight has. Nearest and farthest"
         " are the first and the last bin with enough pairs in time (frames), angle, ratio of the ranges, and distance"
-        " of the cameras. Alpha is not extrapolated to cells without a size. Intervals are at"
+        " of the cameras. As in the verdict, alpha is that of the spots themselves. Intervals are at"
         f" {CONFIDENCE:.0%}, for this scene flown again if a bin has {LEAST_FRAMES} frames, else for these frames."
     )
     return by_scene(result, "correlogram", "Agreement by distance of the observations", caption, columns, numbers)

@@ -58,8 +58,8 @@ def temporal_agreement(result: Result) -> list[Table]:
     numbers: tuple[Number, ...] = (
         lambda stats: stats.headline.alpha.ends,
         of_spots(lambda spots: spots.spots),
-        of_spots(lambda cells: cells.views),
-        of_spots(lambda cells: 100 * cells.labelled),
+        of_spots(lambda spots: spots.views),
+        of_spots(lambda spots: 100 * spots.labelled),
         lambda stats: stats.repeated.voxels,
         lambda stats: stats.agreement.vss.value,
         lambda stats: stats.agreement.psa,
@@ -71,7 +71,7 @@ def temporal_agreement(result: Result) -> list[Table]:
     )
     caption = (
         "Alpha is the agreement of two views at the same spot beyond chance: 1 is perfect, 0 is chance. It is measured"
-        " on sampled cells that two views saw, and does not depend on the voxel size. The other numbers are of the"
+        " on spots that two views saw, and does not depend on the voxel size. The other numbers are of the"
         " voxels seen twice or more. PSA is the share of pairs of frames that agree about a voxel; kappa (Fleiss) and"
         " voxel alpha (Krippendorff) are the same agreement beyond chance. Disagreement has the parts of 1 - PSA within"
         " a frame and between frames. Flip rate is the share of the steps from one observation to the next at which the"
@@ -319,7 +319,7 @@ def ordered(take: Callable[[DriftStatistics], float | Estimate]) -> Number:
 
 
 def of_spots(take: Callable[[SpotAgreement], float]) -> Number:
-    """Return a function that takes a number of the sampled cells; NaN where there are none."""
+    """Return a function that takes a number of the spots; NaN where there are none."""
     return lambda stats: math.nan if stats.spots is None else take(stats.spots)
 
 
@@ -352,8 +352,8 @@ def grouped(rows: Iterable[T], name: Callable[[T], str]) -> dict[str, list[T]]:
 
 def _class_rows(assessed: Sequence[MapStatistics]) -> tuple[Row, ...]:
     by_name = grouped((row for stats in assessed for row in stats.agreement.classes), lambda row: row.name)
-    cells = (stats.spots for stats in assessed if stats.spots is not None)
-    alphas: dict[str, list[ClassAlpha]] = grouped((row for each in cells for row in each.classes), lambda row: row.name)
+    spots = (stats.spots for stats in assessed if stats.spots is not None)
+    alphas: dict[str, list[ClassAlpha]] = grouped((row for each in spots for row in each.classes), lambda row: row.name)
     return tuple(
         (
             name,

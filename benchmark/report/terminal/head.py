@@ -17,8 +17,8 @@ def head_lines(name: str, result: Result, runs: Sequence[UnitSummary], width: in
     first = runs[0]
     frames = sorted({run.frames for run in runs})
     counts = f"{frames[0]} to {frames[-1]}" if len(frames) > 1 else f"{frames[0]}"
-    cells = [run.statistics.spots for run in runs if run.statistics is not None]
-    views = min((each.views for each in cells if each is not None and each.views < each.frames), default=None)
+    spots = [run.statistics.spots for run in runs if run.statistics is not None]
+    views = min((each.views for each in spots if each is not None and each.views < each.frames), default=None)
     seen = "" if views is None else f" of {views} distinct views"
     chosen = " (chosen)" if any(advice.chosen for advice in result.advice.values()) else ""
     classes = " and ".join(map(str, sorted({run.table.K for run in runs})))
