@@ -36,7 +36,7 @@ def numbered(frames):
 
 
 def sampled(frames, budget=1 << 19):
-    """The cells that a sampler took of the frames."""
+    """The spots that a sampler took from the frames."""
     sampler = Sampler(K, budget)
     for frame in frames:
         sampler.add(frame)

@@ -53,8 +53,8 @@ def ran(tmp_path_factory):
 
 def saved(run: Path, model: str) -> tuple[VoxelTable, Events, SpotObservations]:
     name = f"wall__{model}__numpy.parquet"
-    cells = SpotObservations.load(run / "observations" / name)
-    return VoxelTable.load(run / "voxels" / name), Events.load(run / "events" / name), cells
+    spots = SpotObservations.load(run / "observations" / name)
+    return VoxelTable.load(run / "voxels" / name), Events.load(run / "events" / name), spots
 
 
 def test_a_runs_statistics_are_those_of_its_saved_maps_and_events(ran) -> None:
@@ -62,9 +62,9 @@ def test_a_runs_statistics_are_those_of_its_saved_maps_and_events(ran) -> None:
     truth, *_ = saved(run, "gt")
     for entry in summary["runs"]:
         name = entry["model"]
-        table, events, cells = saved(run, name)
+        table, events, spots = saved(run, name)
         true = None if name == "gt" else truth
-        expected = analyse(MapSample.draw(table, events, true, edges=(1, 3)), cells, name=name, edges=(1, 3))
+        expected = analyse(MapSample.draw(table, events, true, edges=(1, 3)), spots, name=name, edges=(1, 3))
         assert entry["statistics"] == json.loads(json.dumps(to_json(expected.summary)))
         columns = pq.read_table(run / "voxels" / f"wall__{name}__numpy.parquet")
         for column, values in expected.columns(table).items():
@@ -121,8 +121,8 @@ def test_without_asking_there_is_what_the_map_alone_tells(tmp_path) -> None:
     result = semstab.run(configure(root, events=True), out=tmp_path / "run", report=False)
     (entry,) = result.runs
     table = VoxelTable.load(tmp_path / "run" / "voxels" / f"{entry.unit.slug}.parquet")
-    cells = SpotObservations.load(tmp_path / "run" / "observations" / f"{entry.unit.slug}.parquet")
-    assert to_json(entry.statistics) == to_json(describe(table, spots=cells, name="a"))
+    spots = SpotObservations.load(tmp_path / "run" / "observations" / f"{entry.unit.slug}.parquet")
+    assert to_json(entry.statistics) == to_json(describe(table, spots=spots, name="a"))
     assert entry.statistics.drift.trend is None
     assert result.comparisons == ()
     again = semstab.run(configure(root, events=True), out=tmp_path / "run", report=False)  # kept

@@ -116,7 +116,7 @@ def test_locations_of_a_class_are_left_out_and_errors_elsewhere_stay(root, tmp_p
     assert (tables[1].evidence[:][:, tables[1].classes.index("door")] > 0).any()
     expected = describe(tables[0].rows(keep)).agreement.psa.value
     assert some.statistics.agreement.psa.value == pytest.approx(expected)
-    assert some.statistics.spots.cells < whole.statistics.spots.cells
+    assert some.statistics.spots.spots < whole.statistics.spots.spots
 
 
 def test_the_masks_of_a_posed_folder(root) -> None:

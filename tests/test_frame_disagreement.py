@@ -37,7 +37,7 @@ BAD = {"clean": set(), "every-third": {0, 3, 6, 9, 12}}
 CLASSES = ["wall", "door", "window"]
 
 
-def cells(places):
+def spots(places):
     """Observations of places, each with its labels in order of the views that see it: {view: label}."""
     spot = np.array([k for k, place in enumerate(places) for _ in place])
     view, label = (np.array([row[i] for place in places for row in place.items()]) for i in (0, 1))
@@ -47,7 +47,7 @@ def cells(places):
 
 
 def test_a_view_stands_alone_where_those_before_and_after_agree_on_another_class() -> None:
-    seen = cells(
+    seen = spots(
         [dict(enumerate(labels)) for labels in ((0, 1, 0), (0, 0, 1, 1), (1, 1, 1, 1, 1, 0), (0, 1), (2, 0, 1))]
     )
     alone = stands_alone(seen.observations()).tolist()
@@ -56,7 +56,7 @@ def test_a_view_stands_alone_where_those_before_and_after_agree_on_another_class
 
 def test_the_frames_beside_a_bad_one_are_not_blamed() -> None:
     """Of seven views the fourth errs at all places: it alone has an excess, by its index, not by its position."""
-    found = lone_disagreement(cells([{t: int(t == 3) for t in range(7)} for _ in range(60)]))
+    found = lone_disagreement(spots([{t: int(t == 3) for t in range(7)} for _ in range(60)]))
     assert found.frame.tolist() == [0, 10, 20, 30, 40, 50, 60]
     assert found.share.tolist() == [0, 0, 0, 1, 0, 0, 0]
     named = outlying_frames(found, 7, name="frame-{}".format).frames
@@ -66,13 +66,13 @@ def test_the_frames_beside_a_bad_one_are_not_blamed() -> None:
 
 
 def test_two_views_of_a_place_tell_nothing() -> None:
-    assert len(lone_disagreement(cells([{0: 0, 1: 1}] * 60)).frame) == 0
+    assert len(lone_disagreement(spots([{0: 0, 1: 1}] * 60)).frame) == 0
 
 
 @given(st.lists(st.lists(st.integers(0, 2), min_size=3, max_size=9), min_size=1, max_size=12))
 def test_the_excesses_of_all_views_of_a_place_sum_to_nothing(places) -> None:
     """Each place adds 0 to the sum over frames of places times excess, whatever its labels are."""
-    found = lone_disagreement(cells([dict(enumerate(labels)) for labels in places]))
+    found = lone_disagreement(spots([dict(enumerate(labels)) for labels in places]))
     assert found.places @ found.excess == pytest.approx(0.0, abs=1e-9)
 
 

@@ -112,7 +112,7 @@ def sums(labels, truth, side=16):
 
 
 def spots_of(labels, side=16, K=2):
-    """A cell for each voxel of the floor."""
+    """A spot for each voxel of the floor."""
     over = World(grid(side), *[np.zeros(side * side)] * 4)
     return sample_of(labels, over, Flight(side, frames=labels.shape[1], K=K))
 
@@ -186,10 +186,10 @@ def test_what_has_no_label_counts_as_disagreeing_in_a_rule_on_alpha(run, tmp_pat
     found = gate(tmp_path / "silent", None, gate_config(rules=["alpha > 0.1", "psa > 0"]))
     alpha, _ = found.judgements
     (record,) = semstab.load(tmp_path / "silent").result.select()
-    cells, own = record.statistics.spots, record.statistics.headline.alpha
-    assert 0.5 < cells.pairs_labelled < 0.8
-    assert alpha.new == pytest.approx(own.value * cells.pairs_labelled)
-    assert alpha.interval.high <= cells.pairs_labelled
+    spots, own = record.statistics.spots, record.statistics.headline.alpha
+    assert 0.5 < spots.pairs_labelled < 0.8
+    assert alpha.new == pytest.approx(own.value * spots.pairs_labelled)
+    assert alpha.interval.high <= spots.pairs_labelled
     assert [note for note in found.notes if "which count as disagreeing: alpha is 0." in note]
 
 
@@ -455,7 +455,7 @@ def test_frames_without_any_label_are_of_the_same_flight():
     unknown = dataclasses.replace(base.coarsened(base.edge, 0), near=None, far=None)
     assert not within_a_flight(new, unknown)
     assert not within_a_flight(unknown, base)
-    assert within_a_flight(new, base.coarsened(base.edge, 0))  # by the views of its cells
+    assert within_a_flight(new, base.coarsened(base.edge, 0))  # by the views of its spots
     assert shares_of(new, base) == pytest.approx({"voxels": 1.0, "observations": 8 / 9})
     other = log_of(quiet[:, :4], K=2, index=grid(16), frames=[0, 1, 2, 20])
     assert not within_a_flight(cluster_sums_of(other.table(), other, truth), base)
@@ -519,7 +519,7 @@ def test_a_change_of_alpha_is_what_a_comparison_says_of_the_same_runs(run, quiet
         assert (row.base, row.new, row.interval.value) == (own.base, own.other, own.difference.value)
     kept = {name: semstab.load_result(folder).record(model=own).statistics
             for name, folder, own in (("new", quiet_models, "part"), ("base", run, "a"))}  # fmt: skip
-    assert alone.new == pytest.approx(kept["new"].headline.alpha.value * kept["new"].cells.pairs_labelled)
+    assert alone.new == pytest.approx(kept["new"].headline.alpha.value * kept["new"].spots.pairs_labelled)
     assert of_all.base != kept["base"].headline.alpha.value
     assert voxels.new == pytest.approx(kept["new"].agreement.voxel_alpha.value)
     text, *_ = gate(new, base, gate_config(rules=rules[:1])).notes

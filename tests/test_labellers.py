@@ -37,7 +37,7 @@ def test_no_labeller_is_stable_without_a_warning_that_names_it(result, name):
 
 
 def test_what_is_left_out_counts_and_caps_the_verdict(result):
-    assert of(result, "sim-steady").cells.labelled > 0.95
+    assert of(result, "sim-steady").spots.labelled > 0.95
     for name in ("trick-border-ignoring", "trick-hard-ignoring"):
         found = of(result, name)
         assert found.spots.labelled < 0.9
@@ -60,5 +60,5 @@ def test_the_limits_of_a_verdict_are_settings(result, tmp_path):
     verdict = {"stable": 0.99, "class_locations": 1e9}
     found = of(labelled(tmp_path / "run", ["sim-steady"], verdict=verdict), "sim-steady")
     assert found.verdict.level == "usable"
-    assert np.isfinite(of(result, "sim-steady").cells.critical_classes[0].unstable)
+    assert np.isfinite(of(result, "sim-steady").spots.critical_classes[0].unstable)
     assert not found.spots.critical_classes

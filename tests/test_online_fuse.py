@@ -54,7 +54,7 @@ def test_a_generator_gives_what_a_run_gives(steady, city):
     })  # fmt: skip
     own, other = steady.record(), run.record()
     assert own.summary.table == other.summary.table
-    for part in ("headline", "cells", "agreement"):
+    for part in ("headline", "spots", "agreement"):
         assert to_json(getattr(own.statistics, part)) == to_json(getattr(other.statistics, part))
     assert own.statistics.verdict.level == other.statistics.verdict.level == steady.summary.verdict
     alpha = other.statistics.headline.alpha

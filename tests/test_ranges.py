@@ -49,7 +49,7 @@ def test_nothing_is_said_where_it_is_not_known_or_labels_are_reliable_everywhere
 
 @pytest.mark.parametrize(("twice", "said"), [(100, False), (1500, True)])
 def test_a_range_from_which_hardly_a_spot_was_seen_twice_has_no_alpha(twice, said) -> None:
-    """Two views at the origin: 3,000 cells at 4 to 5 m, so many of them in both; 3,000 at 20 m, all in both."""
+    """Two views at the origin: 3,000 spots at 4 to 5 m, so many of them in both; 3,000 at 20 m, all in both."""
     rng, n = np.random.default_rng(0), 3000
     index = np.concatenate([np.stack([np.full(n, x), *np.divmod(np.arange(n), 60)], axis=1) for x in (16, 80)])
     labels = np.repeat(rng.integers(0, 3, 2 * n)[:, None], 2, axis=1)
@@ -63,7 +63,7 @@ def test_a_range_from_which_hardly_a_spot_was_seen_twice_has_no_alpha(twice, sai
 
 
 def seen_from_afar(labels, distance=20):
-    """Two views of 3,000 cells at 4 to 5 m, all of them in both, and of as many cells far away."""
+    """Two views of 3,000 spots at 4 to 5 m, all of them in both, and of as many spots far away."""
     n = len(labels) // 2
     index = np.concatenate(
         [np.stack([np.full(n, x), *np.divmod(np.arange(n), 60)], axis=1) for x in (16, 4 * distance)]
@@ -81,7 +81,7 @@ def test_a_range_with_one_class_is_not_assessed() -> None:
     labels[:3000:100, 1] = 1
     found = seen_from_afar(labels)
     near = [row for row in found.strata if row.high <= 7]
-    assert near[0].cells >= 200
+    assert near[0].spots >= 200
     assert not any(row.is_assessed for row in near)
     assert found.strata[-1].is_assessed
     assert found.reliable == found.farthest

@@ -13,7 +13,6 @@ from striped_floor import K, fused, sampled
 from striped_floor import flight as over_stripes
 
 from semstab.core.json_form import to_json
-from semstab.data.earlier import SUMS
 from semstab.data.measures import Measure, dominant, entropy, margin, registered, sbd, vss
 from semstab.errors import DataError
 from semstab.metrics.agreement import rows_of
@@ -38,6 +37,7 @@ from semstab.statistics.intervals import (
     same_flight,
     scope_of,
 )
+from semstab.statistics.observations import PARTS
 
 
 def flight(side=12, F=9, K=3, soft_evidence=False, seed=0):
@@ -93,27 +93,51 @@ def test_the_sums_give_every_number_back(soft_evidence):
 
 
 def stripes(voxel_size=0.3, **options):
-    """The sums of a flight over stripes, with those of its cells, and the cells."""
+    """The sums of a flight over stripes, with those of its spots, and the spots."""
     frames = list(over_stripes(8, flicker=0.3, patch=5, **options))
-    backend, cells = fused(frames, voxel_size), sampled(frames)
-    return cluster_sums_of(backend.table(), backend.events(), spots=cells), cells
+    backend, spots = fused(frames, voxel_size), sampled(frames)
+    return cluster_sums_of(backend.table(), backend.events(), spots=spots), spots
+
+
+def lever_by_hand(spots):
+    """How far the parabola through disagreement at three distances falls until 0, in falls from the second to the first.
+
+    The third answers are two pixels away, of which the second ones are one.
+    """
+    (first, near), (second, far), third = spots.logs()
+    again = first.table().op[first.voxel] >= 2
+    disagreement = [1 - psa(log.table())[log.voxel[again]].mean() for log in (first, second, third)]
+    own, one = near[again].mean(), far[again].mean()
+    distances = np.sqrt([own, one, own + 4 * (one - own)])
+    at_zero = np.polyfit(distances, disagreement, 2)[-1]
+    return (disagreement[0] - at_zero) / (disagreement[1] - disagreement[0])
 
 
 def test_the_sums_of_spots_give_alpha_back():
-    whole, cells = stripes()
-    fine, coarse = (cells.observations(times) for times in (1, 2))
-    expected = [krippendorff_alpha(log.table()) for log in (fine, coarse)]
+    whole, spots = stripes()
+    logs = [log for log, _ in spots.logs()[:2]]
+    expected = [krippendorff_alpha(log.table()) for log in logs]
     assert [value(part, "voxel_alpha") for part in (whole.near, whole.far)] == pytest.approx(expected)
-    assert value(whole, "alpha") == pytest.approx(2 * expected[0] - expected[1])
-    by_class = [[row.voxel_alpha for row in class_agreement(log.table(), log)] for log in (fine, coarse)]
+    lever = lever_by_hand(spots)
+    assert 0.1 < lever < 1
+    assert value(whole, "alpha") == pytest.approx(expected[0] + lever * (expected[0] - expected[1]))
+    by_class = [[row.voxel_alpha for row in class_agreement(log.table(), log)] for log in logs]
     for k in range(K):
-        assert value(whole, "alpha", k) == pytest.approx(2 * by_class[0][k] - by_class[1][k])
-    alone = sums_of_spots(cells)
+        assert value(whole, "alpha", k) == pytest.approx(by_class[0][k] + lever * (by_class[0][k] - by_class[1][k]))
+    alone = sums_of_spots(spots)
     assert value(alone, "alpha") == pytest.approx(value(whole, "alpha"))
     assert np.isnan(value(alone, "psa"))
 
 
-def test_without_cells_there_is_no_alpha():
+def test_where_the_second_answers_are_the_first_ones_alpha_is_that_of_the_first_ones():
+    """There is nothing to extrapolate from: no pixel beside shows the surface."""
+    spots = stripes()[1]
+    alone = replace(spots, neighbour=spots.label, beyond=spots.label, far=spots.near)
+    found = sums_of_spots(alone)
+    assert value(found, "alpha") == pytest.approx(value(sums_of_spots(spots).near, "voxel_alpha"), abs=1e-12)
+
+
+def test_without_spots_there_is_no_alpha():
     table, log, _ = flight()
     sums = cluster_sums_of(table, log)
     assert (sums.near, sums.far) == (None, None)
@@ -131,8 +155,8 @@ def test_sums_of_spots_become_coarser_with_those_of_the_map():
         assert value(larger, key) == pytest.approx(value(whole, key))
 
 
-def test_sums_of_two_maps_are_aligned_with_their_cells():
-    """The frames of one map are not known, those of its cells are; the cubes of the other are larger."""
+def test_sums_of_two_maps_are_aligned_with_their_spots():
+    """The frames of one map are not known, those of its spots are; the cubes of the other are larger."""
     one, other = stripes()[0].coarsened(2.0, 2), stripes(seed=1)[0].coarsened(4.0, 1)
     a, b = aligned(one.coarsened(2.0, 0), other)
     assert (a.edge, a.step, b.edge, b.step) == (4.0, 0, 4.0, 0)
@@ -145,8 +169,8 @@ def test_sums_of_two_maps_are_aligned_with_their_cells():
     assert value(b, "alpha") == pytest.approx(value(other, "alpha"))
 
 
-def test_a_file_holds_a_map_and_its_fine_and_coarse_cells(tmp_path):
-    whole, _ = stripes()
+def test_a_file_holds_a_map_and_the_first_and_second_answers_of_its_spots(tmp_path):
+    whole, spots = stripes()
     whole.save(tmp_path / "sums.parquet")
     back = ClusterSums.load(tmp_path / "sums.parquet")
     for part, own in zip((back, back.near, back.far), (whole, whole.near, whole.far), strict=True):
@@ -154,7 +178,7 @@ def test_a_file_holds_a_map_and_its_fine_and_coarse_cells(tmp_path):
             np.testing.assert_array_equal(getattr(part, name), getattr(own, name))
         for name in ("edge", "step", "voxel_size", "K", "classes", "truth", "fused"):
             assert getattr(part, name) == getattr(own, name)
-    assert (back.voxel_size, back.near.voxel_size, back.far.voxel_size) == (0.3, 0.125, 0.25)
+    assert (back.voxel_size, back.near.voxel_size, back.far.voxel_size) == (0.3, *[spots.spacing / PARTS] * 2)
     assert value(back, "alpha") == value(whole, "alpha")
 
 
@@ -179,44 +203,10 @@ def test_a_file_is_read_by_the_names_of_its_columns(tmp_path):
         ClusterSums.load(tmp_path / "sums.parquet")
 
 
-def test_an_older_file_has_its_sums_by_their_names_of_then(tmp_path):
-    table, log, truth = flight()
-    whole = cluster_sums_of(table, log, truth)
-    whole.save(tmp_path / "sums.parquet")
-    content = pq.read_table(tmp_path / "sums.parquet")
-    about = json.loads(content.schema.metadata[b"semstab"])
-    about |= {name: about[name][0] for name in ("edge", "step", "voxel_size", "fused")}
-    about |= {"schema": 3, "kind": "InfluenceSums"}
-    then = {name: old for old, name in SUMS.items()}
-    content = content.rename_columns([then.get(name, name) for name in content.column_names])
-    pq.write_table(content.replace_schema_metadata({"semstab": json.dumps(about)}), tmp_path / "old.parquet")
-    np.testing.assert_array_equal(ClusterSums.load(tmp_path / "old.parquet").columns, whole.columns)
-
-
-@pytest.mark.parametrize("schema", [2, 3])
-def test_an_older_file_is_read_without_its_cells(tmp_path, schema):
-    """Parts 1 and 2 of schema 3 were of another sample; schema 2 had no frames that were fused."""
-    whole, _ = stripes()
-    whole.save(tmp_path / "sums.parquet")
-    content = pq.read_table(tmp_path / "sums.parquet")
-    about = json.loads(content.schema.metadata[b"semstab"])
-    about |= {name: about[name][0] for name in ("edge", "step", "voxel_size", "fused")}
-    about |= {"schema": schema, "kind": "InfluenceSums"}
-    if schema == 2:
-        about.pop("fused")
-    pq.write_table(content.replace_schema_metadata({"semstab": json.dumps(about)}), tmp_path / "old.parquet")
-    back = ClusterSums.load(tmp_path / "old.parquet")
-    assert (back.near, back.far) == (None, None)
-    np.testing.assert_array_equal(back.columns, whole.columns)
-    assert (back.step, back.voxel_size, back.fused) == (1, 0.3, 0 if schema == 2 else 8)
-    assert value(back, "voxel_alpha") == value(whole, "voxel_alpha")
-    assert np.isnan(value(back, "alpha"))
-
-
 @pytest.mark.parametrize(
     "change",
     [
-        {"schema": 9}, {"kind": "InfluenceSums"}, {"step": [1, 1]}, {"step": [1, 3, 1]}, {"fused": [10**400, 8, 8]},
+        {"schema": 9}, {"schema": 5}, {"kind": "InfluenceSums"}, {"step": [1, 1]}, {"step": [1, 3, 1]}, {"fused": [10**400, 8, 8]},
         {"step": [2**40, 2**40, 2**40]},
     ],
 )  # fmt: skip

@@ -104,7 +104,7 @@ def test_standardised_value_by_hand():
 
 
 def two_models(rng, gap, side=32, F=8):
-    """Two models that err block by block of 4 x 4 voxels, the second more by `gap`: their maps, and their cells."""
+    """Two models that err block by block of 4 x 4 voxels, the second more by `gap`: their maps, and their spots."""
     blocks = rng.beta(2, 6, size=(side // 4, side // 4))
     error = np.kron(blocks, np.ones((4, 4))).ravel()
     shift = np.kron(rng.normal(0, 0.05, size=blocks.shape), np.ones((4, 4))).ravel()
@@ -118,8 +118,8 @@ def two_models(rng, gap, side=32, F=8):
 
 def pair_of(rng, gap, **options):
     """What is compared of two models."""
-    tables, cells = two_models(rng, gap, **options)
-    return compare_models(tables, observations=cells).paired
+    tables, spots = two_models(rng, gap, **options)
+    return compare_models(tables, observations=spots).paired
 
 
 def test_paired_differences_cover_and_their_test_keeps_its_level():
@@ -149,8 +149,8 @@ def test_a_worse_model_is_found_by_difference_test_and_rank():
         assert ranking.ranks[0].best > 0.95
     rng = np.random.default_rng(3)
     twins, worst = two_models(rng, 0.0), two_models(rng, 0.4)
-    tables, cells = (own | {"worst": other["b"]} for own, other in zip(twins, worst, strict=True))
-    rankings = {own.measure: own for own in compare_models(tables, observations=cells).paired.rankings}
+    tables, spots = (own | {"worst": other["b"]} for own, other in zip(twins, worst, strict=True))
+    rankings = {own.measure: own for own in compare_models(tables, observations=spots).paired.rankings}
     for measure in ("alpha", "psa"):
         ranks = {rank.model: rank for rank in rankings[measure].ranks}
         assert ranks["worst"].rank == ranks["worst"].low == 3
@@ -189,8 +189,8 @@ def test_only_voxels_that_all_saw_twice_are_compared():
 
 
 def test_pairs_of_all_scenes_are_corrected_together_where_something_may_be_claimed():
-    tables, cells = two_models(np.random.default_rng(4), 0.05, side=16)
-    found = compare_models(tables, observations=cells)
+    tables, spots = two_models(np.random.default_rng(4), 0.05, side=16)
+    found = compare_models(tables, observations=spots)
     (p,) = (row.p_value for row in found.paired.differences if row.measure == found.paired.primary)
     unclaimed = tuple(dataclasses.replace(row, undecided="too few") for row in found.paired.differences)
     silent = dataclasses.replace(found, paired=dataclasses.replace(found.paired, differences=unclaimed))

@@ -16,8 +16,8 @@ SIDE = 20
 
 
 def sample_of(labels, centres, K=3):
-    """Labels (n, F) of cells of 0.1 m on a floor, 0.2 m apart, seen from cameras at (F, 3)."""
-    return spots_of(labels, K=K, index=grid(SIDE), centres=centres, cell_size=0.1)
+    """Labels (n, F) of spots on a floor, 0.2 m apart, seen from cameras at (F, 3)."""
+    return spots_of(labels, K=K, index=grid(SIDE), centres=centres, spacing=0.2)
 
 
 def flown(step, frames=8, height=10.0):

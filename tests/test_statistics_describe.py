@@ -43,7 +43,7 @@ def model(*arguments, **options):
     return log_of(said(*arguments, **options), index=grid(SIDE))
 
 
-def cells(*arguments, **options):
+def spots(*arguments, **options):
     """The same of spots."""
     return spots_of(said(*arguments, **options), index=grid(SIDE))
 
@@ -55,7 +55,7 @@ def ground_truth():
 @pytest.fixture(scope="module")
 def described():
     events = model(0.2, 0, place=0.2)
-    return analyse(MapSample.draw(events.table(), events, ground_truth()), cells(0.2, 0, place=0.2), name="sim")
+    return analyse(MapSample.draw(events.table(), events, ground_truth()), spots(0.2, 0, place=0.2), name="sim")
 
 
 def test_a_description_is_content_for_json_and_every_voxel_has_a_value(described, tmp_path):
@@ -98,7 +98,7 @@ def test_a_description_holds_what_the_functions_say(described):
     assert summary.agreement.voxel_alpha.value == pytest.approx(krippendorff_alpha(table))
     assert summary.headline.alpha.value == pytest.approx(krippendorff_alpha(table))  # each cell is alone in its voxel
     found = summary.spots
-    assert (found.spots, found.views, found.frames, found.cell_size) == (repeated.sum(), F, F, 0.125)
+    assert (found.spots, found.views, found.frames, found.spacing) == (repeated.sum(), F, F, 0.125)
     shares = table.evidence[:][repeated].sum(axis=0) / table.op[repeated].sum()
     assert found.chance == pytest.approx((shares**2).sum(), abs=0.001)
     assert (found.largest_class, found.largest_share) == (str(shares.argmax()), pytest.approx(shares.max()))
@@ -142,7 +142,7 @@ def values(section):
 
 def test_a_number_has_one_interval_wherever_it_stands():
     events = model(0.2, 0)
-    found = describe(events.table(), events, events.table(), spots=cells(0.2, 0))
+    found = describe(events.table(), events, events.table(), spots=spots(0.2, 0))
     assert found.agreement.psa == found.headline.psa
     assert found.correctness.accuracy == found.headline.accuracy
     assert found.correctness.quadrants.wrong_of_consistent == found.headline.wrong_of_consistent
@@ -152,7 +152,7 @@ def test_a_number_has_one_interval_wherever_it_stands():
 
 def test_a_table_alone_is_described_as_far_as_it_goes():
     events = model(0.2, 0)
-    observed = cells(0.2, 0)
+    observed = spots(0.2, 0)
     alone, logged = describe(events.table(), spots=observed), describe(events.table(), events, spots=observed)
     assert alone.correctness is alone.geometry is alone.drift.trend is None
     assert to_json(alone.drift.null) == to_json(logged.drift.null)
@@ -168,7 +168,7 @@ def test_without_cells_there_is_no_verdict_and_the_line_says_what_to_give():
     found = describe(events.table(), events)
     assert (found.spots, found.correlogram, found.verdict.level) == (None, None, "no verdict")
     assert math.isnan(found.headline.alpha.value)
-    assert "no cells were sampled; give the observations of a `Sampler`" in found.verdict.line
+    assert "no spots were sampled; give the observations of a `Sampler`" in found.verdict.line
 
 
 @pytest.mark.parametrize("labels", [np.zeros((0, 2), dtype=int), [[0, -1]], [[0, 0], [0, 0]]])
@@ -190,7 +190,7 @@ def test_events_of_another_map_and_one_model_are_refused():
 def test_models_beside_each_other():
     made = {"steady": (0.1, 5), "flickering": (0.4, 6), "stuck": (0.1, 7, 0.3)}
     logs = {name: model(*errors, seen=1.0) for name, errors in made.items()}
-    observed = {name: cells(*errors, seen=1.0) for name, errors in made.items()}
+    observed = {name: spots(*errors, seen=1.0) for name, errors in made.items()}
     tables = {name: log.table() for name, log in logs.items()}
     content = compare_models(tables, logs, ground_truth(), observations=observed)
     read = json.loads(json.dumps(to_json(content)))
@@ -205,13 +205,13 @@ def between(low, high):
     return Interval((low + high) / 2, low, high, scope=THIS_SCENE, frames=60)
 
 
-def judged(low, high, wrong=UNKNOWN, voxels=5000, **cells):
+def judged(low, high, wrong=UNKNOWN, voxels=5000, **spots):
     """By alpha in that interval, of observations as these are unless said otherwise."""
     numbers = HeadlineStatistics(*[between(low, high)] * 5)
     own = {
-        "cell_size": 0.125, "cells": 800, "cubes": 40, "frames": 60, "views": 60, "chance": 0.4,
+        "spacing": 0.125, "spots": 800, "cubes": 40, "frames": 60, "views": 60, "chance": 0.4,
         "largest_class": "grass", "largest_share": 0.5, "labelled": 1.0, "classes": (),
-    } | cells  # fmt: skip
+    } | spots  # fmt: skip
     return verdict(
         "net", headline=replace(numbers, wrong_of_consistent=wrong), spots=SpotAgreement(**own), voxels=voxels,
         share=0.5,

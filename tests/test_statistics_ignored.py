@@ -173,7 +173,7 @@ def test_models_without_common_frames_have_no_common_observations():
     apart = [dataclasses.replace(f, index=f.index + 10) for f in flight(4)]
     found = compared(a=list(flight(4)), b=apart)
     assert isinstance(found.observations, ComparedObservations)
-    assert (found.observations.cells, found.observations.observations) == (0, 0)
+    assert (found.observations.spots, found.observations.observations) == (0, 0)
     assert math.isnan(of_alpha(found).difference.value)
 
 

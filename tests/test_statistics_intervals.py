@@ -36,12 +36,12 @@ from semstab.statistics.variance import Spread
 def sums_from(labels, side, voxel_size=0.125):
     index = grid(side)[: len(labels)]
     log = log_of(labels, K=2, index=index, voxel_size=voxel_size)
-    return cluster_sums_of(log.table(), log, spots=spots_of(labels, 2, index, cell_size=voxel_size / 2))
+    return cluster_sums_of(log.table(), log, spots=spots_of(labels, 2, index, spacing=voxel_size / 2))
 
 
 def moved(sums, by):
     """The same map, elsewhere."""
-    further = {name: part and moved(part, by) for name, part in (("fine", sums.near), ("coarse", sums.far))}
+    further = {name: part and moved(part, by) for name, part in (("near", sums.near), ("far", sums.far))}
     return dataclasses.replace(sums, cell=sums.cell + np.array(by, np.int32), **further)
 
 
@@ -164,7 +164,7 @@ def test_every_number_has_an_interval_and_few_frames_say_so():
     without = sums.coarsened(sums.edge, 0)
     assert estimate(without, "voxel_alpha").scope == THESE_FRAMES
     assert estimate(without, "voxel_alpha").value == pytest.approx(value(sums, "voxel_alpha"))
-    assert estimate(without, "alpha") == few  # cells know their views though a map has no log
+    assert estimate(without, "alpha") == few  # spots know their views though a map has no log
     sums = simulated(frames=64, observations=6, quality="uneven")
     keys = ("psa", "vss", "entropy", "accuracy", "observation_accuracy", "wrong_of_consistent")
     for key, k in [*((key, None) for key in (*keys, "alpha")), ("alpha", 0), ("accuracy", 1)]:
@@ -174,7 +174,7 @@ def test_every_number_has_an_interval_and_few_frames_say_so():
 
 
 def test_numbers_asked_together_have_the_intervals_that_each_has_alone():
-    """Cells of one are those of another without some; the same map elsewhere has nothing from before at hand."""
+    """Spots of one are those of another without some; the same map elsewhere has nothing from before at hand."""
     labels = np.random.default_rng(0).integers(0, 2, (24 * 24, 4))
     labels[: 24 * 16] = 0
     labels[: 24 * 8, 2:] = -1  # seen twice

@@ -33,10 +33,10 @@ def fused(classes=("road", "grass", "car", "person"), **settings):
 
 def test_all_disagreement_is_where_things_move() -> None:
     result = fused()
-    cells = result.record().statistics.spots
-    assert cells.moving.classes == ("car", "person")
-    assert cells.moving.disagreement == pytest.approx(1, abs=0.02)
-    assert cells.moving.alpha == pytest.approx(1, abs=0.01)
+    spots = result.record().statistics.spots
+    assert spots.moving.classes == ("car", "person")
+    assert spots.moving.disagreement == pytest.approx(1, abs=0.02)
+    assert spots.moving.alpha == pytest.approx(1, abs=0.01)
     assert result.record().statistics.headline.alpha.value < 0.9
     (line,) = (text for text in warnings(result) if "move" in text)
     assert shlex.split(line[line.index("--set") :]) == ["--set", "exclude.classes=[car, person]"]
@@ -63,16 +63,16 @@ def test_nothing_is_said_where_names_are_of_things_that_stay() -> None:
 
 def test_nothing_is_said_where_most_disagreement_is_elsewhere() -> None:
     result = fused(("car", "grass", "road", "kerb"))
-    cells = result.record().statistics.spots
-    assert cells.moving is None or cells.moving.disagreement < 0.1
+    spots = result.record().statistics.spots
+    assert spots.moving is None or spots.moving.disagreement < 0.1
 
 
 def test_nothing_is_said_where_alpha_leaves_no_disagreement(monkeypatch) -> None:
-    """Alpha of cells without a size may come out as 1 where there are few, though their labels differ."""
+    """Alpha of spots without a size may come out as 1 where there are few, though their labels differ."""
     monkeypatch.setattr(spot_agreement, "value", lambda sums, key: 1.2)
     assert fused().record().statistics.spots.moving is None
 
 
 def test_it_is_kept_with_the_result() -> None:
     statistics = fused().record().statistics
-    assert from_json(MapStatistics, to_json(statistics), "there").cells.moving == statistics.spots.moving
+    assert from_json(MapStatistics, to_json(statistics), "there").spots.moving == statistics.spots.moving

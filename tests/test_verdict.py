@@ -17,12 +17,12 @@ from semstab.statistics.intervals import probability_above
 from semstab.statistics.silence import silence
 from semstab.statistics.verdict import holds_all_levels, level_probabilities, verdict, why_undecided
 
-CELLS = SpotAgreement(0.1, 1000, 100, 20, 20, 0.5, "road", 0.6, 1.0, (), None, 1.0, 1.0)
+SPOTS = SpotAgreement(0.1, 1000, 100, 20, 20, 0.5, "road", 0.6, 1.0, (), None, 1.0, 1.0)
 
 
-def judged(alpha, **cells):
+def judged(alpha, **spots):
     headline = HeadlineStatistics(Interval(*alpha, degrees=20), UNKNOWN, UNKNOWN, UNKNOWN, UNKNOWN)
-    return verdict("m", headline=headline, spots=dataclasses.replace(CELLS, **cells), voxels=1000, share=0.5)
+    return verdict("m", headline=headline, spots=dataclasses.replace(SPOTS, **spots), voxels=1000, share=0.5)
 
 
 @pytest.mark.parametrize(("alpha", "level"), [
@@ -86,11 +86,11 @@ def test_a_model_that_leaves_out_its_errors_is_no_better_of_all():
     """It leaves out 60 % of its errors: alpha rises, and what it left out is said."""
     frames, (silent, _) = list(flight(8, flicker=0.3, patch=10, seed=1)), errs_silently()
     open_, closed = (describe(fused(own, 0.2).table(), spots=sampled(own)) for own in (frames, silent))
-    assert open_.cells.pixels_labelled == open_.cells.pairs_labelled == 1
+    assert open_.spots.pixels_labelled == open_.spots.pairs_labelled == 1
     assert closed.headline.alpha.value > open_.headline.alpha.value + 0.05
-    of_all = closed.headline.alpha.value * closed.cells.pairs_labelled
+    of_all = closed.headline.alpha.value * closed.spots.pairs_labelled
     assert abs(of_all - open_.headline.alpha.value) < 0.6 * (closed.headline.alpha.value - open_.headline.alpha.value)
-    assert 0.7 < closed.cells.pairs_labelled < closed.cells.pixels_labelled < 0.95
+    assert 0.7 < closed.spots.pairs_labelled < closed.spots.pixels_labelled < 0.95
     assert closed.verdict.of_all not in (None, closed.verdict.level)
     assert "that it labels" in closed.verdict.line
 

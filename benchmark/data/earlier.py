@@ -20,12 +20,6 @@ KEYS: Mapping[str, str] = {
 }  # fmt: skip
 """Keys of schema 2, and what they are called now."""
 
-SUMS: Mapping[str, str] = {
-    "looks": "observed", "looks_right": "observed_right", "stable": "consistent", "stable_wrong": "consistent_wrong",
-    "judged": "calibrated",
-}  # fmt: skip
-"""Names of sums in files without spots, and what they are called now."""
-
 GONE = ("beyond_coin", "fusion_rules", "reach", "correlogram", "alpha_between", "each_place")
 """Keys of schema 2 that are not read any more: its looks were at voxels, and alpha is of spots."""
 

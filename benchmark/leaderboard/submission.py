@@ -29,7 +29,7 @@ from semstab.engine.folder import load_result
 from semstab.errors import ConfigError, DataError
 from semstab.leaderboard.definition import Benchmark, load_benchmark
 from semstab.predict.dataset import NAME as PREDICTED
-from semstab.statistics.cluster_sums import chance_of, value
+from semstab.statistics.cluster_sums import ClusterSums, chance_of, functional, value
 from semstab.statistics.verdict import verdict
 
 SUFFIX = ".semstab"
@@ -216,20 +216,25 @@ def _about(benchmark: Benchmark, result: Result, config: Config, handle: RunHand
     )
 
 
+def _within_range(sums: ClusterSums, key: str, k: int | None = None) -> float:
+    """Return a number of sums; alpha, which is extrapolated, is stated as 1 where it comes out higher."""
+    return min(value(sums, key, k), functional(key, k).high)
+
+
 def _require_consistent(path: Path, model: str, scene: str, entry: Entry) -> None:
     """Raise DataError where a stated number does not follow from the sums, or the level not from the numbers."""
     statistics, sums = entry.summary.statistics, entry.sums
     assert statistics is not None
     own, spots, repeated = statistics.headline, statistics.spots, statistics.repeated
     stated: dict[str, tuple[float, float]] = {
-        key: (interval.value, value(sums, key))
+        key: (interval.value, _within_range(sums, key))
         for key, interval in (("alpha", own.alpha), ("psa", own.psa), *(_of_truth(own) if sums.truth else ()))
         if not interval.undecided
     }
     if spots is not None and sums.near is not None:
         stated["chance"] = spots.chance, chance_of(sums.near)
         for row in spots.classes:
-            stated[f"alpha of {row.name}"] = row.alpha.value, value(sums, "alpha", entry.classes.index(row.name))
+            stated[f"alpha of {row.name}"] = row.alpha.value, _within_range(sums, "alpha", entry.classes.index(row.name))
     for key, (number, follows) in stated.items():
         if not math.isclose(number, follows, abs_tol=ALIKE) and not (math.isnan(number) and math.isnan(follows)):
             raise DataError(f"{path}: {scene}: {key} is stated as {number:.6g}, but its sums give {follows:.6g}")
