@@ -250,8 +250,9 @@ def silence_notes(rule: Rule, pairs: Sequence[Pair]) -> list[str]:
     if not bounds_alpha(rule):
         return []
     return [
-        f"{new.summary.unit.scene}: the run gives no label in {1 - new.pairs.share:.1%} of the pairs of views, which count"
-        f" as disagreeing: alpha is {value_of(rule, new):.3f}, and {value(new.sums, ALPHA.key):.3f} of what it labels"
+        f"{new.summary.unit.scene}: the run gives no label in {1 - new.pairs.share:.1%} of the pairs of views, which"
+        f" count as disagreeing: alpha is {value_of(rule, new):.3f}, and {value(new.sums, ALPHA.key):.3f} of what it"
+        " labels"
         for new, _ in pairs
         if 1 - new.pairs.share >= LEAST_LEFT_OUT
     ]

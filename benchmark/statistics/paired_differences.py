@@ -244,8 +244,8 @@ class CommonObservations:
 
     Attributes:
         shared: For each model the answers for spots and views to which all models gave a label.
-        ignoring: For each model the answers that any model gave, with one more class, the last, for those that the model
-            left without a label.
+        ignoring: For each model the answers that any model gave, with one more class, the last, for those that the
+            model left without a label.
         missing: Share of these answers that the model left without a label.
     """
 

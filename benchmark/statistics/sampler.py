@@ -63,8 +63,8 @@ is lost by this, whatever the labels; with a wider tolerance more answers come f
 first frame, which has nothing to differ from, the noise within it counts."""
 
 SURE, SMOOTH = 4.0, 0.0005
-"""Standard deviations of the noise within a frame by which pixels of one surface differ at most; and the noise, relative,
-from which on depth is that of planes through the pixels around."""
+"""Standard deviations of the noise within a frame by which pixels of one surface differ at most; and the noise,
+relative, from which on depth comes from planes through the pixels around."""
 
 GATE, ENOUGH = 0.05, 50
 """That standard deviation is taken of differences up to this, relative, if a frame has at least so many."""
@@ -102,7 +102,8 @@ class Sparse:
         camera: Focal lengths and principal point in pixels; of a scan, pixels in a radian.
         around: Whether columns close a circle.
         reach: Pixels to each side in which points around a place are looked for.
-        spacing: Of the points, in pixels of an image, or in distances of a scan's points; pixels: in pixels of the grid.
+        spacing: Of the points, in pixels of an image, or in distances of a scan's points.
+        pixels: Of the points, in pixels of the grid.
         labels: (n,) uint16 labels of the points; None if the image has labels in all pixels.
     """
 
@@ -177,7 +178,7 @@ class Sampler:
             self._take(view, *self._answers_of_points(frame, sparse, T, seed))
 
     def _view_of(self, frame: Frame, depth: float, sparse: Sparse | None) -> int | None:
-        """Return the view of a frame of this median depth, which may be a new one; None if the frame repeats another."""
+        """Return the view of a frame with this median depth, a new one or not; None if the frame repeats another."""
         small = frame.predicted[:: max(1, -(-frame.shape[0] // SIDE)), :: max(1, -(-frame.shape[1] // SIDE))]
         digest = hashlib.blake2b(np.ascontiguousarray(small).tobytes(), digest_size=16).digest()
         same = self._seen.get(digest)

@@ -224,13 +224,13 @@ def ignored_table(observations: Mapping[str, ComparedObservations]) -> Table:
         Column("missing_percent", "left out (%)", 1),
         Column("psa_low", "at least", 3, over="Agreement with these"),
         Column("psa_high", "at most", 3, over="Agreement with these"),
-        Column("alpha_ignored", "Alpha, left out as by chance", 3),
+        Column("alpha_ignored", "Alpha, left out disagrees", 3),
         Column("order", "Order depends on it"),
     )
     caption = (
         "A pixel is left out if a model gives it no label where another model gives one. The agreement of two views in"
         " a spot has two bounds: these pixels agree never, or always (Manski). For alpha, pixels that are left out"
-        " agree as by chance. The order depends on them if that alpha, or the agreement within its bounds, would change"
+        " disagree. The order depends on them if that alpha, or the agreement within its bounds, would change"
         " the order of the models."
     )
     groups = tuple(Group(scene, _ignored_rows(comparison)) for scene, comparison in observations.items())

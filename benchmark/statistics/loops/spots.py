@@ -33,7 +33,7 @@ STEEPEST = 32.0
 """Largest area that a pixel shows, in those that it would show if the surface faced it."""
 
 SLACK = 0.25
-"""Share of the slope of inverse depth by which a pixel next to another on the same surface may differ from its plane."""
+"""Share of the slope of inverse depth by which two pixels next to each other on one surface may differ from a plane."""
 
 AROUND, LEAST_AROUND = 2, 6.0
 """Pixels to each side through which a plane is laid where a spot is found, and the least number of them."""
@@ -43,8 +43,8 @@ EDGE, JUMP = 4.0, 0.01
 inverse depth, is an edge."""
 
 OFF = 0.35
-"""A pixel answers for a spot if its centre is at most so many pixels away from it along each axis: a pixel at a border of
-classes tells the class at its centre. Every second view is lost by this, whatever the labels."""
+"""A pixel answers for a spot if its centre is at most this far from it along each axis, in pixels: a pixel at a border
+of classes tells the class at its centre. Every second view is lost by this, whatever the labels."""
 
 ON_A_PLANE = 0.03
 """Sparse points lie on a plane if it leaves at most this over of their inverse depth, relative."""
@@ -222,8 +222,8 @@ def free(px, py, pz, edge, share, low, table, taken):
 def area(here, along_x, along_y, x, y, fx, fy):
     """Return the area of the surface that a pixel at ray (x, y, 1) shows, m^2, from inverse depth and its slopes.
 
-    Inverse depth of a plane n . X = 1 is n . (x, y, 1). So n follows from the slopes, and the area is z^3 |n| / (fx fy);
-    at most STEEPEST times that of a surface that faces the camera.
+    Inverse depth of a plane n . X = 1 is n . (x, y, 1). So n follows from the slopes, and the area is
+    z^3 |n| / (fx fy), at most STEEPEST times that of a surface that faces the camera.
     """
     nx, ny = along_x * fx, along_y * fy
     nz = here - nx * x - ny * y
@@ -443,7 +443,7 @@ def mean_area(depth, camera, stride, span):
 
 @serial
 def directions(points, unit, u, v, w):
-    """Write direction (azimuth, elevation) in units of radians, and inverse range, of points (n, 3); 0 of invalid ones."""
+    """Write azimuth and elevation, in `unit` radians, and inverse range of points (n, 3); 0 of invalid points."""
     for i in range(len(points)):
         x, y, z = np.float64(points[i, 0]), np.float64(points[i, 1]), np.float64(points[i, 2])
         distance = np.sqrt(x * x + y * y + z * z)
@@ -537,8 +537,8 @@ def new_in_points(
 ):
     """Add spots where points show a coarse cell without one; return how many.
 
-    Places are looked at evenly over the surface, as in `new_in_image`, at `most` of the points: on the plane through the points around a point,
-    up to half of `spacing` (pixels) away from it; at the point itself if there is no plane.
+    Places are looked at evenly over the surface, as in `new_in_image`, at `most` of the points: on the plane through
+    the points around a point, up to half of `spacing` (pixels) away from it; at the point itself without a plane.
     """
     total, n, at = len(w), 0, np.int64(seed % len(w))
     looked = min(total, most)
@@ -599,7 +599,7 @@ def back(x, y, w, camera, around):
 def project_sparse(point, grid, u, v, w, camera, around, reach, dense, T, spot, x, y, error, room, nearest):
     """Find the spots that points around show; return how many. As `project`, and `nearest` takes the nearest point.
 
-    A plane through the points around tells the depth there; where they lie on no plane, as at an edge, the nearest point
+    A plane through the points around tells the depth there; if they lie on no plane, as at an edge, the nearest point
     does, if it is the next pixel. `room` is the slope of the plane in a pixel, relative.
     """
     rows, columns = grid.shape
