@@ -321,8 +321,8 @@ def rows_of(condition: Condition, nets: Sequence[Network], folder: Path) -> list
 def _row(condition: Condition, network: Network, record: Record) -> Row:
     summary, statistics = record.summary, record.statistics
     assert statistics is not None
-    assert statistics.cells is not None
-    headline, cells = statistics.headline, statistics.cells
+    assert statistics.spots is not None
+    headline, cells = statistics.headline, statistics.spots
     return Row(
         condition=condition.name, scene=condition.scene, kind=condition.kind, stride=condition.stride,
         voxel_size=condition.voxel_size, frames=summary.frames,
