@@ -41,7 +41,7 @@ Numbers. results/real-networks.csv has a row for each network in each condition:
     effective_classes      1 / probability that two observations from anywhere agree (Hill number of order 2)
     largest_class, _share  the class with most observations
     voxels, mean_op, recurrent_share     of the map; recurrent: OP >= 3
-    cells, views           what alpha rests on
+    spots, views           what alpha rests on
 results/real-networks.json has versions, commands, digests (SHA-256) of weights and sequences, and for each condition
 Spearman's rank correlation of a measure with the published mIoU, and with the effective number of classes, over
 `networks` networks. Its 95 % interval comes from 9,999 bootstrap samples of networks (scipy.stats.bootstrap, percentile
@@ -172,7 +172,7 @@ class Row:
     voxels: int
     mean_op: float
     recurrent_share: float
-    cells: int
+    spots: int
     views: int
 
 
@@ -321,8 +321,8 @@ def rows_of(condition: Condition, nets: Sequence[Network], folder: Path) -> list
 def _row(condition: Condition, network: Network, record: Record) -> Row:
     summary, statistics = record.summary, record.statistics
     assert statistics is not None
-    assert statistics.cells is not None
-    headline, cells = statistics.headline, statistics.cells
+    assert statistics.spots is not None
+    headline, spots = statistics.headline, statistics.spots
     return Row(
         condition=condition.name, scene=condition.scene, kind=condition.kind, stride=condition.stride,
         voxel_size=condition.voxel_size, frames=summary.frames,
@@ -333,9 +333,9 @@ def _row(condition: Condition, network: Network, record: Record) -> Row:
         agree=headline.psa.value, agree_low=headline.psa.low, agree_high=headline.psa.high,
         within=statistics.agreement.within.value, between=statistics.agreement.between.value,
         flicker=summary.flicker_percent, compensated=record.image_space.compensated_flicker_percent,
-        effective_classes=cells.effective_classes, largest_class=cells.largest_class,
-        largest_share=cells.largest_share, voxels=summary.table.voxels, mean_op=summary.table.mean_op,
-        recurrent_share=summary.table.recurrent.share, cells=cells.cells, views=cells.views,
+        effective_classes=spots.effective_classes, largest_class=spots.largest_class,
+        largest_share=spots.largest_share, voxels=summary.table.voxels, mean_op=summary.table.mean_op,
+        recurrent_share=summary.table.recurrent.share, spots=spots.spots, views=spots.views,
     )  # fmt: skip
 
 
