@@ -24,7 +24,7 @@ from semstab.statistics.cluster_sums import ClusterSums
 from semstab.statistics.correctness import join_truth
 from semstab.statistics.drift import expected_sbd
 from semstab.statistics.model_comparison import Region, Regions, common_voxels, coverage_of, held, share_of
-from semstab.statistics.observations import SpotObservations
+from semstab.statistics.observations import SpotObservations, numbered_as_one_flight
 from semstab.statistics.paired_differences import SharedObservations, compared_observations
 
 NEAR = 1e-3
@@ -194,7 +194,7 @@ def _with_observations(common: Common, names: Sequence[str], records: Sequence[R
 def _observations_of_the_same_frames(records: Sequence[Record]) -> list[SpotObservations]:
     """Return the sampled observations of runs; none where one run has none, or other frames."""
     files = [file for record in records if (file := record.observations_file) is not None and file.is_file()]
-    samples = [SpotObservations.load(file) for file in files]
+    samples = numbered_as_one_flight([SpotObservations.load(file) for file in files]) if files else []
     return samples if len(samples) == len(records) and _same_frames(samples) else []
 
 

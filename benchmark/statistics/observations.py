@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import itertools
 import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -298,6 +299,36 @@ def cells_of(point: Float64, edge: float) -> Int64:
     from semstab.statistics.loops.spots import PHASE
 
     return np.floor(point / edge + PHASE).astype(np.int64)
+
+
+def numbered_as_one_flight(samples: Sequence[SpotObservations]) -> list[SpotObservations]:
+    """Return samples of one flight with its frames numbered as in the first one.
+
+    Programs that give some frames of a flight number them from 0 on. A frame of another number is known by the place
+    and the time at which it was taken, if no two views of the first sample have the same ones.
+    """
+    first, *others = samples
+    number = dict(zip(_taken(first.views), first.views.frame.tolist(), strict=True))
+    if len(number) < len(first.views):
+        return list(samples)
+    same = [first]
+    for other in others:
+        keys = _taken(other.views)
+        found = [number.get(key) for key in keys]
+        known = [frame for frame in found if frame is not None]
+        if len(set(known)) < len(known) or not known:
+            same.append(other)
+            continue
+        further = itertools.count(max(number.values(), default=-1) + 1)
+        frame = np.array([next(further) if own is None else own for own in found], np.int64)
+        same.append(dataclasses.replace(other, views=dataclasses.replace(other.views, frame=frame)))
+    return same
+
+
+def _taken(views: Views) -> list[tuple[float, ...]]:
+    """Return the place and the time of each view; no time if it is unknown."""
+    time = np.nan_to_num(views.timestamp, nan=-1.0)
+    return [tuple(row) for row in np.column_stack([views.centre.round(6), time]).tolist()]
 
 
 def same_spots(samples: Sequence[SpotObservations]) -> list[SpotObservations]:

@@ -32,17 +32,21 @@ MOST_SPOTS = 1 << 16
 MOST_NEW = 1 << 15
 """Most spots that one frame adds."""
 
-LOOKED_AT = 16_000
+LOOKED_AT = 6_000
 """Blocks of pixels, about, or points of a scan, in which new spots are looked for."""
+
+LEAST_PART, ALL_NEW = 0.25, 20.0
+"""Least part of the blocks in which new spots are looked for once few are new; and the share of new ones in all spots,
+1 / ALL_NEW, from which on all blocks are looked at."""
 
 APART = 0.7
 """Edge of a coarse cell, by the mean area that a block of pixels shows, or up to twice as much."""
 
-SIDE = 640
+SIDE = 320
 """Most pixels on a side of the labels by which frames that repeat another are found."""
 
-FEW = 4
-"""The median depth is taken of every FEW-th pixel of each axis."""
+FEW = 20_000
+"""Pixels, about, of which the median depth is taken; every n-th row is looked at to see whether depth is sparse."""
 
 REACH = 1 << 20
 """Coarse cells from the first camera within which there are spots."""
@@ -151,7 +155,7 @@ class Sampler:
         self._clear()
 
     def _clear(self) -> None:
-        self._share, self._answers, self._spots = 1 << 32, 0, 0
+        self._share, self._answers, self._spots, self._part = 1 << 32, 0, 0, 1.0
         self._point, self._hash = np.empty((1 << 12, 3)), np.empty(1 << 12, np.uint32)
         self._table = np.full(1 << 14, -1, np.int64)
         self._columns = {name: np.empty(1 << 14, dtype) for name, dtype in TYPES.items()}
@@ -159,7 +163,7 @@ class Sampler:
     def add(self, frame: Frame) -> None:
         """Add the answers of a frame."""
         self._frames += 1
-        few = frame.depth[::FEW, ::FEW]
+        few = frame.depth[:: _few(frame.shape), :: _few(frame.shape)]
         few = few[(few > 0) & (few < np.inf)]
         if not len(few):
             few = frame.depth[(frame.depth > 0) & (frame.depth < np.inf)]
@@ -206,7 +210,8 @@ class Sampler:
 
         (H, W), stride = frame.shape, _stride(frame.shape)
         blocks = -(-H // stride) * -(-W // stride)
-        where = SURE * self._noise, self._edge, self._share, self._low, stride, _factor(blocks), seed
+        looked = max(1, round(self._part * blocks))
+        where = SURE * self._noise, self._edge, self._share, self._low, stride, _factor(blocks), looked, seed
         self._new(lambda *room: new_in_image(fixed(frame.depth), _camera(frame), T, *where, *room))
 
     def _find_in_points(self, sparse: Sparse, T: Float64, seed: int) -> None:
@@ -225,7 +230,9 @@ class Sampler:
             room = max(2 * len(self._hash), self._spots + MOST_NEW)
             self._point, self._hash = _longer(self._point, room), _longer(self._hash, room)
         end = self._spots + MOST_NEW
-        self._spots += find(self._table, self._point[self._spots : end], self._hash[self._spots : end])
+        new = find(self._table, self._point[self._spots : end], self._hash[self._spots : end])
+        self._spots += new
+        self._part = min(max(ALL_NEW * new / max(self._spots, 1), LEAST_PART), 1.0)
 
     def _rebuilt(self, size: int) -> Int64:
         """Return a table of the coarse cells of all spots."""
@@ -372,6 +379,11 @@ def _labels(frame: Frame) -> tuple[Any, Any]:
     return fixed(frame.predicted), fixed(np.zeros((0, 0), np.bool_) if frame.unlabelled is None else frame.unlabelled)
 
 
+def _few(shape: tuple[int, int]) -> int:
+    """Return a step along each axis that leaves about FEW pixels."""
+    return max(1, round(math.sqrt(shape[0] * shape[1] / FEW)))
+
+
 def _stride(shape: tuple[int, int]) -> int:
     """Return the distance of the pixels in which new spots are looked for."""
     return max(1, round(math.sqrt(shape[0] * shape[1] / LOOKED_AT)))
@@ -424,9 +436,13 @@ def _sparse(frame: Frame, K: int) -> Sparse | None:
         unlabelled = np.False_ if frame.unlabelled is None else frame.unlabelled.reshape(-1)
         labels = np.where(labels < K, labels, np.where(unlabelled, K, K + 1)).astype(np.uint16)
         return Sparse(grid, u, v, w, (1 / unit, 1 / unit, 0.0, 0.0), True, 5, 1.0, 2.0, labels)
-    valid = (frame.depth > 0) & (frame.depth < np.inf)
+    rows = frame.depth[:: _few(frame.shape)]
+    valid = (rows > 0) & (rows < np.inf)
     n, pairs = int(np.count_nonzero(valid)), int(np.count_nonzero(valid[:, 1:] & valid[:, :-1]))
-    if not 0 < n < SPARSE * valid.size or pairs >= ALONE * n:
+    if not n < SPARSE * valid.size or pairs >= ALONE * n > 0:
+        return None
+    valid = (frame.depth > 0) & (frame.depth < np.inf)
+    if not (n := int(np.count_nonzero(valid))):
         return None
     row, column = np.nonzero(valid)
     spacing = math.sqrt((np.ptp(row) + 1) * (np.ptp(column) + 1) / n)

@@ -238,18 +238,20 @@ def number_of(expected, chance):
 
 
 @serial
-def new_in_image(depth, camera, T, allowed, edge, share, low, stride, factor, seed, table, point, hashed):
+def new_in_image(depth, camera, T, allowed, edge, share, low, stride, factor, looked, seed, table, point, hashed):
     """Add spots where an image shows a coarse cell without one; return how many.
 
     Places are looked at evenly over the surface, PLACES in the area of a coarse cell's face: in blocks of stride x
-    stride pixels, in an order that jumps over the image by `factor`, as many as the area that a pixel shows asks for.
+    stride pixels, of which `looked` are taken, in an order that jumps over the image by `factor`, as many as the area
+    that a pixel shows asks for.
     A place lies anywhere in its pixel, so that the view that finds a spot meets it as any other view does.
     """
     H, W = depth.shape
     fx, fy, cx, cy = camera
     columns = (W + stride - 1) // stride
-    total, n, at = (H + stride - 1) // stride * columns, 0, np.int64(0)
-    for _ in range(total):
+    total, n = (H + stride - 1) // stride * columns, 0
+    at = np.int64(seed % total)
+    for _ in range(looked):
         at += factor
         if at >= total:
             at -= total
