@@ -231,7 +231,7 @@ def again(frames, times):
     lambda frames: again(frames, 2), lambda frames: again(frames, 4), lambda frames: numbered(frames * 2),
 ], ids=["hovers twice", "hovers four times", "flies again"])  # fmt: skip
 def test_a_frame_that_says_the_same_again_is_no_further_view(flown):
-    """The frames without those that repeat another have the numbers that they have with them: by these spots are drawn."""
+    """The frames without those that repeat another keep their indices, by which the places of spots are drawn."""
     frames = list(flight(16, flicker=0.2, patch=5))
     every = flown(frames)
     firsts = [f for k, f in enumerate(every) if not any((f.T_wc == before.T_wc).all() for before in every[:k])]

@@ -58,7 +58,7 @@ def _value(value: Any) -> Any:
         named["voxel_alpha"] = named.pop("alpha")
     if isinstance(named.get("blocks"), Mapping):  # statistics
         named["cubes"] = named.pop("blocks").get("count", 0)
-        named |= {"cells": None, "correlogram": None}
+        named |= {"spots": None, "correlogram": None}
         named["headline"] = {key: each for key, each in named["headline"].items() if key != "voxel_alpha"}
         named["headline"]["alpha"] = UNKNOWN
     if {"level", "line"} == named.keys():  # a verdict

@@ -234,7 +234,10 @@ def _require_consistent(path: Path, model: str, scene: str, entry: Entry) -> Non
     if spots is not None and sums.near is not None:
         stated["chance"] = spots.chance, chance_of(sums.near)
         for row in spots.classes:
-            stated[f"alpha of {row.name}"] = row.alpha.value, _within_range(sums, "alpha", entry.classes.index(row.name))
+            stated[f"alpha of {row.name}"] = (
+                row.alpha.value,
+                _within_range(sums, "alpha", entry.classes.index(row.name)),
+            )
     for key, (number, follows) in stated.items():
         if not math.isclose(number, follows, abs_tol=ALIKE) and not (math.isnan(number) and math.isnan(follows)):
             raise DataError(f"{path}: {scene}: {key} is stated as {number:.6g}, but its sums give {follows:.6g}")
