@@ -124,8 +124,8 @@ def named(made: Made, bad: bool, rng: np.random.Generator) -> tuple[set[int], se
             planted.add(frame.index)
             labels = in_blocks(labels, made.K, rng)
         sampler.add(dataclasses.replace(frame, labels=labels))
-    cells = sampler.sample()
-    found = outlying_frames(lone_disagreement(cells), len(cells.views))
+    spots = sampler.sample()
+    found = outlying_frames(lone_disagreement(spots), len(spots.views))
     return planted, {each.frame for each in found.frames}
 
 

@@ -3,8 +3,7 @@
     python simulations/ranges.py SEQUENCES [--voxel-size 0.2]
 
 SEQUENCES is a folder in SemanticKITTI's layout with ground truth. Labels are the true ones; of the points at range r a
-share of (r - 10 m) / 40 m, at most 80 %, is drawn anew from nine classes. Printed are alpha of fine cells, alpha
-extrapolated to cells without a size, as it is for images, and the strata.
+share of (r - 10 m) / 40 m, at most 80 %, is drawn at random from nine classes. Alpha and the strata are printed.
 """
 
 from __future__ import annotations
@@ -41,10 +40,8 @@ def main() -> None:
         made = dataclasses.replace(frame, labels=np.where(wrong & (labels < K), drawn, labels), mask=None)
         backend.integrate(made)
         sampler.add(made)
-    cells, table = sampler.sample(), backend.table()
-    found = describe(table, backend.events(), spots=cells)
-    images = describe(table, backend.events(), spots=dataclasses.replace(cells, sparse=False))
-    print(f"alpha {found.headline.alpha.text()}, extrapolated {images.headline.alpha.text()}")
+    found = describe(backend.table(), backend.events(), spots=sampler.sample())
+    print(f"alpha {found.headline.alpha.text()}")
     assert found.ranges is not None
     print(found.ranges.text)
     print("| range m | observations % | alpha |\n|---|---:|---:|")

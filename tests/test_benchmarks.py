@@ -24,6 +24,7 @@ SMALL = {
     "end_to_end": ("96x54", "--size 96x54 --frames 2 --runs 1 --noise 0 --voxel-size 1 --backend numpy --depth png"),
     "gpu": ("96x54", "--device CPU:0 --sizes 96x54 --classes 3 --voxels 9000 --rounds 2 --copied-megabytes 1 "
             "--cpu-backends numba"),
+    "spots": ("96x54, 0.3 %", "--sizes 96x54 --rounds 1 --warm 2 --frames 3"),
     "statistics": ("all statistics", "--frames 4 --size 64x48 --voxel-size 0.2"),
 }  # fmt: skip
 

@@ -26,7 +26,7 @@ EXACT = ("recurrent_vss", "psa", "recurrent_share")
 """What is the same however frames are shared out among processes."""
 
 ABOUT = 0.05
-"""Alpha differs by less: a process asks its own frames at spots that they found, not at those of others, so that alpha is
+"""Alpha differs by less: a process asks its own frames at spots that they found, not those of others, so that alpha is
 of other spots, and of the pairs of views within each process alone."""
 
 

@@ -231,7 +231,7 @@ def again(frames, times):
     lambda frames: again(frames, 2), lambda frames: again(frames, 4), lambda frames: numbered(frames * 2),
 ], ids=["hovers twice", "hovers four times", "flies again"])  # fmt: skip
 def test_a_frame_that_says_the_same_again_is_no_further_view(flown):
-    """The frames without those that repeat another keep their indices, by which the places of spots are drawn."""
+    """The frames without those that repeat another keep their numbers, by which spots are drawn."""
     frames = list(flight(16, flicker=0.2, patch=5))
     every = flown(frames)
     firsts = [f for k, f in enumerate(every) if not any((f.T_wc == before.T_wc).all() for before in every[:k])]
@@ -625,6 +625,7 @@ def test_a_less_dense_sample_meets_a_denser_one():
     assert thinned.share < spots.share
     both = common_observations([spots, thinned])
     assert both.missing == (0, 0)
+    # Fails as long as the side of the second answers is drawn by the number of a spot in its sample, not by its cell
     assert [entries(own) for own in both.shared] == [entries(thinned)] * 2
 
 
@@ -633,6 +634,7 @@ def test_samples_that_begin_elsewhere_meet():
     spots, back = sampled(frames), sampled(frames[::-1])
     both = common_observations([spots, back])
     assert both.missing == (0, 0)
+    # Fails as long as the side of the second answers is drawn by the number of a spot in its sample, not by its cell
     assert entries(both.shared[0]) == entries(both.shared[1]) == entries(spots)
 
 

@@ -100,7 +100,7 @@ def stripes(voxel_size=0.3, **options):
 
 
 def lever_by_hand(spots):
-    """How far a parabola through disagreement at three distances falls to 0, in falls from the second to the first.
+    """How far the parabola through disagreement at three distances falls to 0, in falls from the second to the first.
 
     The third answers are two pixels away, of which the second ones are one.
     """
@@ -207,7 +207,8 @@ def test_a_file_is_read_by_the_names_of_its_columns(tmp_path):
     "change",
     [
         {"schema": 9}, {"schema": 5}, {"kind": "InfluenceSums"}, {"step": [1, 1]}, {"step": [1, 3, 1]},
-        {"fused": [10**400, 8, 8]}, {"step": [2**40, 2**40, 2**40]},
+        {"fused": [10**400, 8, 8]},
+        {"step": [2**40, 2**40, 2**40]},
     ],
 )  # fmt: skip
 def test_a_file_of_another_kind_is_refused(tmp_path, change):

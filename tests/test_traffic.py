@@ -32,8 +32,10 @@ def fused(classes=("road", "grass", "car", "person"), **settings):
 
 
 def test_all_disagreement_is_where_things_move() -> None:
-    """But for 7 % of it, as alpha of the rest is .98: of the spots at the edges of cars those remain that most views call
-    road or grass. Their disagreement is not quite extrapolated to 0.
+    """But for 7 % of it, as alpha of the rest is .98.
+
+    Of the spots at the edges of cars those remain that most views call road or grass: their disagreement is not quite
+    extrapolated to 0.
     """
     result = fused()
     spots = result.record().statistics.spots

@@ -11,7 +11,7 @@ from simulated_events import grid, log_of, spots_of
 from striped_floor import flight, fused, sampled
 from test_statistics_ignored import errs_silently, without
 
-from semstab.data.statistics import UNKNOWN, HeadlineStatistics, Interval, SpotAgreement
+from semstab.data.statistics import UNKNOWN, HeadlineStatistics, Interval, LabelledPairs, SpotAgreement
 from semstab.statistics import describe
 from semstab.statistics.intervals import probability_above
 from semstab.statistics.silence import silence
@@ -50,11 +50,11 @@ def test_the_reason_why_nothing_is_decided_does_not_contradict_itself():
 @pytest.mark.parametrize(("alpha", "share", "level", "of_all"), [
     ((0.82, 0.81, 0.83), 1.0, "stable", None),
     ((0.82, 0.81, 0.83), math.nan, "stable", None),
-    ((0.82, 0.81, 0.83), 0.85, "stable", "usable"),
+    ((0.82, 0.81, 0.83), 0.93, "stable", "usable"),
     ((0.82, 0.81, 0.83), 0.5, "stable", "unstable"),
     ((0.82, 0.81, 0.83), 0.0, "stable", "unstable"),
-    ((0.95, 0.94, 0.96), 0.9, "stable", None),
-    ((0.70, 0.69, 0.71), 0.9525, "usable", "undecided"),
+    ((0.95, 0.94, 0.96), 0.96, "stable", None),
+    ((0.70, 0.69, 0.71), 0.9804, "usable", "undecided"),
 ])  # fmt: skip
 def test_the_level_of_all_counts_what_has_no_label_as_disagreeing(alpha, share, level, of_all):
     found = judged(alpha, pairs_labelled=share, pixels_labelled=0.92)
@@ -66,7 +66,10 @@ def test_the_level_of_all_counts_what_has_no_label_as_disagreeing(alpha, share, 
 
 def test_probabilities_of_all_sum_to_one():
     for share in (1.0, 0.9, 0.7, 0.3):
-        assert sum(level_probabilities(Interval(0.8, 0.7, 0.9, degrees=9), share=share).values()) == pytest.approx(1)
+        pairs = LabelledPairs(share, chance=0.3)
+        assert sum(level_probabilities(Interval(0.8, 0.7, 0.9, degrees=9), pairs=pairs).values()) == pytest.approx(1)
+        assert pairs.of_labelled(pairs.of_all(0.8)) == pytest.approx(0.8)
+    assert math.isinf(LabelledPairs(0.0, 0.3).of_labelled(0.5))
 
 
 def test_the_share_of_pairs_is_that_of_views_that_both_label():
@@ -88,7 +91,7 @@ def test_a_model_that_leaves_out_its_errors_is_no_better_of_all():
     open_, closed = (describe(fused(own, 0.2).table(), spots=sampled(own)) for own in (frames, silent))
     assert open_.spots.pixels_labelled == open_.spots.pairs_labelled == 1
     assert closed.headline.alpha.value > open_.headline.alpha.value + 0.05
-    of_all = closed.headline.alpha.value * closed.spots.pairs_labelled
+    of_all = closed.spots.pairs.of_all(closed.headline.alpha.value)
     assert abs(of_all - open_.headline.alpha.value) < 0.6 * (closed.headline.alpha.value - open_.headline.alpha.value)
     assert 0.7 < closed.spots.pairs_labelled < closed.spots.pixels_labelled < 0.95
     assert closed.verdict.of_all not in (None, closed.verdict.level)

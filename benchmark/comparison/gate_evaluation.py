@@ -190,7 +190,7 @@ def value_of(rule: Rule, entry: Entry) -> float:
     if rule.measure.quantity is COVERAGE:
         return math.nan
     number = value(entry.sums, rule.measure.quantity.key, _k(rule, entry))
-    return min(number, number * entry.counted) if bounds_alpha(rule) else number
+    return entry.pairs.of_all(number) if bounds_alpha(rule) else number
 
 
 def _interval_of(rule: Rule, new: Entry, base: Entry | None, level: float, scope: Scope) -> Interval:
@@ -201,7 +201,7 @@ def _interval_of(rule: Rule, new: Entry, base: Entry | None, level: float, scope
         k, before = _k(rule, new), None if base is None else base.sums
         result = bounded(rule, new.sums, before, k=k, level=level, scope=scope)
         if bounds_alpha(rule):
-            number, low, high = (min(x, new.counted * x) for x in (result.value, result.low, result.high))
+            number, low, high = map(new.pairs.of_all, (result.value, result.low, result.high))
             result = dataclasses.replace(result, value=number, low=low, high=high)
         if _of_all_alpha(rule) and any(map(_is_nearly_one_class, (new.sums, before))):
             return dataclasses.replace(result, undecided=ONE_CLASS)
@@ -250,10 +250,11 @@ def silence_notes(rule: Rule, pairs: Sequence[Pair]) -> list[str]:
     if not bounds_alpha(rule):
         return []
     return [
-        f"{new.summary.unit.scene}: the run gives no label in {1 - new.counted:.1%} of the pairs of views, which count"
-        f" as disagreeing: alpha is {value_of(rule, new):.3f}, and {value(new.sums, ALPHA.key):.3f} of what it labels"
+        f"{new.summary.unit.scene}: the run gives no label in {1 - new.pairs.share:.1%} of the pairs of views, which"
+        f" count as disagreeing: alpha is {value_of(rule, new):.3f}, and {value(new.sums, ALPHA.key):.3f} of what it"
+        " labels"
         for new, _ in pairs
-        if 1 - new.counted >= LEAST_LEFT_OUT
+        if 1 - new.pairs.share >= LEAST_LEFT_OUT
     ]
 
 

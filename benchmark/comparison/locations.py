@@ -324,7 +324,7 @@ def _observations(common: Common, number: int, index: Int32, voxel_size: float) 
 
 
 def _rows_of(log: Events, index: Int32, voxel_size: float) -> tuple[Int64, Int64, Float64]:
-    """Return for each observation the row of the voxel that holds its cell, or -1, its frame and its shares."""
+    """Return for each observation the row of the voxel that holds its spot, or -1, its frame and its shares."""
     centre = (np.stack([log.ix, log.iy, log.iz], axis=1) + 0.5) * log.voxel_size
     keys, wanted = voxel_keys(np.floor(centre / voxel_size).astype(np.int32), index)
     at = np.minimum(np.searchsorted(wanted, keys), max(len(wanted) - 1, 0))

@@ -30,6 +30,7 @@ from semstab.data.digests import require_unchanged
 from semstab.data.georeference import Georeference
 from semstab.data.records import ImageSpace, Record
 from semstab.data.results import UnitSummary
+from semstab.data.statistics import LabelledPairs
 from semstab.datasets import GROUND_TRUTH
 from semstab.engine.folder import load_result, run_and_model
 from semstab.errors import ConfigError, DataError, sanitize, summarize_error
@@ -71,10 +72,10 @@ class Entry(EntryNumbers):
     small: tuple[ClusterSums, Flicker] | None = None
 
     @property
-    def counted(self) -> float:
-        """Return the factor of its alpha if what has no label counts as disagreeing; 1 where that is not known."""
+    def pairs(self) -> LabelledPairs:
+        """Return the pairs of views of a spot of which both have a label; all of them if that is not known."""
         statistics = self.summary.statistics
-        return 1.0 if statistics is None or statistics.spots is None else statistics.spots.counted
+        return LabelledPairs() if statistics is None or statistics.spots is None else statistics.spots.pairs
 
     @functools.cached_property
     def sums(self) -> ClusterSums:

@@ -260,7 +260,7 @@ MOST_CLASSES = 4
 """Most classes that a sentence names."""
 
 BASES: dict[Basis, str] = {
-    "observations": "paired; alpha is of the observations (a cell in a view) that all runs made, with the same weights",
+    "observations": "paired; alpha is of the answers (a spot in a view) to which all runs gave a label",
     "voxels": "paired on the voxels that all runs saw twice or more",
     "cubes": "paired on cubes of space",
     "flights": "not paired",
@@ -293,7 +293,7 @@ def left_out(observations: ComparedObservations) -> Iterator[str]:
     """Yield the share of the observations that each run left out, and alpha where that counts against it."""
     for row in observations.ignored:
         if row.missing >= LEAST_LEFT_OUT:
-            counted = f"alpha is {row.alpha:.3f} if the pixels that it leaves out agree as by chance"
+            counted = f"alpha is {row.alpha:.3f} if the pixels that it leaves out disagree"
             yield f"{row.model} gives no label to {row.missing:.1%} of the pixels that others label; {counted}"
     if observations.depends and any(row.missing >= LEAST_LEFT_OUT for row in observations.ignored):
         yield "the order of the runs depends on the pixels that were left out"

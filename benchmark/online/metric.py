@@ -156,7 +156,7 @@ class TemporalStability:
         voxel_size: The edge of a voxel, metres.
         ignore_index: The label of pixels without a class.
         soft: True to fuse scores; else the likeliest class of each pixel is fused, as from label maps on disk.
-        alpha: True to sample the spots that give alpha and a verdict: half of the time of an update.
+        alpha: True to ask frames at the spots that give alpha and a verdict: half of the time of an update.
         max_voxels: The most voxels of a sequence; a larger map is sampled at random, so that its memory is bounded.
         backend: The backend that fuses.
         of_torchmetrics: The arguments of `torchmetrics.Metric`, where it is installed.

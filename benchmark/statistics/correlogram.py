@@ -59,9 +59,9 @@ BINS = tuple((axis, *edges) for axis, limits in AXES.items() for edges in iterto
 def correlogram(spots: SpotObservations) -> Correlogram:
     """Return alpha in bins of the distance of two views of a spot.
 
-    Views of a spot that are 1, 2, 4, 8, ... apart are paired, so that the cost is linear. Chance is that of the pairs
-    in the bin. Bands are at CONFIDENCE, for this scene flown again where the bin has enough frames for that, else for
-    these frames.
+    Views of a spot that are 1, 2, 4, 8, ... apart are paired, so that the cost is linear. Chance is computed from the
+    pairs in the bin. Bands are at CONFIDENCE, for this scene flown again if the bin has enough frames for that, else
+    for these frames.
     """
     (seen, near), (beside, far), further = spots.logs()
     labels = np.unique(

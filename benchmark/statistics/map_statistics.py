@@ -177,8 +177,8 @@ def analyse(
 
     Args:
         sample: The map, or a sample of it, with its log and the ground truth.
-        spots: Labels that views give spots, taken of the same frames by a `Sampler`; without them there is no alpha
-            and no verdict.
+        spots: Labels that views give spots, taken of the same frames by a `Sampler`; without them there is no alpha and
+            no verdict.
         limit: The map of view-independent labels; the ground truth's where it is not given.
         name: Name of the model, for the verdict.
         seed: Seed of random orders.

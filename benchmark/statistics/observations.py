@@ -99,9 +99,9 @@ class SpotObservations:
     """Answers of views for spots of the surface: a row (m,) for each spot and frame.
 
     A spot is a point of the surface, one in a coarse cell; it does not depend on the voxels of a map. The answer of a
-    frame is the label of the pixel which the spot falls into. A second and a third answer, of the next two pixels on the
-    same surface, tell how agreement falls with the distance of the points that answer: at a border of two classes the
-    first one is wrong if the pixel's centre and the spot lie on different sides.
+    frame is the label of the pixel which the spot falls into. A second and a third answer, of the next two pixels on
+    the same surface, tell how agreement falls with the distance of the points that answer: at a border of two classes
+    the first one is wrong if the pixel's centre and the spot lie on different sides.
 
     Attributes:
         spot: (m,) int32 row of `point`.

@@ -18,13 +18,13 @@ from semstab.data.contrast import ComparedObservations, Ignored, ModelComparison
 from semstab.data.events import Events
 from semstab.data.information import by_group
 from semstab.data.measures import ENTROPY, Quantity, mean, measures
-from semstab.data.statistics import UNDEFINED, UNKNOWN, Estimate, Interval
+from semstab.data.statistics import UNDEFINED, UNKNOWN, Estimate, Interval, LabelledPairs
 from semstab.data.voxels import VoxelTable
 from semstab.errors import ConfigError, DataError
 from semstab.metrics.agreement import observations, require_same_grid, rows_of
 from semstab.statistics.accumulate import Cubes, cluster_sums_of, sums_of_spots
 from semstab.statistics.agreement import ALPHA, ONE_HOT, PSA, VOXEL_ALPHA, psa
-from semstab.statistics.cluster_sums import ClusterSums, Statistic, mean_functional
+from semstab.statistics.cluster_sums import ClusterSums, Statistic, chance_of, mean_functional
 from semstab.statistics.cluster_sums import value as value_of
 from semstab.statistics.correctness import ACCURACY, join_truth
 from semstab.statistics.intervals import difference, estimate, scope_of
@@ -354,8 +354,10 @@ def compared_observations(samples: Mapping[str, SpotObservations]) -> SharedObse
         edge = None if near is None else near.edge
     ignored = []
     for name, missing in zip(names, both.missing, strict=True):
-        log, alpha = ignoring[name].observations(), value_of(sums_of_spots(samples[name]), ALPHA.key)
-        ignored.append(Ignored(name, missing, *psa_bounds(log), min(alpha, 1.0) * pairs_labelled(log)))
+        log, whole = ignoring[name].observations(), sums_of_spots(samples[name])
+        chance = math.nan if whole.near is None else chance_of(whole.near)
+        pairs = LabelledPairs(pairs_labelled(log), chance)
+        ignored.append(Ignored(name, missing, *psa_bounds(log), pairs.of_all(min(value_of(whole, ALPHA.key), 1.0))))
     first = next(iter(logs.values()))
     bounds = {row.model: (row.psa_low, row.psa_high) for row in ignored}
     by_psa = sorted(names, key=lambda name: -mean(psa(logs[name].table())))

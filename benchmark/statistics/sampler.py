@@ -26,14 +26,14 @@ from semstab.statistics.observations import COLUMNS, TYPES, VIEW, SpotObservatio
 BUDGET = 1 << 19
 """Most answers (spot, view)."""
 
-MOST_SPOTS = 1 << 17
+MOST_SPOTS = 1 << 16
 """Most spots, of which many may have been seen once."""
 
-MOST_NEW = 1 << 16
+MOST_NEW = 1 << 15
 """Most spots that one frame adds."""
 
 LOOKED_AT = 16_000
-"""Blocks of pixels, about, in which new spots are looked for."""
+"""Blocks of pixels, about, or points of a scan, in which new spots are looked for."""
 
 APART = 0.7
 """Edge of a coarse cell, by the mean area that a block of pixels shows, or up to twice as much."""
@@ -56,15 +56,22 @@ CHANGE = 8.0
 STILL = 1.0
 """Pixels by which no point of an image moves while a camera stands still."""
 
-SIGMAS, LEAST, MOST = 4.0, 0.002, 0.05
+SIGMAS, LEAST, MOST = 1.0, 0.002, 0.05
 """A pixel shows a spot if their depths differ by at most so many standard deviations of how they differ in the flight,
-which depth noise and errors of poses cause; the least and the most of this tolerance, relative."""
+which depth noise and errors of poses cause; the least and the most of this tolerance, relative. A third of the answers
+is lost by this, whatever the labels; with a wider tolerance more answers come from other surfaces than the spot's. Of a
+first frame, which has nothing to differ from, the noise within it counts."""
+
+SURE, SMOOTH = 4.0, 0.0005
+"""Standard deviations of the noise within a frame by which pixels of one surface differ at most; and the noise,
+relative, from which on depth comes from planes through the pixels around."""
 
 GATE, ENOUGH = 0.05, 50
 """That standard deviation is taken of differences up to this, relative, if a frame has at least so many."""
 
-SPARSE, DENSE = 0.3, 0.1
-"""Share of an image's pixels that have depth below which depth is sparse, as a LiDAR's in an image is; and share of the
+SPARSE, ALONE, DENSE = 0.3, 0.7, 0.1
+"""Share of an image's pixels that have depth below which depth is sparse, as a LiDAR's in an image is, if fewer than
+this share of these pixels have one next to them; and share of the
 labels at pixels without depth from which on labels are read where a spot falls, not at the next pixel with depth."""
 
 
@@ -95,7 +102,8 @@ class Sparse:
         camera: Focal lengths and principal point in pixels; of a scan, pixels in a radian.
         around: Whether columns close a circle.
         reach: Pixels to each side in which points around a place are looked for.
-        spacing: Of the points, in pixels of an image, or in distances of a scan's points; pixels: in pixels of the grid.
+        spacing: Of the points, in pixels of an image, or in distances of a scan's points.
+        pixels: Of the points, in pixels of the grid.
         labels: (n,) uint16 labels of the points; None if the image has labels in all pixels.
     """
 
@@ -137,6 +145,7 @@ class Sampler:
         self._anchor: Anchor | None = None
         self._seen: dict[bytes, Anchor] = {}
         self._errors: list[float] = []
+        self._noise = 0.0
         self._widths: list[float] = []
         self._known = 0
         self._clear()
@@ -161,6 +170,7 @@ class Sampler:
         self._known = self._spots
         T, seed = fixed(frame.T_wc), (frame.index + 1) * 0x9E3779B9 & 0xFFFFFFFF
         if sparse is None:
+            self._noise = _noise(frame)
             self._find(frame, T, seed)
             self._take(view, *self._answers_of_image(frame, T, seed))
         else:
@@ -168,7 +178,7 @@ class Sampler:
             self._take(view, *self._answers_of_points(frame, sparse, T, seed))
 
     def _view_of(self, frame: Frame, depth: float, sparse: Sparse | None) -> int | None:
-        """Return the view of a frame of this median depth, which may be a new one; None if the frame repeats another."""
+        """Return the view of a frame with this median depth, a new one or not; None if the frame repeats another."""
         small = frame.predicted[:: max(1, -(-frame.shape[0] // SIDE)), :: max(1, -(-frame.shape[1] // SIDE))]
         digest = hashlib.blake2b(np.ascontiguousarray(small).tobytes(), digest_size=16).digest()
         same = self._seen.get(digest)
@@ -196,7 +206,7 @@ class Sampler:
 
         (H, W), stride = frame.shape, _stride(frame.shape)
         blocks = -(-H // stride) * -(-W // stride)
-        where = self._edge, self._share, self._low, stride, _factor(blocks), seed
+        where = SURE * self._noise, self._edge, self._share, self._low, stride, _factor(blocks), seed
         self._new(lambda *room: new_in_image(fixed(frame.depth), _camera(frame), T, *where, *room))
 
     def _find_in_points(self, sparse: Sparse, T: Float64, seed: int) -> None:
@@ -204,7 +214,7 @@ class Sampler:
         from semstab.statistics.loops.spots import new_in_points
 
         place = sparse.camera, sparse.around, sparse.reach, sparse.pixels
-        where = self._allowed(), T, self._edge, self._share, self._low, _factor(len(sparse.w)), seed
+        where = self._allowed(), T, self._edge, self._share, self._low, _factor(len(sparse.w)), LOOKED_AT, seed
         self._new(lambda *room: new_in_points(*sparse.arrays, *place, *where, *room))
 
     def _new(self, find: Any) -> None:
@@ -229,7 +239,7 @@ class Sampler:
 
     def _allowed(self) -> float:
         """Return the tolerance of depth, relative: it follows from the flight's own differences so far."""
-        sigma = float(np.median(self._errors)) if self._errors else LEAST
+        sigma = float(np.median(self._errors)) if self._errors else self._noise
         return min(max(SIGMAS * sigma, LEAST), MOST)
 
     def _learn(self, earlier: int, spot: npt.NDArray[np.int32], error: Float64) -> None:
@@ -243,7 +253,8 @@ class Sampler:
 
         n, camera = self._spots, _camera(frame)
         spot, (x, y, error, room) = np.empty(n, np.int32), np.empty((4, n))
-        n = project(self._point[:n], fixed(frame.depth), camera, T, spot, x, y, error, room)
+        noise = SURE * self._noise if self._noise > SMOOTH else 0.0
+        n = project(self._point[:n], fixed(frame.depth), camera, T, noise, spot, x, y, error, room)
         spot, x, y, error, room = spot[:n], x[:n], y[:n], error[:n], room[:n]
         self._learn(self._known, spot, error)
         out = _room(n)
@@ -253,12 +264,14 @@ class Sampler:
         return tuple(column[:m] for column in out)
 
     def _answers_of_points(self, frame: Frame, sparse: Sparse, T: Float64, seed: int) -> tuple[Any, ...]:
-        from semstab.statistics.loops.spots import answer_sparse, answer_points, project_sparse
+        from semstab.statistics.loops.spots import answer_points, answer_sparse, project_sparse
 
         n = self._spots
         spot, nearest, (x, y, error, room) = np.empty(n, np.int32), np.empty(n, np.int64), np.empty((4, n))
         place = sparse.camera, sparse.around, sparse.reach
-        n = project_sparse(self._point[:n], *sparse.arrays, *place, T, spot, x, y, error, room, nearest)
+        n = project_sparse(
+            self._point[:n], *sparse.arrays, *place, sparse.labels is None, T, spot, x, y, error, room, nearest
+        )
         spot, x, y, error, room, nearest = spot[:n], x[:n], y[:n], error[:n], room[:n], nearest[:n]
         self._learn(self._known, spot, error)
         out = _room(n)
@@ -279,7 +292,19 @@ class Sampler:
             )
         else:
             m = answer_points(
-                spot, x, y, error, room, self._allowed(), *sparse.arrays, sparse.labels, nearest, *place, seed, *out
+                spot,
+                x,
+                y,
+                error,
+                room,
+                self._allowed(),
+                *sparse.arrays,
+                sparse.labels,
+                self.K,
+                nearest,
+                *place,
+                seed,
+                *out,
             )
         return tuple(column[:m] for column in out)
 
@@ -359,7 +384,17 @@ def _width(frame: Frame, sparse: Sparse | None, footprint: float) -> float:
     if sparse is not None:
         return OBLIQUE * sparse.spacing * footprint
     stride = _stride(frame.shape)
-    return stride * math.sqrt(mean_area(fixed(frame.depth), _camera(frame), 2 * stride)) or footprint
+    return stride * math.sqrt(mean_area(fixed(frame.depth), _camera(frame), 2 * stride, stride)) or footprint
+
+
+def _noise(frame: Frame) -> float:
+    """Return the noise of a frame's depth, relative, by which one pixel differs from the next ones."""
+    from semstab.statistics.loops.spots import second_differences
+
+    stride = 2 * _stride(frame.shape)
+    found = np.empty((frame.shape[0] // stride + 1) * (frame.shape[1] // stride + 1))
+    n = second_differences(fixed(frame.depth), stride, found)
+    return float(np.median(found[:n])) / 0.6745 / math.sqrt(6) if n else 0.0
 
 
 @functools.lru_cache(maxsize=64)
@@ -390,7 +425,8 @@ def _sparse(frame: Frame, K: int) -> Sparse | None:
         labels = np.where(labels < K, labels, np.where(unlabelled, K, K + 1)).astype(np.uint16)
         return Sparse(grid, u, v, w, (1 / unit, 1 / unit, 0.0, 0.0), True, 5, 1.0, 2.0, labels)
     valid = (frame.depth > 0) & (frame.depth < np.inf)
-    if not 0 < (n := int(np.count_nonzero(valid))) < SPARSE * valid.size:
+    n, pairs = int(np.count_nonzero(valid)), int(np.count_nonzero(valid[:, 1:] & valid[:, :-1]))
+    if not 0 < n < SPARSE * valid.size or pairs >= ALONE * n:
         return None
     row, column = np.nonzero(valid)
     spacing = math.sqrt((np.ptp(row) + 1) * (np.ptp(column) + 1) / n)
@@ -402,5 +438,5 @@ def _sparse(frame: Frame, K: int) -> Sparse | None:
     unlabelled = np.False_ if frame.unlabelled is None else frame.unlabelled[valid]
     labels = frame.predicted[valid].astype(np.uint16)
     labels = np.where(labels < K, labels, np.where(unlabelled, K, K + 1)).astype(np.uint16)
-    reach = min(max(math.ceil(1.6 * spacing), 2), 12)
+    reach = min(max(math.ceil(1.1 * spacing), 2), 12)
     return Sparse(grid, u, v, w, _camera(frame), False, reach, spacing, spacing, None if dense else labels)

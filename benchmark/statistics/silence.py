@@ -27,8 +27,7 @@ class Silence:
 def silence(spots: SpotObservations) -> Silence:
     """Return what a model labels of its own sample; NaN without pixels, or without a spot that two views saw.
 
-    Alpha times the share of the pairs is alpha if what is left out counts as disagreeing: a pair of which one has no
-    label agrees no better than by chance.
+    Alpha of all pairs follows, in which a pair of which one has no label disagrees: see `LabelledPairs`.
     """
     labelled = spots.label < spots.K
     if not len(labelled):

@@ -12,6 +12,7 @@ from semstab.data.statistics import (
     Flipping,
     HeadlineStatistics,
     Interval,
+    LabelledPairs,
     Level,
     SpotAgreement,
     StabilityVerdict,
@@ -75,11 +76,15 @@ TOO_FEW_VOXELS = "its map has too few locations to act on; use smaller voxels, o
 STILL = "the camera stood still: all frames show one view"
 
 
-def level_probabilities(alpha: Interval, limits: Limits = LIMITS, share: float = 1.0) -> Mapping[Level, float]:
-    """Return how probable each level of share * alpha is; NaN without an interval."""
+ALL = LabelledPairs()
+
+
+def level_probabilities(alpha: Interval, limits: Limits = LIMITS, pairs: LabelledPairs = ALL) -> Mapping[Level, float]:
+    """Return how probable each level of all pairs of views is, from alpha of labelled ones; NaN without an interval."""
 
     def above(limit: float) -> float:
-        return 0.0 if limit > share else probability_above(alpha, limit / share, "agreement")
+        least = pairs.of_labelled(limit)
+        return 0.0 if least > 1 else probability_above(alpha, least, "agreement")
 
     if math.isnan(alpha.low):
         return dict.fromkeys(("stable", "usable", "unstable"), math.nan)
@@ -87,9 +92,9 @@ def level_probabilities(alpha: Interval, limits: Limits = LIMITS, share: float =
     return {"stable": reliable, "usable": tentative - reliable, "unstable": 1 - tentative}
 
 
-def holds_all_levels(alpha: Interval, limits: Limits = LIMITS, share: float = 1.0) -> bool:
-    """Return whether the interval of share * alpha holds both limits, so that it excludes no level."""
-    return share * alpha.low <= limits.usable and limits.stable <= share * alpha.high
+def holds_all_levels(alpha: Interval, limits: Limits = LIMITS, pairs: LabelledPairs = ALL) -> bool:
+    """Return whether the interval of alpha of all pairs holds both limits, so that it excludes no level."""
+    return pairs.of_all(alpha.low) <= limits.usable and limits.stable <= pairs.of_all(alpha.high)
 
 
 def why_undecided(alpha: Interval, limits: Limits = LIMITS) -> str:
@@ -121,7 +126,7 @@ def verdict(
     """Return the most probable level of alpha, and the level if what the model leaves out counts as disagreeing.
 
     It is undecided where the interval of alpha holds both limits, whatever the probabilities are, and where no level
-    has DECIDED. The second level is that of alpha times the share of pairs of views of which both have a label.
+    has DECIDED. The second level is that of all pairs of views of a spot: a pair of which one has no label disagrees.
 
     Args:
         model: Its name.
@@ -137,7 +142,7 @@ def verdict(
         return StabilityVerdict("no verdict", math.nan, f"{model}: no verdict, {reason}; {support}")
     assert spots is not None
     level, probability = _level(headline, spots, limits)
-    of_all, _ = _level(headline, spots, limits, spots.counted)
+    of_all, _ = _level(headline, spots, limits, spots.pairs)
     silent = spots.labelled < limits.labelled
     both = StabilityVerdict(level, probability, "", None if of_all == level else of_all, spots.pixels_labelled)
     wrong = headline.wrong_of_consistent
@@ -170,18 +175,18 @@ def _missing(spots: SpotAgreement | None, voxels: int) -> str:
 
 
 def _level(
-    headline: HeadlineStatistics, spots: SpotAgreement, limits: Limits, share: float = 1.0
+    headline: HeadlineStatistics, spots: SpotAgreement, limits: Limits, pairs: LabelledPairs = ALL
 ) -> tuple[Level, float]:
-    """Return the level of share * alpha with its probability."""
+    """Return the level of alpha of all pairs with its probability."""
     if spots.effective_classes < LEAST_CLASSES:
         return "uninformative", math.nan
-    probabilities = dict(level_probabilities(headline.alpha, limits, share))
+    probabilities = dict(level_probabilities(headline.alpha, limits, pairs))
     level = max(probabilities, key=lambda name: probabilities[name])
     if math.isnan(probabilities[level]):
         return "no verdict", math.nan
     if headline.wrong_of_consistent.low > DANGEROUS and level != "unstable":
         return "misleading", math.nan
-    if probabilities[level] < DECIDED or holds_all_levels(headline.alpha, limits, share):
+    if probabilities[level] < DECIDED or holds_all_levels(headline.alpha, limits, pairs):
         return "undecided", probabilities[level]
     if level == "stable" and spots.labelled < limits.labelled:
         return "usable", probabilities["usable"] + probabilities["stable"]

@@ -87,8 +87,8 @@ class RangeStratum:
     Attributes:
         low, high: Ends of the range in metres; the high one is not part of it.
         share: Share of all sampled observations.
-        cells: Cells that two views saw from there.
-        alpha: Alpha of these observations; NaN where they were not assessed: two views saw too few cells from there, or
+        spots: Spots that two views saw from there.
+        alpha: Alpha of these observations; NaN where they were not assessed: two views saw too few spots from there, or
             nearly all of them are one class.
     """
 
@@ -170,6 +170,38 @@ class RangeAgreement:
 
 
 @dataclass(frozen=True)
+class LabelledPairs:
+    """Pairs of views of a spot of which both have a label: alpha of all pairs follows from alpha of these.
+
+    Attributes:
+        share: Their share of all pairs.
+        chance: Probability that two labels from anywhere agree.
+    """
+
+    share: float = 1.0
+    chance: float = 0.0
+
+    def of_all(self, alpha: float) -> float:
+        """Return alpha if each other pair counts as disagreeing.
+
+        Observed disagreement is then share * D + 1 - share, expected disagreement stays 1 - chance:
+
+            alpha of all = share * alpha - (1 - share) * chance / (1 - chance)
+        """
+        if self.share >= 1:
+            return alpha
+        return self.share * alpha - (1 - self.share) * self.chance / (1 - self.chance)
+
+    def of_labelled(self, alpha: float) -> float:
+        """Return the alpha of labelled pairs that is this alpha of all pairs; infinite if no pair has labels."""
+        if self.share >= 1:
+            return alpha
+        if not self.share > 0:
+            return math.inf
+        return (alpha + (1 - self.share) * self.chance / (1 - self.chance)) / self.share
+
+
+@dataclass(frozen=True)
 class SpotAgreement:
     """The observations that alpha rests on: labels that views give spots of the surface.
 
@@ -204,9 +236,9 @@ class SpotAgreement:
     pairs_labelled: float = math.nan
 
     @property
-    def counted(self) -> float:
-        """Return the factor of alpha if what has no label counts as disagreeing; 1 where that was not stored."""
-        return 1.0 if math.isnan(self.pairs_labelled) else self.pairs_labelled
+    def pairs(self) -> LabelledPairs:
+        """Return the pairs of views of a spot of which both have a label; all of them if that was not stored."""
+        return LabelledPairs() if math.isnan(self.pairs_labelled) else LabelledPairs(self.pairs_labelled, self.chance)
 
     @property
     def effective_classes(self) -> float:

@@ -135,7 +135,7 @@ THIN = 0.1
 """The share of the weight in strata that hardly overlap from which on the table reports it."""
 
 _COMMON = (
-    "Alpha is of the observations (a cell in a view) that all models labelled, the rest of the voxels that all saw"
+    "Alpha is of the answers (a spot in a view) to which all models gave a label, the rest of the voxels that all saw"
     " twice or more."
 )
 
@@ -224,13 +224,13 @@ def ignored_table(observations: Mapping[str, ComparedObservations]) -> Table:
         Column("missing_percent", "left out (%)", 1),
         Column("psa_low", "at least", 3, over="Agreement with these"),
         Column("psa_high", "at most", 3, over="Agreement with these"),
-        Column("alpha_ignored", "Alpha, left out as by chance", 3),
+        Column("alpha_ignored", "Alpha, left out disagrees", 3),
         Column("order", "Order depends on it"),
     )
     caption = (
         "A pixel is left out if a model gives it no label where another model gives one. The agreement of two views in"
-        " a cell has two bounds: these pixels agree never, or always (Manski). For alpha, pixels that are left out"
-        " agree as by chance. The order depends on them if that alpha, or the agreement within its bounds, would change"
+        " a spot has two bounds: these pixels agree never, or always (Manski). For alpha, pixels that are left out"
+        " disagree. The order depends on them if that alpha, or the agreement within its bounds, would change"
         " the order of the models."
     )
     groups = tuple(Group(scene, _ignored_rows(comparison)) for scene, comparison in observations.items())
@@ -290,10 +290,10 @@ def correlogram(result: Result) -> list[Table]:
         *(_of(_end(axis, last)) for axis in _AXES for last in (0, -1)),
     )
     caption = (
-        "The table shows alpha of pairs of observations of a spot, by their distance. Models and flights are compared"
+        "The table shows alpha of pairs of views of a spot, by their distance. Models and flights are compared"
         " at a stated angle between the directions of view, not over all pairs that a flight has. Nearest and farthest"
         " are the first and the last bin with enough pairs in time (frames), angle, ratio of the ranges, and distance"
-        " of the cameras. As in the verdict, alpha is that of the spots themselves. Intervals are at"
+        " of the cameras. Alpha of each bin is read at the spot itself, as alpha of all pairs is. Intervals are at"
         f" {CONFIDENCE:.0%}, for this scene flown again if a bin has {LEAST_FRAMES} frames, else for these frames."
     )
     return by_scene(result, "correlogram", "Agreement by distance of the observations", caption, columns, numbers)

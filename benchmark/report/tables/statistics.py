@@ -71,7 +71,7 @@ def temporal_agreement(result: Result) -> list[Table]:
     )
     caption = (
         "Alpha is the agreement of two views at the same spot beyond chance: 1 is perfect, 0 is chance. It is measured"
-        " on spots that two views saw, and does not depend on the voxel size. The other numbers are of the"
+        " at spots of the surface that two views saw, and does not depend on voxel size. The other numbers are of the"
         " voxels seen twice or more. PSA is the share of pairs of frames that agree about a voxel; kappa (Fleiss) and"
         " voxel alpha (Krippendorff) are the same agreement beyond chance. Disagreement has the parts of 1 - PSA within"
         " a frame and between frames. Flip rate is the share of the steps from one observation to the next at which the"
@@ -319,7 +319,7 @@ def ordered(take: Callable[[DriftStatistics], float | Estimate]) -> Number:
 
 
 def of_spots(take: Callable[[SpotAgreement], float]) -> Number:
-    """Return a function that takes a number of the spots; NaN where there are none."""
+    """Return a function that takes a number of the spots; NaN without spots."""
     return lambda stats: math.nan if stats.spots is None else take(stats.spots)
 
 

@@ -78,8 +78,8 @@ class Functional:
 
 
 SPOTS: tuple[tuple[Part, float], ...] = (("near", 1.0), ("far", -1.0))
-"""alpha + lever (alpha - alpha'), with alpha' of the second answers: agreement falls with the distance of the points that
-answer from the spot, as a border of two classes may lie between them. See `lever_of`."""
+"""alpha + lever (alpha - alpha'), with alpha' of the second answers: agreement falls with the distance of the points
+that answer from the spot, as a border of two classes may lie between them. See `lever_of`."""
 
 
 def lever_of(near: ClusterSums, far: ClusterSums) -> float:

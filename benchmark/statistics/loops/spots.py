@@ -33,15 +33,18 @@ STEEPEST = 32.0
 """Largest area that a pixel shows, in those that it would show if the surface faced it."""
 
 SLACK = 0.25
-"""Share of the slope of inverse depth by which a pixel next to another on the same surface may differ from its plane."""
+"""Share of the slope of inverse depth by which two pixels next to each other on one surface may differ from a plane."""
+
+AROUND, LEAST_AROUND = 2, 6.0
+"""Pixels to each side through which a plane is laid where a spot is found, and the least number of them."""
 
 EDGE, JUMP = 4.0, 0.01
 """A slope of inverse depth to one side that is larger than that to the other side by this factor, and this share of the
 inverse depth, is an edge."""
 
 OFF = 0.35
-"""A pixel answers for a spot if its centre is at most so many pixels away from it along each axis: a pixel at a border of
-classes tells the class at its centre. Every second view is lost by this, whatever the labels."""
+"""A pixel answers for a spot if its centre is at most this far from it along each axis, in pixels: a pixel at a border
+of classes tells the class at its centre. Every second view is lost by this, whatever the labels."""
 
 ON_A_PLANE = 0.03
 """Sparse points lie on a plane if it leaves at most this over of their inverse depth, relative."""
@@ -97,12 +100,65 @@ def slope(before, here, after):
 
 
 @serial
-def slopes(depth, row, column, here):
-    """Return the slopes of inverse depth along a row and along a column."""
+def slopes(depth, row, column, here, span=1):
+    """Return the slopes of inverse depth along a row and along a column, from pixels `span` pixels away."""
     return (
-        slope(inverse(depth, row, column - 1), here, inverse(depth, row, column + 1)),
-        slope(inverse(depth, row - 1, column), here, inverse(depth, row + 1, column)),
+        slope(inverse(depth, row, column - span), here, inverse(depth, row, column + span)) / span,
+        slope(inverse(depth, row - span, column), here, inverse(depth, row + span, column)) / span,
     )
+
+
+@serial
+def second_differences(depth, stride, found):
+    """Write second differences of inverse depth along rows, relative, at every stride-th pixel; return how many.
+
+    On a plane they are noise alone, of variance 6 times a pixel's.
+    """
+    n = 0
+    for row in range(stride // 2, depth.shape[0], stride):
+        for column in range(stride // 2, depth.shape[1], stride):
+            before, here, after = (
+                inverse(depth, row, column - 1), inverse(depth, row, column), inverse(depth, row, column + 1)
+            )  # fmt: skip
+            if before > 0.0 and here > 0.0 and after > 0.0:
+                found[n] = abs(before - 2.0 * here + after) / here
+                n += 1
+    return n
+
+
+@serial
+def smoothed(depth, row, column, here, dx, dy, allowed):
+    """Return inverse depth at (dx, dy) from a pixel's centre, by a plane through the pixels around it.
+
+    Pixels of another surface do not count: they differ by more than noise, `allowed` (relative), and slope explain. So
+    a spot's own error is a fifth of a pixel's, and views from other sides meet it where it is.
+    """
+    along_x, along_y = slopes(depth, row, column, here, AROUND)
+    steep = abs(along_x) + abs(along_y)
+    n = sx = sy = sw = sxx = sxy = syy = sxw = syw = 0.0
+    for b in range(-AROUND, AROUND + 1):
+        for a in range(-AROUND, AROUND + 1):
+            there = inverse(depth, row + b, column + a)
+            if there == 0.0 or abs(there - here) > 2.0 * allowed * here + 2.0 * AROUND * steep:
+                continue
+            w = there - here
+            n, sx, sy, sw = n + 1.0, sx + a, sy + b, sw + w
+            sxx, sxy, syy, sxw, syw = sxx + a * a, sxy + a * b, syy + b * b, sxw + a * w, syw + b * w
+    if n < LEAST_AROUND:
+        along_x, along_y = slopes(depth, row, column, here)
+        return here + along_x * dx + along_y * dy
+    mx, my, mw = sx / n, sy / n, sw / n
+    cxx, cxy, cyy, cxw, cyw = (
+        sxx / n - mx * mx,
+        sxy / n - mx * my,
+        syy / n - my * my,
+        sxw / n - mx * mw,
+        syw / n - my * mw,
+    )
+    det = cxx * cyy - cxy * cxy
+    if not det > 0.01:
+        return here
+    return here + mw + (cyy * cxw - cxy * cyw) / det * (dx - mx) + (cxx * cyw - cxy * cxw) / det * (dy - my)
 
 
 # --- New spots --------------------------------------------------------------------------------------------------------
@@ -166,8 +222,8 @@ def free(px, py, pz, edge, share, low, table, taken):
 def area(here, along_x, along_y, x, y, fx, fy):
     """Return the area of the surface that a pixel at ray (x, y, 1) shows, m^2, from inverse depth and its slopes.
 
-    Inverse depth of a plane n . X = 1 is n . (x, y, 1). So n follows from the slopes, and the area is z^3 |n| / (fx fy);
-    at most STEEPEST times that of a surface that faces the camera.
+    Inverse depth of a plane n . X = 1 is n . (x, y, 1). So n follows from the slopes, and the area is
+    z^3 |n| / (fx fy), at most STEEPEST times that of a surface that faces the camera.
     """
     nx, ny = along_x * fx, along_y * fy
     nz = here - nx * x - ny * y
@@ -182,7 +238,7 @@ def number_of(expected, chance):
 
 
 @serial
-def new_in_image(depth, camera, T, edge, share, low, stride, factor, seed, table, point, hashed):
+def new_in_image(depth, camera, T, allowed, edge, share, low, stride, factor, seed, table, point, hashed):
     """Add spots where an image shows a coarse cell without one; return how many.
 
     Places are looked at evenly over the surface, PLACES in the area of a coarse cell's face: in blocks of stride x
@@ -210,13 +266,16 @@ def new_in_image(depth, camera, T, edge, share, low, stride, factor, seed, table
             done += 1
             if here == 0.0:
                 continue
-            along_x, along_y = slopes(depth, row, column, here)
             if done == 1:
+                along_x, along_y = slopes(depth, row, column, here, stride)
                 shown = area(here, along_x, along_y, (column - cx) / fx, (row - cy) / fy, fx, fy) * stride * stride
                 places = number_of(PLACES * shown / (edge * edge), fraction(np.uint32(number ^ np.uint32(0x165667B1))))
                 if places == 0:
                     continue
-            there = here + along_x * (u - column) + along_y * (v - row)
+            px, py, pz = in_world((u - cx) / fx / here, (v - cy) / fy / here, 1.0 / here, T)
+            if free(px, py, pz, edge, share, low, table, False) < 0:
+                continue
+            there = smoothed(depth, row, column, here, u - column, v - row, allowed)
             z = 1.0 / (there if there > 0.5 * here else here)
             px, py, pz = in_world((u - cx) / fx * z, (v - cy) / fy * z, z, T)
             own = free(px, py, pz, edge, share, low, table, True)
@@ -258,11 +317,12 @@ def outside(depth, row, column, here, dx, dy, w):
 
 
 @serial
-def project(point, depth, camera, T, spot, x, y, error, room):
+def project(point, depth, camera, T, noise, spot, x, y, error, room):
     """Find the spots that fall on a pixel with depth, in front of the camera; return how many.
 
     For each it writes its number, its image coordinates, how much nearer than the spot the surface is by the pixel's
-    slope, and `room`: how far the spot is from all that the slopes to the pixels around allow; both relative.
+    slope, and `room`: how far the spot is from all that the slopes to the pixels around allow; both relative. Noise is
+    what pixels of one surface differ by, relative: if it is not 0, planes through the pixels around tell the depth.
     """
     H, W = depth.shape
     fx, fy, cx, cy = camera
@@ -280,8 +340,13 @@ def project(point, depth, camera, T, spot, x, y, error, room):
         here = inverse(depth, row, column)
         if here == 0.0 or abs(u - column) > OFF or abs(v - row) > OFF:
             continue
-        along_x, along_y = slopes(depth, row, column, here)
         spot[n], x[n], y[n] = i, u, v
+        if noise > 0.0:
+            error[n] = smoothed(depth, row, column, here, u - column, v - row, noise) * z - 1.0
+            room[n] = abs(error[n])
+            n += 1
+            continue
+        along_x, along_y = slopes(depth, row, column, here)
         error[n] = (here + along_x * (u - column) + along_y * (v - row)) * z - 1.0
         room[n] = outside(depth, row, column, here, u - column, v - row, 1.0 / z) * z
         n += 1
@@ -356,15 +421,18 @@ def answer(spot, x, y, room, allowed, depth, labels, unlabelled, K, camera, seed
 
 
 @serial
-def mean_area(depth, camera, stride):
-    """Return the mean area of the surface that a pixel shows, m^2, over every stride-th pixel of each axis."""
+def mean_area(depth, camera, stride, span):
+    """Return the mean area of the surface that a pixel shows, m^2, over every stride-th pixel of each axis.
+
+    Slopes are those to pixels `span` pixels away.
+    """
     fx, fy, cx, cy = camera
     total, count = 0.0, 0
     for row in range(stride // 2, depth.shape[0], stride):
         for column in range(stride // 2, depth.shape[1], stride):
             here = inverse(depth, row, column)
             if here > 0.0:
-                along_x, along_y = slopes(depth, row, column, here)
+                along_x, along_y = slopes(depth, row, column, here, span)
                 total += area(here, along_x, along_y, (column - cx) / fx, (row - cy) / fy, fx, fy)
                 count += 1
     return total / max(count, 1)
@@ -375,7 +443,7 @@ def mean_area(depth, camera, stride):
 
 @serial
 def directions(points, unit, u, v, w):
-    """Write direction (azimuth, elevation) in units of radians, and inverse range, of points (n, 3); 0 of invalid ones."""
+    """Write azimuth and elevation, in `unit` radians, and inverse range of points (n, 3); 0 of invalid points."""
     for i in range(len(points)):
         x, y, z = np.float64(points[i, 0]), np.float64(points[i, 1]), np.float64(points[i, 2])
         distance = np.sqrt(x * x + y * y + z * z)
@@ -411,6 +479,7 @@ def surface(grid, u, v, w, x, y, reach, around):
     rows, columns = grid.shape
     column, row = np.int64(np.floor(x + 0.5)), np.int64(np.floor(y + 0.5))
     nearest, least, reference = np.int64(-1), 1e18, 0.0
+    n = sx = sy = sw = sxx = sxy = syy = sxw = syw = sww = 0.0
     for b in range(max(row - reach, 0), min(row + reach + 1, rows)):
         for a in range(column - reach, column + reach + 1):
             at = a % columns if around else a
@@ -422,19 +491,9 @@ def surface(grid, u, v, w, x, y, reach, around):
                 dx = dx - columns * np.round(dx / columns)
             distance = dx * dx + dy * dy
             if distance < least:
-                nearest, least, reference = np.int64(i), distance, w[i]
-    if nearest < 0:
-        return 0.0, 0.0, nearest, least, 0.0, 0.0
-    n = sx = sy = sw = sxx = sxy = syy = sxw = syw = sww = 0.0
-    for b in range(max(row - reach, 0), min(row + reach + 1, rows)):
-        for a in range(column - reach, column + reach + 1):
-            at = a % columns if around else a
-            if at < 0 or at >= columns or grid[b, at] < 0:
-                continue
-            i = grid[b, at]
-            dx, dy, dw = u[i] - x, v[i] - y, w[i] / reference - 1.0
-            if around:
-                dx = dx - columns * np.round(dx / columns)
+                nearest, least = np.int64(i), distance
+            reference = w[i] if n == 0.0 else reference
+            dw = w[i] / reference - 1.0
             n += 1.0
             sx, sy, sw = sx + dx, sy + dy, sw + dw
             sxx, sxy, syy = sxx + dx * dx, sxy + dx * dy, syy + dy * dy
@@ -456,16 +515,36 @@ def surface(grid, u, v, w, x, y, reach, around):
 
 @serial
 def new_in_points(
-    grid, u, v, w, camera, around, reach, spacing, allowed, T, edge, share, low, factor, seed, table, point, hashed
+    grid,
+    u,
+    v,
+    w,
+    camera,
+    around,
+    reach,
+    spacing,
+    allowed,
+    T,
+    edge,
+    share,
+    low,
+    factor,
+    most,
+    seed,
+    table,
+    point,
+    hashed,
 ):
     """Add spots where points show a coarse cell without one; return how many.
 
-    Places are looked at evenly over the surface, as in `new_in_image`: on the plane through the points around a point,
-    up to half of `spacing` (pixels) away from it; at the point itself if there is no plane.
+    Places are looked at evenly over the surface, as in `new_in_image`, at `most` of the points: on the plane through
+    the points around a point, up to half of `spacing` (pixels) away from it; at the point itself without a plane.
     """
-    total, n, at = len(w), 0, np.int64(0)
+    total, n, at = len(w), 0, np.int64(seed % len(w))
+    looked = min(total, most)
     fx, fy, cx, cy = camera
-    for _ in range(total):
+    spacing = spacing * np.sqrt(total / looked)
+    for _ in range(looked):
         at += factor
         if at >= total:
             at -= total
@@ -517,10 +596,10 @@ def back(x, y, w, camera, around):
 
 
 @serial
-def project_sparse(point, grid, u, v, w, camera, around, reach, T, spot, x, y, error, room, nearest):
+def project_sparse(point, grid, u, v, w, camera, around, reach, dense, T, spot, x, y, error, room, nearest):
     """Find the spots that points around show; return how many. As `project`, and `nearest` takes the nearest point.
 
-    A plane through the points around tells the depth there; where they lie on no plane, as at an edge, the nearest point
+    A plane through the points around tells the depth there; if they lie on no plane, as at an edge, the nearest point
     does, if it is the next pixel. `room` is the slope of the plane in a pixel, relative.
     """
     rows, columns = grid.shape
@@ -539,6 +618,8 @@ def project_sparse(point, grid, u, v, w, camera, around, reach, T, spot, x, y, e
         else:
             p, q = X / Z * fx + cx, Y / Z * fy + cy
             if not (-0.5 <= p < columns - 0.5 and -0.5 <= q < rows - 0.5):
+                continue
+            if dense and (abs(p - np.floor(p + 0.5)) > OFF or abs(q - np.floor(q + 0.5)) > OFF):
                 continue
         there, left, at, least, along_x, along_y = surface(grid, u, v, w, p, q, reach, around)
         if there == 0.0 or left > ON_A_PLANE:
@@ -586,8 +667,12 @@ def answer_sparse(
 
 @serial
 def next_point(grid, u, v, w, at, goal_x, goal_y, reach, around, allowed, steep):
-    """Return the point nearest to a goal in the image that shows the surface of point `at`, not `at`; -1 without any."""
+    """Return the point nearest to a goal in the image that shows the surface of point `at`, not `at`; -1 without any.
+
+    It is looked for within half of `reach`.
+    """
     rows, columns = grid.shape
+    reach = (reach + 1) // 2
     other, least = np.int64(-1), 1e18
     column, row = np.int64(np.floor(goal_x + 0.5)), np.int64(np.floor(goal_y + 0.5))
     for b in range(max(row - reach, 0), min(row + reach + 1, rows)):
@@ -607,7 +692,7 @@ def next_point(grid, u, v, w, at, goal_x, goal_y, reach, around, allowed, steep)
 
 @serial
 def answer_points(
-    spot, x, y, error, room, allowed, grid, u, v, w, labels, nearest, camera, around, reach, seed, out, near, far,
+    spot, x, y, error, room, allowed, grid, u, v, w, labels, K, nearest, camera, around, reach, seed, out, near, far,
     beyond, square,
 ):  # fmt: skip
     """Write the answers of the nearest points, whose labels (n,) are given, as `answer` does.
@@ -631,10 +716,12 @@ def answer_points(
         )
         narrow = np.cos(y[i] / fy - 0.5 * np.pi) if around else 1.0
         out[n], near[n], far[n], beyond[n] = spot[i], labels[at], labels[at], labels[at]
-        if first >= 0 and last >= 0:
+        if first >= 0 and last >= 0 and max(labels[at], labels[first], labels[last]) < K:
             far[n], beyond[n] = labels[first], labels[last]
+        else:
+            first = at
         for k in range(2):
-            j = first if k == 1 and first >= 0 and last >= 0 else at
+            j = first if k == 1 else at
             dx, dy = u[j] - x[i], v[j] - y[i]
             if around:
                 dx = dx - columns * np.round(dx / columns)
