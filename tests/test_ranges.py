@@ -54,7 +54,7 @@ def test_a_range_from_which_hardly_a_spot_was_seen_twice_has_no_alpha(twice, sai
     index = np.concatenate([np.stack([np.full(n, x), *np.divmod(np.arange(n), 60)], axis=1) for x in (16, 80)])
     labels = np.repeat(rng.integers(0, 3, 2 * n)[:, None], 2, axis=1)
     labels[twice:n, 1] = -1
-    found = range_agreement(spots_of(labels, index=index, centres=[[0, 6, 7.5], [0.1, 6, 7.5]]))
+    found = range_agreement(spots_of(labels, index=index, centres=[[0, 6, 7.5], [0.1, 6, 7.5]], spacing=0.25))
     assert found is not None
     near, far = found.strata[0], found.strata[-1]
     assert math.isnan(near.alpha.value) != said
@@ -68,7 +68,7 @@ def seen_from_afar(labels, distance=20):
     index = np.concatenate(
         [np.stack([np.full(n, x), *np.divmod(np.arange(n), 60)], axis=1) for x in (16, 4 * distance)]
     )
-    found = range_agreement(spots_of(labels, index=index, centres=[[0, 6, 7.5], [0.1, 6, 7.5]]))
+    found = range_agreement(spots_of(labels, index=index, centres=[[0, 6, 7.5], [0.1, 6, 7.5]], spacing=0.25))
     assert found is not None
     return found
 

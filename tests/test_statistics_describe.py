@@ -61,7 +61,7 @@ def described():
 def test_a_description_is_content_for_json_and_every_voxel_has_a_value(described, tmp_path):
     write_json(tmp_path / "statistics.json", described.summary)
     content = read_json(tmp_path / "statistics.json")
-    assert content["schema"] == 2
+    assert content["schema"] == 3
     assert content["agreement"]["voxel_alpha"]["value"] == described.summary.agreement.voxel_alpha.value
     assert content["headline"]["alpha"]["value"] == described.summary.headline.alpha.value
     assert content["strata"][0]["psa"] is None
@@ -96,7 +96,7 @@ def test_a_description_holds_what_the_functions_say(described):
     repeated = table.op >= 2
     assert (summary.repeated.voxels, summary.repeated.share) == (repeated.sum(), pytest.approx(repeated.mean()))
     assert summary.agreement.voxel_alpha.value == pytest.approx(krippendorff_alpha(table))
-    assert summary.headline.alpha.value == pytest.approx(krippendorff_alpha(table))  # each cell is alone in its voxel
+    assert summary.headline.alpha.value == pytest.approx(krippendorff_alpha(table))  # each spot is alone in its voxel
     found = summary.spots
     assert (found.spots, found.views, found.frames, found.spacing) == (repeated.sum(), F, F, 0.125)
     shares = table.evidence[:][repeated].sum(axis=0) / table.op[repeated].sum()
@@ -163,7 +163,7 @@ def test_a_table_alone_is_described_as_far_as_it_goes():
         assert "for this scene flown again, from 8 frames" in found.verdict.line
 
 
-def test_without_cells_there_is_no_verdict_and_the_line_says_what_to_give():
+def test_without_spots_there_is_no_verdict_and_the_line_says_what_to_give():
     events = model(0.2, 0)
     found = describe(events.table(), events)
     assert (found.spots, found.correlogram, found.verdict.level) == (None, None, "no verdict")

@@ -14,6 +14,7 @@ from semstab.data.contrast import ComparedObservations
 from semstab.statistics import compare_models
 from semstab.statistics.accumulate import sums_of_spots
 from semstab.statistics.cluster_sums import value
+from semstab.statistics.observations import COLUMNS
 from semstab.statistics.paired_differences import common_observations, psa_bounds, stratum_counts, thin_share
 
 SIZE = 0.2
@@ -109,13 +110,13 @@ def across(frame):
 
 
 def at_borders(frame):
-    """The pixels around the borders of stripes: 15 % of all, in cells that show easy pixels too."""
+    """The pixels around the borders of stripes: 15 % of all, beside easy ones."""
     stripe = across(frame) / 0.9
     return np.abs(stripe - np.round(stripe)) < 0.15 / 2
 
 
 def anew_in_each_frame(frame):
-    """Pixels that fill the cells that they are in: 15 % of all, others in each frame."""
+    """Pixels in strips across the floor: 15 % of all, others in each frame."""
     strip = np.floor(across(frame) / 0.25).astype(int)
     return np.random.default_rng(frame.index).random(200)[strip] < 0.15
 
@@ -154,19 +155,23 @@ def test_that_a_model_leaves_the_hardest_out_is_said(hardest):
     assert found.depends
 
 
-def test_common_observations_are_of_cells_of_which_all_models_labelled_every_pixel():
+def test_common_observations_are_of_spots_to_which_all_models_gave_labels_at_the_same_pixels():
     frames = list(flight(4, flicker=0.2))
     rng = np.random.default_rng(4)
-    both = common_observations([sampled(frames), sampled(without(frames, lambda frame: rng.random(frame.shape) < 0.5))])
-    one, other = (own.observations() for own in both.shared)
+    whole = sampled(frames)
+    both = common_observations([whole, sampled(without(frames, lambda frame: rng.random(frame.shape) < 0.5))])
+    one, other = both.shared
     assert len(one) > 1000
-    np.testing.assert_array_equal(one.pixels, other.pixels)
-    np.testing.assert_array_equal(one.evidence, other.evidence)
-    np.testing.assert_array_equal(one.frame, other.frame)
+    for name in COLUMNS:  # of the second and the third answers, too
+        np.testing.assert_array_equal(getattr(one, name), getattr(other, name))
+    np.testing.assert_array_equal(one.observations().evidence, other.observations().evidence)
     assert both.missing[0] == 0
     assert both.missing[1] == pytest.approx(0.5, abs=0.01)
-    every = [own.weight.sum() for own in both.ignoring]
-    assert every[0] == every[1] == sampled(frames).weight.sum()
+    assert [len(own) for own in both.ignoring] == [len(whole)] * 2
+    for own in both.ignoring:
+        assert own.K == K + 1
+    assert np.mean(both.ignoring[0].label == K) == 0
+    assert np.mean(both.ignoring[1].label == K) == both.missing[1]
 
 
 def test_models_without_common_frames_have_no_common_observations():

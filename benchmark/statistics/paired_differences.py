@@ -243,7 +243,7 @@ class CommonObservations:
     """Models of one scene with their common observations.
 
     Attributes:
-        shared: For each model the answers for spots and views to which all models gave a label.
+        shared: For each model the answers for spots and views to which all models gave a label, at the same pixels.
         ignoring: For each model the answers that any model gave, with one more class, the last, for those that the
             model left without a label.
         missing: Share of these answers that the model left without a label.
@@ -257,6 +257,9 @@ class CommonObservations:
 def common_observations(models: Sequence[SpotObservations]) -> CommonObservations:
     """Return the common observations of samples.
 
+    Where the pixel beside has no label of one model, its second answer is of another pixel than that of the others, or
+    there is none: such observations are not common, since alpha would differ though all labels are the same.
+
     Raises:
         DataError: If they differ in K.
     """
@@ -264,11 +267,13 @@ def common_observations(models: Sequence[SpotObservations]) -> CommonObservation
         raise DataError("samples with different classes cannot be compared; fuse both alike")
     models = same_spots(models)
     of, first = _numbered(models)
-    labelled, silent = np.zeros((2, len(models), len(first)))
+    labelled, silent, near, far = np.zeros((4, len(models), len(first)))
     for k, (own, sample) in enumerate(zip(of, models, strict=True)):
         labelled[k] = np.bincount(own[sample.label < sample.K], minlength=len(first))
         silent[k] = np.bincount(own[sample.label == sample.K], minlength=len(first))
-    common: Mask = (labelled > 0).all(axis=0) & (silent == 0).all(axis=0)
+        near[k], far[k] = (np.bincount(own, squares, len(first)) for squares in (sample.near, sample.far))
+    elsewhere = (near == near[0]).all(axis=0) & (far != far[0]).any(axis=0)
+    common: Mask = (labelled > 0).all(axis=0) & (silent == 0).all(axis=0) & ~elsewhere
     most = labelled.max(axis=0)
     asked = SpotObservations.stacked(models).only(first)
     shared, ignoring = [], []
