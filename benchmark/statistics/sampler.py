@@ -11,6 +11,7 @@ from __future__ import annotations
 import functools
 import hashlib
 import math
+import zlib
 from dataclasses import dataclass
 from typing import Any
 
@@ -35,9 +36,8 @@ MOST_NEW = 1 << 15
 LOOKED_AT = 6_000
 """Blocks of pixels, about, or points of a scan, in which new spots are looked for."""
 
-LEAST_PART, ALL_NEW = 0.25, 20.0
-"""Least part of the blocks in which new spots are looked for once few are new; and the share of new ones in all spots,
-1 / ALL_NEW, from which on all blocks are looked at."""
+PART = 0.5
+"""Part of the blocks in which new spots are looked for after the first frame: a place is seen by several frames."""
 
 APART = 0.7
 """Edge of a coarse cell, by the mean area that a block of pixels shows, or up to twice as much."""
@@ -172,7 +172,7 @@ class Sampler:
         if view is None:
             return
         self._known = self._spots
-        T, seed = fixed(frame.T_wc), (frame.index + 1) * 0x9E3779B9 & 0xFFFFFFFF
+        T, seed = fixed(frame.T_wc), zlib.crc32(np.ascontiguousarray(frame.T_wc).tobytes())
         if sparse is None:
             self._noise = _noise(frame)
             self._find(frame, T, seed)
@@ -230,9 +230,8 @@ class Sampler:
             room = max(2 * len(self._hash), self._spots + MOST_NEW)
             self._point, self._hash = _longer(self._point, room), _longer(self._hash, room)
         end = self._spots + MOST_NEW
-        new = find(self._table, self._point[self._spots : end], self._hash[self._spots : end])
-        self._spots += new
-        self._part = min(max(ALL_NEW * new / max(self._spots, 1), LEAST_PART), 1.0)
+        self._spots += find(self._table, self._point[self._spots : end], self._hash[self._spots : end])
+        self._part = PART
 
     def _rebuilt(self, size: int) -> Int64:
         """Return a table of the coarse cells of all spots."""
@@ -266,7 +265,8 @@ class Sampler:
         self._learn(self._known, spot, error)
         out = _room(n)
         m = answer(
-            spot, x, y, room, self._allowed(), fixed(frame.depth), *_labels(frame), self.K, camera, seed, *out,
+            spot, x, y, room, self._allowed(), fixed(frame.depth), *_labels(frame), self.K, camera, self._hash,
+            seed, *out,
         )  # fmt: skip
         return tuple(column[:m] for column in out)
 
@@ -284,35 +284,14 @@ class Sampler:
         out = _room(n)
         if sparse.labels is None:
             m = answer_sparse(
-                spot,
-                x,
-                y,
-                error,
-                self._allowed(),
-                *_labels(frame),
-                self.K,
-                sparse.w,
-                nearest,
-                sparse.camera,
-                seed,
-                *out,
-            )
+                spot, x, y, error, self._allowed(), *_labels(frame), self.K, sparse.w, nearest, sparse.camera,
+                self._hash, seed, *out,
+            )  # fmt: skip
         else:
             m = answer_points(
-                spot,
-                x,
-                y,
-                error,
-                room,
-                self._allowed(),
-                *sparse.arrays,
-                sparse.labels,
-                self.K,
-                nearest,
-                *place,
-                seed,
-                *out,
-            )
+                spot, x, y, error, room, self._allowed(), *sparse.arrays, sparse.labels, self.K, nearest, *place,
+                self._hash, seed, *out,
+            )  # fmt: skip
         return tuple(column[:m] for column in out)
 
     def _take(self, view: int, spot: Any, label: UInt16, second: UInt16, third: UInt16, square: Any) -> None:

@@ -372,7 +372,9 @@ def aside(side):
 
 
 @serial
-def answer(spot, x, y, room, allowed, depth, labels, unlabelled, K, camera, seed, out, near, far, beyond, square):
+def answer(
+    spot, x, y, room, allowed, depth, labels, unlabelled, K, camera, hashed, seed, out, near, far, beyond, square
+):
     """Write the answers of the pixels that show a spot: its number, three labels, and two squared distances, metres^2.
 
     A pixel shows a spot if both are at the same depth, but for `allowed` (relative). The first label is that of the
@@ -392,7 +394,7 @@ def answer(spot, x, y, room, allowed, depth, labels, unlabelled, K, camera, seed
         ex, ey = dx, dy
         if own < K:
             along_x, along_y = slopes(depth, row, column, here)
-            start = np.int64(mixed(np.uint32(np.uint32(seed) ^ np.uint32(spot[i]))) & np.uint32(3))
+            start = np.int64(mixed(np.uint32(np.uint32(seed) ^ hashed[spot[i]])) & np.uint32(3))
             for turn in range(4):
                 step_x, step_y = aside((start + turn) & 3)
                 labelled = np.int64(K)
@@ -636,7 +638,7 @@ def project_sparse(point, grid, u, v, w, camera, around, reach, dense, T, spot, 
 
 @serial
 def answer_sparse(
-    spot, x, y, error, allowed, labels, unlabelled, K, w, nearest, camera, seed, out, near, far, beyond, square
+    spot, x, y, error, allowed, labels, unlabelled, K, w, nearest, camera, hashed, seed, out, near, far, beyond, square
 ):
     """Write the answers of the pixels of an image with sparse depth and dense labels, as `answer` does."""
     H, W = labels.shape
@@ -649,7 +651,7 @@ def answer_sparse(
         own, dx, dy = own_label(labels, unlabelled, row, column, K), column - x[i], row - y[i]
         second, third, ex, ey = own, own, dx, dy
         if own < K:
-            start = np.int64(mixed(np.uint32(np.uint32(seed) ^ np.uint32(spot[i]))) & np.uint32(3))
+            start = np.int64(mixed(np.uint32(np.uint32(seed) ^ hashed[spot[i]])) & np.uint32(3))
             for turn in range(4):
                 step_x, step_y = aside((start + turn) & 3)
                 a, b = column + 2 * step_x, row + 2 * step_y
@@ -694,8 +696,8 @@ def next_point(grid, u, v, w, at, goal_x, goal_y, reach, around, allowed, steep)
 
 @serial
 def answer_points(
-    spot, x, y, error, room, allowed, grid, u, v, w, labels, K, nearest, camera, around, reach, seed, out, near, far,
-    beyond, square,
+    spot, x, y, error, room, allowed, grid, u, v, w, labels, K, nearest, camera, around, reach, hashed, seed, out, near,
+    far, beyond, square,
 ):  # fmt: skip
     """Write the answers of the nearest points, whose labels (n,) are given, as `answer` does.
 
@@ -708,7 +710,7 @@ def answer_points(
         if abs(error[i]) > allowed:
             continue
         at = nearest[i]
-        step_x, step_y = aside(np.int64(mixed(np.uint32(np.uint32(seed) ^ np.uint32(spot[i]))) & np.uint32(3)))
+        step_x, step_y = aside(np.int64(mixed(np.uint32(np.uint32(seed) ^ hashed[spot[i]])) & np.uint32(3)))
         half = 0.5 * reach
         first = next_point(
             grid, u, v, w, at, u[at] + half * step_x, v[at] + half * step_y, reach, around, allowed, room[i]
