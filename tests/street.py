@@ -92,7 +92,7 @@ def write_street(folder, street):
     classes = [Scan(points, np.searchsorted(street.known, ids), T) for points, ids, T in street]
     names = write_semantickitti(folder, classes, street.known, TO_CAMERA)
     for k, (name, scan) in enumerate(zip(names, classes, strict=True)):
-        far = np.clip((np.linalg.norm(scan.points, axis=1) - 8) / 12, 0, 0.8)
+        far = np.clip((np.linalg.norm(scan.points, axis=1) - 12) / 70, 0, 0.8)
         for model, share in (("clean", 0.0), ("flips", 0.25 if k % 3 == 1 else 0.0), ("far", far)):
             wrong = rng.random(len(scan.walls)) < share
             predicted = np.where(wrong, rng.integers(0, len(IDS), len(scan.walls)), scan.walls)
