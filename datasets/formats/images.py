@@ -11,7 +11,7 @@ import io
 import os
 import re
 import struct
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Collection, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -23,14 +23,14 @@ import numpy.typing as npt
 
 from semstab.core.types import Float32, Mask, UInt8, UInt16, UInt32
 from semstab.data.labels import IGNORE_8BIT, IGNORE_16BIT, LabelSpace
-from semstab.datasets.formats.disk import AGAIN, decode_array, read_bytes
+from semstab.datasets.formats.disk import AGAIN, NPY_SHAPE, decode_array, read_bytes
 from semstab.datasets.geometry.lenses import Labels
 from semstab.errors import ConfigError, DataError, summarize_error
 
 if TYPE_CHECKING:
     from PIL.ImageFile import ImageFile
 
-DEPTH_SUFFIXES = (".png", ".npy", ".npz", ".exr", ".tiff", ".tif")
+DEPTH_SUFFIXES = (".png", ".npy", ".npz", ".exr", ".tiff", ".tif", ".pfm")
 LABEL_SUFFIXES = (".png", ".npy", ".npz")
 SCORE_SUFFIXES = (".npz", ".npy")
 COLOR_SUFFIXES = (".png", ".jpg", ".jpeg", ".tif", ".tiff")
@@ -38,6 +38,8 @@ MASK_SUFFIXES = (".png",)
 
 MILLIMETRES = 1000.0
 NO_CLASS = IGNORE_16BIT
+HEADER_BYTES = 256
+"""Bytes that hold the size of an array or of a float map."""
 MAX_PIXELS = 2**28
 MAX_IMAGE_BYTES = 2**29
 """Largest decoded image: RGB of 178 megapixels."""
@@ -73,6 +75,8 @@ def read_depth(path: Path, scale: float | None = None, read: Read = read_bytes) 
         depth = _decode_tiff(path, data)
     elif suffix == ".exr":
         depth = _decode_exr(path, data)
+    elif suffix == ".pfm":
+        depth = _decode_pfm(path, data)
     else:
         depth = decode_array(path, data, "depth")
     if depth.ndim != 2 or depth.dtype.kind not in "fui":
@@ -95,10 +99,12 @@ def _unpacked(samples: npt.NDArray[Any]) -> Float32 | None:
     return depth if len(known) and bool(((known >= NEAREST) & np.isfinite(known)).all()) else None
 
 
-def read_labels(path: Path, space: LabelSpace | None = None, read: Read = read_bytes) -> Labels:
+def read_labels(
+    path: Path, space: LabelSpace | None = None, read: Read = read_bytes, void: Collection[int] = ()
+) -> Labels:
     """Return the class ids (H, W) uint8 or uint16, in the ids of the file; RGB maps through the colours of `space`.
 
-    Wider integers are narrowed.
+    Wider integers are narrowed; of these the ids `void` are ignored.
 
     Raises:
         DataError: For a colour or an id that no class can have, an RGB map without `space`, another type, or a damaged
@@ -106,7 +112,7 @@ def read_labels(path: Path, space: LabelSpace | None = None, read: Read = read_b
     """
     data = read(path)
     if path.suffix.lower() != ".png":
-        return _narrow(path, decode_array(path, data, "labels"), space)
+        return _narrow(path, decode_array(path, data, "labels"), space, void)
     with _whole_png(path, data) as png:
         if png.kind not in ("grey", "palette") and (png.kind not in ("RGB", "RGBA") or png.bits != 8):
             raise DataError(
@@ -201,20 +207,48 @@ def color_size(path: Path) -> Size:
         return image.size
 
 
+def depth_size(path: Path) -> Size | None:
+    """Return (width, height) of a depth image from its header; None where that does not tell, or is damaged."""
+    from PIL import Image
+
+    suffix = path.suffix.lower()
+    try:
+        if suffix in (".png", ".tif", ".tiff"):
+            with Image.open(path) as image:
+                return image.size
+        with path.open("rb") as file:
+            head = file.read(HEADER_BYTES)
+    except (OSError, ValueError, SyntaxError, Image.DecompressionBombError):  # raised where the image is needed
+        return None
+    if suffix == ".pfm" and (match := PFM_HEADER.match(head)):
+        return int(match[2]), int(match[3])
+    if suffix == ".npy" and (shape := NPY_SHAPE.search(head)):
+        sides = [int(side) for side in re.findall(rb"\d+", shape[1])]
+        return (sides[1], sides[0]) if len(sides) == 2 else None
+    return None
+
+
 # --- labels ---------------------------------------------------------------------------------------------------------
 
 
-def _narrow(path: Path, ids: npt.NDArray[Any], space: LabelSpace | None) -> Labels:
+def _narrow(path: Path, ids: npt.NDArray[Any], space: LabelSpace | None, void: Collection[int]) -> Labels:
     """Return integer ids of any width as uint8 where the classes (without `space`: the ids) fit, else uint16."""
     if ids.ndim != 2 or ids.size == 0 or ids.dtype.kind not in "ui":
         raise DataError(f"{path}: labels must be integer ids (H, W), got {ids.dtype} of shape {ids.shape}")
     if ids.dtype in (np.uint8, np.uint16):
         return ids
-    low, high = int(ids.min()), int(ids.max())
+    ignored = np.isin(ids, [*void]) if void else np.zeros(ids.shape, np.bool_)
+    known = ids[~ignored]
+    low, high = (int(known.min()), int(known.max())) if known.size else (0, 0)
     if low < 0 or high > IGNORE_16BIT:
-        raise DataError(f"{path}: label ids from {low} to {high}; store ids from 0, and 255 (65535) for 'ignore'")
+        outside = np.unique(known[(known < 0) | (known > IGNORE_16BIT)])
+        mend = f"; if {outside[0]} is 'ignore', set void_ids: {{MODEL: [{outside[0]}]}}" if len(outside) == 1 else ""
+        raise DataError(f"{path}: label ids from {low} to {high}{mend}; store ids from 0, and 255 (65535) for 'ignore'")
     fits = high <= IGNORE_8BIT and (space is None or max(space.ids) < IGNORE_8BIT)
-    return ids.astype(np.uint8) if fits else ids.astype(np.uint16)
+    kind, ignore = (np.uint8, IGNORE_8BIT) if fits else (np.uint16, IGNORE_16BIT)
+    narrowed: Labels = ids.astype(kind)
+    narrowed[ignored] = ignore
+    return narrowed
 
 
 def _labels_by_color(path: Path, image: UInt8, space: LabelSpace) -> Labels:
@@ -230,9 +264,47 @@ def _labels_by_color(path: Path, image: UInt8, space: LabelSpace) -> Labels:
         y, x = np.argwhere(unknown)[0]
         raise DataError(
             f"{path}: colour {tuple(image[y, x, :3].tolist())} at pixel ({x}, {y}) ({np.count_nonzero(unknown)} pixels)"
-            f" is no class of '{space.name}'; set taxonomy to the one whose colours the image has"
+            f" is no class of '{space.name}'; {_cause(image[..., :3], unknown, table)}"
         )
     return ids.astype(np.uint8) if max(space.ids) < IGNORE_8BIT else ids
+
+
+NEIGHBOURS = 4
+"""Pixels from a mixed one, at most, to those whose colours are mixed in it."""
+
+MIXED_SHARE, LEAST_KNOWN = 0.8, 0.3
+"""The share of the unknown pixels that mixtures explain, and of all that have a class besides."""
+
+
+def _cause(image: UInt8, unknown: Mask, table: UInt16) -> str:
+    """Return why colours (H, W, 3) may be no class, and what to do."""
+    used = [name for name, channel in zip(("red", "green", "blue"), range(3), strict=True) if image[..., channel].any()]
+    if (image == image[..., :1]).all():
+        return "its three channels are equal: are they ids? save one of them, image[..., 0], as grey"
+    if len(used) == 1:
+        return f"only its {used[0]} channel is not 0: are these ids, as CARLA's? save that channel alone, as grey"
+    if np.count_nonzero(table[_packed(image[..., ::-1])] == NO_CLASS) < 0.05 * unknown.size:
+        return (
+            "with red and blue exchanged it is one: OpenCV writes BGR; exchange them (image[..., ::-1]) and save again"
+        )
+    mixed = _is_mixed(image, unknown) | _is_mixed(image.swapaxes(0, 1), unknown.T).T
+    if (~unknown).mean() >= LEAST_KNOWN and mixed[unknown].mean() >= MIXED_SHARE:
+        return "such colours are mixtures of neighbouring classes at borders; resize label maps by the nearest pixel"
+    return "set taxonomy to the one whose colours the image has"
+
+
+def _is_mixed(image: UInt8, unknown: Mask) -> Mask:
+    """Return the unknown pixels (H, W) whose colour lies between those of the next known ones in their row."""
+    H, W = unknown.shape
+    u = np.arange(W)
+    before = np.maximum.accumulate(np.where(unknown, -W, u), axis=1)
+    after = np.minimum.accumulate(np.where(unknown, 2 * W, u)[:, ::-1], axis=1)[:, ::-1]
+    near = unknown & (u - before <= NEIGHBOURS) & (after - u <= NEIGHBOURS)
+    rows = np.arange(H)[:, None]
+    a, b = (image[rows, at.clip(0, W - 1)].astype(np.int16) for at in (before, after))
+    between = (image >= np.minimum(a, b) - 1) & (image <= np.maximum(a, b) + 1)
+    mixed: Mask = near & between.all(axis=2)
+    return mixed
 
 
 @functools.lru_cache(maxsize=2)
@@ -389,6 +461,30 @@ def _decode_exr(path: Path, data: bytes) -> npt.NDArray[Any]:
     if depth.ndim != 2:
         raise DataError(f"{path}: expected one channel, got {depth.shape[2]}; export the depth channel alone")
     return depth
+
+
+PFM_HEADER = re.compile(rb"P([Ff])\s+(\d{1,9})\s+(\d{1,9})\s+([-+.\deE]{1,40})\s")
+
+
+def _decode_pfm(path: Path, data: bytes) -> npt.NDArray[Any]:
+    """Return one channel (H, W) of a portable float map, whose rows go from the bottom to the top."""
+    header = PFM_HEADER.match(data)
+    if header is None:
+        raise DataError(f"{path}: not a PFM image (it begins with {data[:8]!r}); {AGAIN}")
+    width, height, channels = int(header[2]), int(header[3]), 1 if header[1] == b"f" else 3
+    _check_pixels(path, width, height)
+    try:
+        order = "<" if float(header[4]) < 0 else ">"
+    except ValueError as error:
+        raise DataError(f"{path}: not a whole PFM image; {AGAIN}") from error
+    needed, there = 4 * width * height * channels, len(data) - header.end()
+    if there < needed:
+        raise DataError(f"{path}: truncated: {width}x{height} pixels need {needed} bytes, it has {there}; {AGAIN}")
+    stored = np.frombuffer(data, f"{order}f4", width * height * channels, header.end())
+    depth = stored.reshape(height, width, channels)[::-1].astype(np.float32)
+    if (depth != depth[..., :1]).any():
+        raise DataError(f"{path}: expected one channel, got {channels} that differ; export the depth channel alone")
+    return depth[..., 0]
 
 
 @functools.cache
