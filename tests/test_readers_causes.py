@@ -337,13 +337,21 @@ def interpolated(ids: np.ndarray) -> np.ndarray:
     return cv2.resize(PALETTE[even[::2, ::2]], ids.shape[::-1], interpolation=cv2.INTER_LINEAR)
 
 
-def millimetres(folder: Path) -> None:
+def millimetres(folder: Path, units: float = 1000) -> None:
     def longer(path: Path) -> None:
         T = np.loadtxt(path)
-        T[:3, 3] *= 1000
+        T[:3, 3] *= units
         np.savetxt(path, T)
 
     every(folder / "pose", longer)
+
+
+def centimetres(folder: Path) -> None:
+    millimetres(folder, 100)
+
+
+def flat_beside_the_truth(folder: Path) -> None:
+    renamed(lambda path: path.parents[1] / path.name)(folder)
 
 
 def inverse(folder: Path) -> None:
@@ -363,6 +371,8 @@ CAUSES = {
         "set taxonomy to the one whose colours the image has",
     ),
     "poses in millimetres": (millimetres, r"under metres_per_unit: 0.001 \(set it in .*; the poses are in millimetres"),
+    "poses in centimetres": (centimetres, r"under metres_per_unit: 0.01 \(set it in .*; the poses are in centimetres"),
+    "labels beside the truth": (flat_beside_the_truth, r"labels/000.png: .*; set labels: \{net: 'labels/\{name\}'\}"),
     "inverse depth": (inverse, r"with 0.* error under depth_kind: inverse \(set it in "),
     "labels in JPEG": (jpeg, r"labels/net/000.jpg is a JPEG, which changes class ids; write label maps as PNG"),
     "labels of other names": (

@@ -38,6 +38,9 @@ OPTION = "dataset.options."
 METRIC = (0.1, 200.0)
 """The least and the largest median of depth, metres, that cameras see."""
 
+COARSE = (0.001, 0.01, 0.1, 10.0)
+"""Units of depth in a metre that no dataset uses: where a factor leads to one, it is one on the poses."""
+
 UNITS = {1000.0: "millimetres", 100.0: "centimetres", 10.0: "decimetres", 0.001: "kilometres"}
 """Units of poses, by how many are in a metre."""
 
@@ -181,7 +184,11 @@ class Reading:
         """Return whether a factor on depth is rather one on the poses: depth is metric as it is, and not with it."""
         factor, (least, most) = convention.factor, METRIC
         known = "metres_per_unit" in self.said and convention.depth == self.convention.depth and not self.in_program
-        return known and factor != 1 and least <= self.median <= most and not least <= factor * self.median <= most
+        if not known or factor == 1 or not least <= self.median <= most:
+            return False
+        scale = (self.depth_scale or 1.0) / factor
+        unused = any(abs(scale / coarse - 1) < USUAL for coarse in COARSE)
+        return unused or not least <= factor * self.median <= most
 
     def _of_factor(self, convention: Convention) -> tuple[str, str]:
         """Return the setting that makes up for a factor on depth, and its value."""

@@ -179,7 +179,10 @@ def unread_labels(options: LabelOptions, entry: SceneEntry, frames: Sequence[Nam
     folder = entry.folder / "labels"
     if options.labels is not None or options.labels_root is not None or not folder.is_dir() or not frames:
         return None
-    for place, template in ((folder, "labels"), *((folder / name, "labels/{model}") for name in subfolders(folder))):
+    for place, template in (
+        (folder, "labels"),
+        *((folder / name, "labels/{model}") for name in subfolders(folder) if name != GROUND_TRUTH),
+    ):
         suffixes = (*images.LABEL_SUFFIXES, *LOSSY_SUFFIXES, *OTHER_SUFFIXES)
         files = sorted(
             (path for path in place.iterdir() if path.suffix.lower() in suffixes), key=lambda p: natural(p.name)
@@ -281,7 +284,7 @@ class LabelMaps:
         self.ground_truth = GROUND_TRUTH in labels
         self.regions = tuple(regions)
         self.class_ids = class_ids
-        self.unread = None if labels else unread_labels(options, entry, frames)
+        self.unread = None if self.models else unread_labels(options, entry, frames)
         self._options = options
         self._folder = entry.folder
         self._frames = frames
