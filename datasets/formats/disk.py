@@ -321,12 +321,10 @@ def read_camera(path: Path) -> tuple[Intrinsics, tuple[int, int] | None]:
     """
     content = read_object(path)
     where = str(path)
-    sides = [
-        next((key for key in keys if content.get(key) is not None), None) for keys in (("width", "w"), ("height", "h"))
-    ]
-    size = None if None in sides else tuple(pixels(content, str(key), where) for key in sides)
+    sized = content.get("width") is not None and content.get("height") is not None
+    size = (pixels(content, "width", where), pixels(content, "height", where)) if sized else None
     columns = content.get("intrinsic_matrix")
-    rows = [value for value in content.values() if isinstance(value, list) and len(value) == 3]
+    rows = [value for value in content.values() if isinstance(value, list) and len(value) == 3 and _size(value) == 9]
     if isinstance(columns, list) and len(columns) == 9:
         numbers = [number({"intrinsic_matrix": value}, "intrinsic_matrix", where) for value in columns]
         K = np.array(numbers, dtype=np.float64).reshape(3, 3).T

@@ -245,9 +245,8 @@ def _narrow(path: Path, ids: npt.NDArray[Any], space: LabelSpace | None, void: C
         mend = f"; if {outside[0]} is 'ignore', set void_ids: {{MODEL: [{outside[0]}]}}" if len(outside) == 1 else ""
         raise DataError(f"{path}: label ids from {low} to {high}{mend}; store ids from 0, and 255 (65535) for 'ignore'")
     fits = high <= IGNORE_8BIT and (space is None or max(space.ids) < IGNORE_8BIT)
-    kind, ignore = (np.uint8, IGNORE_8BIT) if fits else (np.uint16, IGNORE_16BIT)
-    narrowed: Labels = ids.astype(kind)
-    narrowed[ignored] = ignore
+    narrowed: Labels = ids.astype(np.uint8) if fits else ids.astype(np.uint16)
+    narrowed[ignored] = IGNORE_8BIT if fits else IGNORE_16BIT
     return narrowed
 
 
