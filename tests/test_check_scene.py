@@ -339,7 +339,7 @@ def damage_intrinsics(folder):
 
 def damage_settings(folder):
     (folder / "scene.yaml").write_text("depth_kind: euclidean\n")
-    return "scene.yaml: depth_kind: input should be 'planar' or 'ray' (got 'euclidean')"
+    return "scene.yaml: depth_kind: input should be 'planar', 'ray' or 'inverse' (got 'euclidean')"
 
 
 @pytest.mark.parametrize(
