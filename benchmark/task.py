@@ -86,6 +86,8 @@ def tasks_of(scene: Scene, config: Config, others: Sequence[str] = ()) -> Iterat
     """
     names = models_of(scene, config)
     if not names:
+        if scene.unread is not None:
+            raise DataError(scene.unread)
         searched = f"searched {', '.join(scene.label_paths)}; " if scene.label_paths else ""
         what, instead = "label maps", "add them, or predict them: --predict colour-clusters, or --predict FILE.py:NAME"
         if scene.of_scans:

@@ -18,16 +18,20 @@ from pydantic import BaseModel, Field
 
 from semstab.core.files import open_file
 from semstab.datasets.files import options as opt
+from semstab.datasets.files.labels import SceneEntry
 from semstab.datasets.files.options import FileOptions, Folders, FrameSource, Template, inside
 from semstab.datasets.files.reader import FileDataset
-from semstab.datasets.formats.disk import AGAIN, natural, numbered_lines, to_number
+from semstab.datasets.formats.disk import AGAIN, natural, numbered_lines, subfolders, to_number
 from semstab.datasets.formats.images import DEPTH_SUFFIXES, color_size
 from semstab.datasets.geometry.cameras import Camera, Poses, from_quaternions
 from semstab.errors import DataError
 
 logger = logging.getLogger("semstab")
 
-MODEL_FOLDERS = ("sparse", "sparse/0", ".")
+MODELS_FOLDER = "sparse"
+"""The folder of the sparse model, or of one model a subfolder: 0, 1, ..."""
+
+ALL = "all"
 
 
 class ColmapOptions(FileOptions):
@@ -35,7 +39,10 @@ class ColmapOptions(FileOptions):
 
     pose_convention: opt.PoseConvention = "world_to_camera"
     pixel_centre: opt.PixelCentre = 0.5
-    model: str | None = Field(None, description="folder of the sparse model; by default sparse, sparse/0 or the scene")
+    model: int | str | None = Field(
+        None,
+        description="folder of the sparse model, its number in sparse/, or all: a scene each; by default the only one",
+    )
     images: str = Field("images", description="folder of the (undistorted) images in the scene's")
     depth: str = Field("stereo/depth_maps/{image}.geometric.bin", description="template: {image}, {name} (no suffix)")
 
@@ -44,7 +51,8 @@ class Colmap(FileDataset[ColmapOptions]):
     """{name} is the image's name in the model without suffix: 0012, or cam0/0012.
 
     Depth maps in .bin files are in the model's unit, others in metres, unless depth_scale says so; with
-    metres_per_unit both become metric.
+    metres_per_unit both become metric. Models that the mapper left beside each other, sparse/0, sparse/1, share no
+    coordinates: one is read, or with `model: all` each is a scene, NAME-0, NAME-1.
     """
 
     Options: type[BaseModel] = ColmapOptions
@@ -52,17 +60,39 @@ class Colmap(FileDataset[ColmapOptions]):
 
     def __init__(self, options: ColmapOptions) -> None:
         self._depth = Template("depth", options.depth, ("image", "name"))
+        self._models: dict[str, Path] = {}
         super().__init__(options)
+
+    def find_scenes(self, root: Path) -> Iterator[SceneEntry]:
+        """Yield the scenes; with `model: all` one for each model."""
+        for entry in super().find_scenes(root):
+            models = self._found(entry.folder)
+            if self.options.model != ALL or len(models) == 1:
+                yield entry
+                continue
+            for model in models:
+                name = f"{entry.name}-{model.name}"
+                self._models[name] = model
+                yield SceneEntry(name, entry.folder, entry.below_root)
 
     def is_scene(self, folder: Path) -> bool:
         """Return whether there is a sparse model."""
-        return self._model(folder) is not None
+        return bool(self._found(folder))
+
+    def frames_of_scene(self, entry: SceneEntry) -> list[FrameSource]:
+        """Return the frames of the scene's model."""
+        return self._frames(entry.folder, self._models.get(entry.name) or self._only(entry.folder))
 
     def frames(self, folder: Path) -> list[FrameSource]:
-        """Return a frame for each registered image. Raises what `read_model` raises."""
+        """Return a frame for each image of the only model.
+
+        Raises:
+            DataError: For several models where none is wanted, and what `read_model` raises.
+        """
+        return self._frames(folder, self._only(folder))
+
+    def _frames(self, folder: Path, model: Path) -> list[FrameSource]:
         options, folders = self.options, Folders()
-        model = self._model(folder)
-        assert model is not None
         path, images = read_model(model)
         frames: list[FrameSource] = []
         for image in images:
@@ -80,13 +110,46 @@ class Colmap(FileDataset[ColmapOptions]):
         _tell_sizes(path, frames)
         return frames
 
-    def _model(self, folder: Path) -> Path | None:
-        names = MODEL_FOLDERS if self.options.model is None else (self.options.model,)
-        candidates = (inside(self.options.root, folder, name, "option model") for name in names)
-        return next((candidate for candidate in candidates if has_model(candidate)), None)
+    def _found(self, folder: Path) -> list[Path]:
+        """Return the folders of the models of a scene that the options leave."""
+        wanted, sparse = self.options.model, folder / MODELS_FOLDER
+        if wanted not in (None, ALL):
+            named = inside(self.options.root, folder, str(wanted), "option model")
+            numbered = sparse / str(wanted) if str(wanted).isdecimal() else named
+            return [path for path in (named, numbered) if has_model(path)][:1]
+        if has_model(sparse):
+            return [sparse]
+        models = [sparse / name for name in subfolders(sparse) if name.isdecimal() and has_model(sparse / name)]
+        return models or [path for path in (folder,) if has_model(path)]
+
+    def _only(self, folder: Path) -> Path:
+        """Return the folder of the only model of a scene.
+
+        Raises:
+            DataError: If there are several, with the number of images of each.
+        """
+        models = self._found(folder)
+        if len(models) == 1:
+            return models[0]
+        said = "; ".join(f"{model.name}: {_summary(model)}" for model in models[:MOST_LISTED])
+        more = f"; {len(models) - MOST_LISTED} more" if len(models) > MOST_LISTED else ""
+        raise DataError(
+            f"{folder / MODELS_FOLDER}: {len(models)} models, which share no coordinates ({said}{more}); choose one"
+            " with model: NUMBER (--option model=NUMBER), or model: all for a scene each"
+        )
 
 
 # The sparse model, text and binary (colmap.github.io/format.html): the cameras and the images; points are skipped.
+
+
+MOST_LISTED = 5
+"""Models that an error lists."""
+
+
+def _summary(model: Path) -> str:
+    """Return how many images a model has, and the first of them."""
+    _, images = read_model(model)
+    return f"{len(images)} image{'s' if len(images) > 1 else ''} from {images[0].name[:40]}"
 
 
 def _tell_sizes(path: Path, frames: Sequence[FrameSource]) -> None:

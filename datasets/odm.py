@@ -47,7 +47,9 @@ DSM = "odm_dem/dsm.tif"
 VIEWS = "mve/views"
 DMAPS = "undistorted/openmvs/depthmaps"
 
-NPZ_MAPS = "undistorted/depthmaps"
+NPZ_MAPS = ("undistorted/depthmaps", "depthmaps")
+"""Folders of OpenSfM's depth maps in opensfm/; the last one is that of versions before 0.5."""
+
 NPZ_SUFFIXES = (".clean.npz", ".raw.npz")
 """Of OpenSfM's own depth maps those that were checked against their neighbours first."""
 
@@ -110,7 +112,7 @@ LOCATIONS: dict[Kind, str] = {
     "dsm": DSM,
     "mve": "mve/views/view_NNNN.mve/depth-L0.mvei",
     "openmvs": "opensfm/undistorted/openmvs/depthmaps/*.dmap",
-    "opensfm": "opensfm/undistorted/depthmaps/NAME.clean.npz, NAME.raw.npz",
+    "opensfm": "opensfm/undistorted/depthmaps/NAME.clean.npz, NAME.raw.npz (or opensfm/depthmaps)",
     "files": "depth/NAME.png",
 }
 """Sources of depth and their paths; the first of them that a project has is taken."""
@@ -125,9 +127,7 @@ def find_depth(project: Project, kind: Kind, template: str) -> Path | None:
     if kind == "openmvs":
         return next(iter(sorted((project.opensfm / DMAPS).glob("*.dmap"))), None)
     if kind == "opensfm":
-        maps = project.opensfm / NPZ_MAPS
-        there = project.undistorted and any(True for suffix in NPZ_SUFFIXES for _ in maps.glob(f"*{suffix}"))
-        return maps if there else None
+        return _npz_maps(project) if project.undistorted else None
     path = project.folder / DSM if kind == "dsm" else (project.folder / template).parent
     there = path.is_file() if kind == "dsm" else "{" not in str(path) and path.is_dir()
     return path if there else None
@@ -146,7 +146,7 @@ def depth_files(project: Project, kind: Kind | None, names: Mapping[str, str], t
         return {shot: maps.get(name, folder / f"{name}.dmap") for shot, name in names.items()}
     folders = Folders()
     if kind == "opensfm":
-        maps_of = project.opensfm / NPZ_MAPS
+        maps_of = _npz_maps(project) or project.opensfm / NPZ_MAPS[0]
         candidates = {
             shot: [maps_of / f"{name}{suffix}" for suffix in NPZ_SUFFIXES for name in written_names(shot)]
             for shot in names
@@ -154,6 +154,13 @@ def depth_files(project: Project, kind: Kind | None, names: Mapping[str, str], t
         return {shot: next(filter(folders.has, paths), paths[0]) for shot, paths in candidates.items()}
     wanted = {shot: project.folder / template.filled(name=name) for shot, name in names.items()}
     return {shot: folders.one_of(path, DEPTH_SUFFIXES) or path for shot, path in wanted.items()}
+
+
+def _npz_maps(project: Project) -> Path | None:
+    """Return the folder of OpenSfM's depth maps, None where it has none."""
+    folders = (project.opensfm / name for name in NPZ_MAPS)
+    there = (maps for maps in folders if any(True for suffix in NPZ_SUFFIXES for _ in maps.glob(f"*{suffix}")))
+    return next(there, None)
 
 
 def _mve_files(views: Path, names: Mapping[str, str]) -> dict[str, Path]:

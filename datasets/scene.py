@@ -73,6 +73,7 @@ class Scene(ABC):
         made: Whether it is simulated, so that each frame has the pose that it was rendered from.
         posed: Whether its frames have depth and a pose, so that they can be fused.
         replaced: Label sources in its files that predictions stand for, and that are not read.
+        unread: The images in a folder of label maps of which none is read, and what reads them; None if there are none.
         in_program: Whether its frames are those of a program, and not in files.
     """
 
@@ -81,6 +82,7 @@ class Scene(ABC):
     ground_truth: bool = False
     further: Sequence[str] = ()
     regions: tuple[str, ...] = ()
+    unread: str | None = None
     up: Float64 | None = None
     georeference: Georeference | None = None
     placed: str | None = None
@@ -143,6 +145,9 @@ class Scene(ABC):
     def timestamps(self) -> Float64 | None:
         """Return (len,) seconds on the scene's own clock, ascending; None where it has none. Reads no image."""
         return None
+
+    def require_one_size(self, indices: Sequence[int]) -> None:  # noqa: B027  of files only
+        """Raise DataError where depth images of these frames are of a size that the intrinsics are not for."""
 
     def tracked(self, index: int) -> bool:
         """Return whether the frame has a pose, which tracking may have lost. Reads no image."""

@@ -6,7 +6,8 @@ github.com/PRBonn/semantic-kitti-api, config/semantic-kitti.yaml.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, Literal
 
@@ -72,6 +73,13 @@ class SemanticKitti(ScanDataset[SemanticKittiOptions]):
     def __init__(self, options: SemanticKittiOptions) -> None:
         super().__init__(options)
         self._table = _table(options)
+
+    def find_scenes(self, root: Path) -> Iterable[SceneEntry]:
+        """Return the scenes; one in the folder sequences/ of the benchmark is called as its sequence is: 08."""
+        entries = [*super().find_scenes(root)]
+        short = [entry.name.removeprefix("sequences-") for entry in entries]
+        unique = len(set(short)) == len(short)
+        return [replace(entry, name=name) if unique else entry for entry, name in zip(entries, short, strict=True)]
 
     def is_scene(self, folder: Path) -> bool:
         """Return whether scans are there, and their poses."""

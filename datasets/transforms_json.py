@@ -18,7 +18,7 @@ from pydantic import BaseModel, Field
 from semstab.datasets.files.options import CameraAxes, FileOptions, Folders, FrameSource, PixelCentre, Template, inside
 from semstab.datasets.files.reader import FileDataset
 from semstab.datasets.formats.disk import matrix, natural, number, pixels, read_object
-from semstab.datasets.formats.images import COLOR_SUFFIXES, DEPTH_SUFFIXES, MILLIMETRES
+from semstab.datasets.formats.images import COLOR_SUFFIXES, DEPTH_SUFFIXES, MILLIMETRES, color_size
 from semstab.datasets.geometry.cameras import Camera
 from semstab.errors import DataError
 
@@ -27,12 +27,19 @@ PINHOLES = (None, "PINHOLE", "SIMPLE_PINHOLE", "OPENCV", "perspective")
 """Camera models that do not distort if the coefficients are zero."""
 
 
+FILES = ("transforms.json", "transforms_train.json")
+"""Files of the cameras, the first that is there: Blender's exports for NeRF have one for each part of their images."""
+
+
 class TransformsOptions(FileOptions):
     """Options with the defaults of the format; the depth scale is the file's own, else 1000."""
 
     camera_axes: CameraAxes = "opengl"
     pixel_centre: PixelCentre = 0.5
-    transforms: str = Field("transforms.json", description="file of the cameras in the scene's folder")
+    transforms: str | None = Field(
+        None,
+        description="file of the cameras in the scene's folder; by default transforms.json, or transforms_train.json",
+    )
     depth: str | None = Field(None, description="template with {name}, for frames without depth_file_path")
 
 
@@ -40,7 +47,8 @@ class TransformsJson(FileDataset[TransformsOptions]):
     """{name} is the image's name without suffix, from the folder that all images share: frame_00012.
 
     Depth is read as the programs do: integers and floats are millimetres, unless the file has integer_depth_scale or
-    depth_unit_scale_factor (metres in a unit). Frames go in the natural order of their images.
+    depth_unit_scale_factor (metres in a unit). Poses that the file says to be scaled (applied_scale) are divided by
+    that. Frames go in the natural order of their images. The size of an image is its file's where no w and h are given.
     """
 
     Options: type[BaseModel] = TransformsOptions
@@ -48,14 +56,20 @@ class TransformsJson(FileDataset[TransformsOptions]):
 
     def is_scene(self, folder: Path) -> bool:
         """Return whether the file of the cameras is there."""
-        return inside(self.options.root, folder, self.options.transforms, "option transforms").is_file()
+        return self._file(folder).is_file()
 
     def frames(self, folder: Path) -> list[FrameSource]:
         """Return a frame for each entry of 'frames'. Raises what `read_transforms` raises."""
-        path = inside(self.options.root, folder, self.options.transforms, "option transforms")
+        path = self._file(folder)
         depth = self.options.depth or ("depth/{name}" if self.options.surface is not None else None)
         template = None if depth is None else Template("depth", depth, ("name",), ("name",))
         return read_transforms(path, self.options.root, folder, template)
+
+    def _file(self, folder: Path) -> Path:
+        """Return the file of the cameras, there or not."""
+        if self.options.transforms is not None:
+            return inside(self.options.root, folder, self.options.transforms, "option transforms")
+        return next((path for name in FILES if (path := folder / name).is_file()), folder / FILES[0])
 
 
 def read_transforms(path: Path, root: Path, folder: Path, depth: Template | None = None) -> list[FrameSource]:
@@ -80,6 +94,9 @@ def read_transforms(path: Path, root: Path, folder: Path, depth: Template | None
         if metres <= 0 or math.isinf(1 / metres):
             raise DataError(f"{path}: '{key}' is {metres:g}; expected the metres in a unit of depth")
         scale = 1 / metres
+    shrunk = number(content, "applied_scale", str(path)) if content.get("applied_scale") is not None else 1.0
+    if not 0 < shrunk < math.inf or math.isinf(1 / shrunk):
+        raise DataError(f"{path}: 'applied_scale' is {shrunk:g}; expected the factor by which poses were multiplied")
     for entry, image, where in zip(entries, images, wheres, strict=True):
         if image is None:
             raise DataError(f"{where}: 'file_path' is missing; add it")
@@ -89,12 +106,18 @@ def read_transforms(path: Path, root: Path, folder: Path, depth: Template | None
             stated = inside(root, folder, depth.filled(name=name), where)
         if stated is None:
             raise DataError(f"{where}: has no depth_file_path; add it, or set depth: 'depth/{{name}}.png'")
+        color, pose = (
+            folders.one_of(image, COLOR_SUFFIXES),
+            matrix(entry.get("transform_matrix"), f"{where}: transform_matrix"),
+        )
+        pose[:3, 3] /= shrunk
+        values = ChainMap(entry, content)
+        if color is not None and "camera_angle_x" in values and not {"w", "h"} & values.keys():  # of Blender
+            values = values.new_child(dict(zip("wh", color_size(color), strict=True)))
         frames.append(
             FrameSource(
-                name=name, depth=folders.one_of(stated, DEPTH_SUFFIXES) or stated,
-                pose=matrix(entry.get("transform_matrix"), f"{where}: transform_matrix"), pose_file=path,
-                camera=_camera(ChainMap(entry, content), where), color=folders.one_of(image, COLOR_SUFFIXES),
-                depth_scale=scale,
+                name=name, depth=folders.one_of(stated, DEPTH_SUFFIXES) or stated, pose=pose, pose_file=path,
+                camera=_camera(values, where), color=color, depth_scale=scale,
             )
         )  # fmt: skip
     return sorted(frames, key=lambda frame: natural(frame.name))

@@ -95,6 +95,18 @@ def test_a_file_of_another_size_than_its_frame_is_refused_first(scene, name, mat
         action()
 
 
+def test_labels_of_the_same_view_are_looked_up_unless_they_are_far_larger(scene, monkeypatch):
+    file = next((scene / "labels/a").glob("0000.*"))
+    bombs.png(file, 80, 60, 8)
+    assert frame_of(scene)().labels.shape == (6, 8)
+    bombs.png(file, 4000, 3000, 8)
+    monkeypatch.setattr("semstab.datasets.formats.images._imdecode", _fails_on(file))
+    action = frame_of(scene)
+    with pytest.raises(semstab.DataError, match=r"claims 4000x3000 pixels, but depth is 8x6 .* to one size") as error:
+        action()
+    assert "\n" not in str(error.value)
+
+
 def _fails_on(file):
     from semstab.datasets.formats import images
 
@@ -170,6 +182,25 @@ def test_a_parquet_file_of_many_rows_is_refused(tmp_path):
     )
     within(taken)
     assert "unpack to" in taken.message
+
+
+def test_scores_of_another_size_than_the_depth_have_the_bytes_of_scores(tmp_path):
+    file = bombs.npz(tmp_path / "s.npz", "scores", (100, 960, 1280), "<f4")
+    taken = bombs.read(SETUP, f"images.read_scores(Path({str(file)!r}), 'KHW', (240, 320), classes=100)")
+    within(taken)
+    assert taken.megabytes < 50
+    assert "but depth is 320x240" in taken.message
+    small = bombs.npz(tmp_path / "t.npz", "scores", (3, 12, 16), "<f4")
+    assert read_scores(small, "KHW", (6, 8)).shape == (12, 16, 3)
+
+
+@pytest.mark.parametrize("void", [(), (-1,), (0, -1)])
+def test_the_most_wide_ids_that_are_read_stay_in_bounds(tmp_path, void):
+    file = bombs.npz(tmp_path / "l.npz", "labels", (5500, 6000), "<i8")
+    taken = bombs.read(SETUP, f"images.read_labels(Path({str(file)!r}), void={void})")
+    assert taken.message is None
+    assert taken.megabytes < MOST_MB
+    assert taken.seconds < MOST_SECONDS
 
 
 def test_readers_that_know_no_frame_are_bounded_too(tmp_path):

@@ -329,7 +329,7 @@ def damage_pose(folder):
 
 def damage_size(folder):
     np.save(folder / "depth/001.npy", np.ones((10, 10), np.float32))
-    return "labels/net/001.png: labels are 96x72 but depth is 10x10"
+    return "depth/001.npy: depth is 10x10 where that of the others is 96x72"
 
 
 def damage_intrinsics(folder):
@@ -339,7 +339,7 @@ def damage_intrinsics(folder):
 
 def damage_settings(folder):
     (folder / "scene.yaml").write_text("depth_kind: euclidean\n")
-    return "scene.yaml: depth_kind: input should be 'planar' or 'ray' (got 'euclidean')"
+    return "scene.yaml: depth_kind: input should be 'planar', 'ray' or 'inverse' (got 'euclidean')"
 
 
 @pytest.mark.parametrize(

@@ -160,7 +160,7 @@ def image(path: str, *shape_and_value: int, dtype: type = np.uint16):
 
 
 @pytest.mark.parametrize(("damage", "message"), [
-    (image("depth/0001.png", 3, 4, 2000), "labels are 8x6 but depth is 4x3"),
+    (image("depth/0001.png", 3, 4, 2000), "depth is 4x3 where that of the others is 8x6"),
     (lambda wall: np.savetxt(wall / "pose/0001.txt", np.diag([2.0, 2, 2, 1])),
      "pose/0001.txt: the rotation is not orthonormal"),
     (lambda wall: os.truncate(wall / "depth/0001.png", 40), "depth/0001.png"),

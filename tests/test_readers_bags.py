@@ -163,8 +163,57 @@ def test_the_world_is_the_map_or_the_frame_that_is_named(tmp_path, frames):
     np.testing.assert_allclose(bags.ODOM_IN_MAP @ in_odom, frames[2].T_wc, atol=1e-12)
     with pytest.raises(DataError, match=rf"world_frame: 'earth' is not above '{OPTICAL}' in /tf.*camera_link, base"):
         opened(path, world_frame="earth")
-    with pytest.raises(DataError, match=r"'lidar', the frame of its images, is not in /tf \(camera_frame: one of base"):
+    known = "base_link, camera_color_optical_frame, camera_link, odom"
+    hint = rf"camera_frame: one of {OPTICAL}, or record /tf_static"
+    with pytest.raises(
+        DataError, match=rf"'lidar', the frame of its images, is not in /tf, which has {known} \({hint}"
+    ):
         opened(path, camera_frame="lidar")
+
+
+def split(frames, tmp_path, container, gap=0, first="run"):
+    """A recording in two files whose metadata.yaml is lost; what is static is in the first alone."""
+    half, folder = START + 2 * STEP - HALF, tmp_path / "lost"
+    folder.mkdir()
+    for k in (0, 1):
+
+        def part(ros, topic, time, message, k=k):
+            return [(topic, time + k * gap, message)] if (time >= half) == bool(k) else []
+
+        written = write(tmp_path, frames, part, container, f"part{k}")
+        file = written if written.is_file() else next(path for path in written.iterdir() if path.suffix != ".yaml")
+        file.rename(folder / f"{first}_{k}{file.suffix}")
+    return folder
+
+
+@pytest.mark.parametrize("container", bags.CONTAINERS)
+def test_a_split_recording_without_metadata_is_one_bag(tmp_path, frames, container):
+    folder = split(frames, tmp_path, container)
+    dataset = open_dataset("bag", {"root": folder.parent, "classes": ds.CLASSES})
+    assert "lost" in dataset.scenes
+    scene = opened(folder)
+    assert (scene.name, len(scene)) == ("lost", 4)
+    ds.assert_same_voxels(labelled(scene, frames), frames)
+
+
+def test_recordings_with_time_between_them_are_bags_each(tmp_path, frames):
+    folder = split(frames, tmp_path, "MCAP", gap=10**11)
+    assert open_dataset("bag", {"root": folder}).scenes == ("run_0", "run_1")
+
+
+def test_the_frame_of_a_body_is_not_offered_as_that_of_the_camera(tmp_path, frames):
+    folder = split(frames, tmp_path, "MCAP")
+    with pytest.raises(DataError, match=r"is not in /tf, which has .*base_link.* \(record /tf_static, too, or give"):
+        opened(folder / "run_1.mcap")
+
+
+@pytest.mark.parametrize("folder", [True, False])
+def test_a_truncated_mcap_is_mended_by_mcap_recover_wherever_it_lies(tmp_path, frames, folder):
+    path = write(tmp_path, frames, without())
+    (file,) = path.glob("*.mcap")
+    file.write_bytes(file.read_bytes()[:-3000])
+    with pytest.raises(DataError, match=r"not a whole bag .* or 'mcap recover'"):
+        opened(path if folder else file)
 
 
 def posed_by(make, frames):

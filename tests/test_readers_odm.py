@@ -160,6 +160,14 @@ def test_depth_of_every_source_which_is_said(tmp_path, kind) -> None:
         assert frame.intrinsics.fx == pytest.approx(down.K.fx * frame.shape[1] / down.W)
 
 
+def test_depth_maps_of_opensfm_in_their_older_place(tmp_path) -> None:
+    folder = write_project(tmp_path / "field", depth="opensfm")
+    expected = opened(folder).geometry(1).depth
+    (folder / "opensfm/undistorted/depthmaps").rename(folder / "opensfm/depthmaps")
+    assert opened(folder).depth_from.startswith("opensfm, ")
+    np.testing.assert_array_equal(opened(folder).geometry(1).depth, expected)
+
+
 def test_a_map_of_opensfm_that_was_checked_goes_before_a_raw_one(tmp_path) -> None:
     folder = write_project(tmp_path / "field", depth=None)
     frames = [down.frame(k) for k in range(3)]

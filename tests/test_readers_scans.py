@@ -207,7 +207,25 @@ def test_kitti_poses_are_of_the_lidar_in_the_first_lidars_world(kitti):
     np.testing.assert_allclose([scene.T_wc(k) for k in range(4)], [s.T for s in sw.scans()], rtol=0, atol=1e-9)
     np.testing.assert_allclose(scene.timestamps, [0, 0.1, 0.2, 0.3])
     assert (scene.name, scene.up.tolist()) == ("00", [0, 0, 1])
-    assert open_dataset("semantickitti", {"root": kitti.parents[1]}).scenes == ("sequences-00",)
+    assert open_dataset("semantickitti", {"root": kitti.parents[1]}).scenes == ("00",)
+
+
+@pytest.mark.parametrize("kind", ["<u2", "<i8"])
+def test_labels_of_another_width_are_told_by_the_number_of_points(kitti, kind):
+    expected = read(kitti).frame(1, "net").labels
+    for path in (kitti / "predictions/net").iterdir():
+        path.write_bytes((np.fromfile(path, "<u4") & 0xFFFF).astype(kind).tobytes())
+    np.testing.assert_array_equal(read(kitti).frame(1, "net").labels, expected)
+
+
+def test_ids_of_training_are_named(kitti):
+    for path in (kitti / "predictions/net").iterdir():
+        ids = np.arange(len(np.fromfile(path, "<u4")), dtype="<u4") % 20
+        path.write_bytes(ids.tobytes())
+    said = (
+        "is no class of the format; are ids 0 to 19 those that a network is trained with[?] write them back by learning"
+    )
+    fails(DataError, said, read(kitti).frame, 0, "net")
 
 
 def test_kitti_poses_may_be_of_the_lidar_or_inverse(kitti):

@@ -4,9 +4,12 @@ from __future__ import annotations
 
 import dataclasses
 import itertools
+import math
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from typing import Any
+
+import numpy as np
 
 from semstab.data.frames import Frame
 from semstab.datasets import Scene
@@ -18,6 +21,7 @@ Ratio = tuple[float, float]
 POSES = ("camera_to_world", "world_to_camera")
 AXES = tuple(CAMERA_AXES)
 KINDS = ("planar", "ray")
+INVERSE = "inverse"
 
 KNOWN_SCALES = (65.535, 256.0, 1000.0, 4000.0, 5000.0, 6553.5, *(10.0**k for k in range(-6, 7)))
 """Units of depth in a metre that datasets use."""
@@ -30,6 +34,15 @@ USUAL = 0.001
 
 OPTION = "dataset.options."
 """The beginning of the path of a dataset's option."""
+
+METRIC = (0.1, 200.0)
+"""The least and the largest median of depth, metres, that cameras see."""
+
+COARSE = (0.001, 0.01, 0.1, 10.0)
+"""Units of depth in a metre that no dataset uses: where a factor leads to one, it is one on the poses."""
+
+UNITS = {1000.0: "millimetres", 100.0: "centimetres", 10.0: "decimetres", 0.001: "kilometres"}
+"""Units of poses, by how many are in a metre."""
 
 RATIOS = (0.25, 0.5, 2.0, 4.0)
 """Sizes that intrinsics are for, relative to the depth image, where they were not scaled with it; others come from the
@@ -46,7 +59,7 @@ class Convention:
     Attributes:
         pose: The direction in which the pose matrices map.
         axes: The camera's axes in them.
-        depth: Planar, along the optical axis, or along the pixel's ray.
+        depth: Planar, along the optical axis; along the pixel's ray; or inverse, 1 over the first.
         factor: On depth, relative to the configured reading.
         ratio: Size of the image that the intrinsics are for, relative to the configured one: width, height.
     """
@@ -64,7 +77,9 @@ class Convention:
 
 
 def alternatives(configured: Convention, ratios: tuple[Ratio, ...]) -> Iterator[Convention]:
-    """Yield every combination of pose, axes and kind of depth; with other intrinsics only planar or ray as configured.
+    """Yield every combination of pose, axes and kind of depth; with other intrinsics only the kind as configured.
+
+    Inverse depth is tried with poses as configured.
 
     The configured convention comes first; factors are searched for each of them.
     """
@@ -73,6 +88,8 @@ def alternatives(configured: Convention, ratios: tuple[Ratio, ...]) -> Iterator[
         changed = dataclasses.replace(configured, pose=pose, axes=axes, depth=depth)
         if changed != configured:
             yield changed
+    if configured.depth != INVERSE:
+        yield dataclasses.replace(configured, depth=INVERSE)
     for ratio, pose, axes in itertools.product(ratios, POSES, AXES):
         yield dataclasses.replace(configured, pose=pose, axes=axes, ratio=ratio)
 
@@ -87,6 +104,7 @@ class Reading:
         said: Values by name of setting, those of scene.yaml and the dataset's options together.
         options: Names and values of the dataset's options.
         size: (width, height) of the depth images.
+        median: Median of their depth as configured, of one of them; metres.
         ratios: Sizes that the intrinsics may be for, relative to what is said.
         file: The scene.yaml with further settings, where the dataset has one.
         names: Names of all settings, those that are not set too.
@@ -96,6 +114,7 @@ class Reading:
     said: Mapping[str, Any]
     options: Mapping[str, Any]
     size: Size
+    median: float
     ratios: tuple[Ratio, ...]
     file: str | None
     depth_scale: float | None
@@ -108,11 +127,13 @@ class Reading:
         names = {"pose": "pose_convention", "axes": "camera_axes", "depth": "depth_kind"}
         return Convention(**{field: self.said[name] for field, name in names.items() if name in self.said})
 
-    def usual_factor(self, factor: float) -> float:
+    def usual_factor(self, factor: float, kind: str = "planar") -> float:
         """Return the factor that leads to a depth scale which datasets use, if one is near.
 
-        Otherwise the depth scale has three digits.
+        Otherwise the depth scale has three digits. Of inverse depth the scale grows with the factor.
         """
+        if kind == INVERSE:
+            return 1 / self.usual_factor(1 / factor)
         now = 1.0 if self.depth_scale is None else self.depth_scale
         near = min(KNOWN_SCALES, key=lambda known: abs(known * factor / now - 1))
         return now / (near if abs(near * factor / now - 1) <= SNAP else float(f"{now / factor:.3g}"))
@@ -137,7 +158,7 @@ class Reading:
             "pose": ("pose_convention", convention.pose),
             "axes": ("camera_axes", convention.axes),
             "depth": ("depth_kind", convention.depth),
-            "factor": ("depth_scale", self._scale_after(convention.factor)),
+            "factor": self._of_factor(convention),
             "ratio": ("intrinsics_size", f"{self.size_after(convention.ratio)}"),
         }
         return tuple(self._line(*said[field]) for field in convention.differs_in(self.convention))
@@ -149,11 +170,32 @@ class Reading:
         texts = {
             "pose": ("T_wc that maps the world to the camera", "pass np.linalg.inv(T_wc)"),
             "axes": (f"T_wc with {convention.axes} camera axes", "turn them: x right, y down, z forward"),
-            "depth": ("depth along the rays of the pixels", "convert it to depth along the optical axis"),
+            "depth": (
+                ("inverse depth", "pass 1 / depth")
+                if convention.depth == INVERSE
+                else ("depth along the rays of the pixels", "convert it to depth along the optical axis")
+            ),
             "factor": (f"depth of {unit} units a metre", f"divide it by {unit}"),
             "ratio": (f"intrinsics of an image of {width}x{height}", "scale them to the depth's size"),
         }
         yield from (texts[field] for field in convention.differs_in(self.convention))
+
+    def of_poses(self, convention: Convention) -> bool:
+        """Return whether a factor on depth is rather one on the poses: depth is metric as it is, and not with it."""
+        factor, (least, most) = convention.factor, METRIC
+        known = "metres_per_unit" in self.said and convention.depth == self.convention.depth and not self.in_program
+        if not known or factor == 1 or not least <= self.median <= most:
+            return False
+        scale = (self.depth_scale or 1.0) / factor
+        unused = any(abs(scale / coarse - 1) < USUAL for coarse in COARSE)
+        return unused or not least <= factor * self.median <= most
+
+    def _of_factor(self, convention: Convention) -> tuple[str, str]:
+        """Return the setting that makes up for a factor on depth, and its value."""
+        if self.of_poses(convention):
+            return "metres_per_unit", f"{self.said['metres_per_unit'] / convention.factor:.4g}"
+        inverse = convention.depth == INVERSE
+        return "depth_scale", self._scale_after(1 / convention.factor if inverse else convention.factor)
 
     def _scale_after(self, factor: float) -> str:
         if self.depth_scale is None:
@@ -165,8 +207,11 @@ class Reading:
         if self.in_program:
             return ", ".join(text for _, text in self._of_program(convention))
         where, factor = self._where(self.lines(convention)), convention.factor
-        if factor == 1:
+        if factor == 1 or convention.depth == INVERSE:
             return where
+        if self.of_poses(convention):
+            unit = UNITS.get(round(factor, 6), f"units of {1 / factor:.4g} m")
+            return f"{where}; the poses are in {unit}, depth in metres"
         times = f"{factor:.4g} times too short" if factor > 1 else f"{1 / factor:.4g} times too long"
         poses = self.said.get("metres_per_unit")
         unit = "the poses are not in metres" if poses is None else f"metres_per_unit is {poses / factor:.4g}"
@@ -201,10 +246,12 @@ def reading(
     """
     said = {**options, **scene.settings}
     height, width = frame.shape
+    depths = frame.depth[(frame.depth > 0) & (frame.depth < np.inf)]
     return Reading(
         said={name: value for name, value in said.items() if value is not None},
         options=options,
         size=(width, height),
+        median=float(np.median(depths)) if len(depths) else math.nan,
         ratios=tuple(_ratios(frame, color_shape)),
         file=None if scene.settings_file is None else str(scene.settings_file),
         depth_scale=scene.depth_scale or said.get("depth_scale"),

@@ -47,6 +47,9 @@ LEAST_PAIRS = 3
 GOOD = 0.05
 """A convention with a larger error is not proposed, and as configured it is not called sound."""
 
+MOST_ERROR = {3: 0.02, 4: 0.02, 5: 0.02}
+"""The largest error of a convention that changes so many settings at once: of many combinations one fits a little."""
+
 STRIKING = 0.02
 """The error that refutes a configured convention without evidence of its own, ..."""
 
@@ -245,7 +248,7 @@ class Assessment:
         if fit.convention.factor == 1:
             return fit
         measured = min([fit, *self._measured_scale(fit)], key=lambda one: one.error)
-        factor = self.reading.usual_factor(measured.convention.factor)
+        factor = self.reading.usual_factor(measured.convention.factor, fit.convention.depth)
         (known,) = fits_of(self.sample, fit.convention, np.array([factor]))
         return measured if measured.clearly_beats(known) else known
 
@@ -259,7 +262,12 @@ class Assessment:
             return False
         if factor != 1 and not LEAST_SCALE_ERROR <= size <= 1.001 * LARGEST_FACTOR:
             return False
-        return fit.clearly_beats(mine) and fit.error <= (GOOD if mine.has_evidence else STRIKING)
+        limit = GOOD if mine.has_evidence else STRIKING
+        return fit.clearly_beats(mine) and fit.error <= min(limit, self._limit(fit))
+
+    def _limit(self, fit: Fit) -> float:
+        """Return the largest error with which a fit refutes: the less, the more it changes at once."""
+        return MOST_ERROR.get(self._changes(fit)[0], GOOD)
 
     def _is_confirmed(self, fit: Fit) -> bool:
         if fit.convention.factor != 1 and not self._scale_is_told(fit):

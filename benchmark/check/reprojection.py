@@ -10,7 +10,7 @@ from typing import Any, NamedTuple, cast
 import numpy as np
 import numpy.typing as npt
 
-from semstab.check.conventions import Convention
+from semstab.check.conventions import INVERSE, Convention
 from semstab.check.loops import find_matches
 from semstab.core.prefetch import prefetch
 from semstab.core.types import Float32, Float64, Int64, Mask
@@ -77,6 +77,14 @@ class View:
         pose[:3, :3] = pose[:3, :3] @ CAMERA_AXES[convention.axes]
         return pose
 
+    def read_as(self, convention: Convention, configured: Convention) -> Float32:
+        """Return depth (H, W) of the file as that convention reads it, but for the length of rays and the factor."""
+        if (convention.depth == INVERSE) == (configured.depth == INVERSE):
+            return self.depth
+        with np.errstate(divide="ignore", over="ignore"):
+            inverse: Float32 = np.where(self.depth > 0, 1 / self.depth, np.float32(0)).astype(np.float32)
+        return inverse
+
     def sampled_camera(self, convention: Convention) -> Intrinsics:
         """Return the intrinsics of every stride-th pixel."""
         width, height = self.size
@@ -88,7 +96,7 @@ class View:
 
         The file is read as that convention does; the factor of depth is left out.
         """
-        if convention.depth == configured.depth:
+        if (convention.depth == "ray") == (configured.depth == "ray"):
             return 0, self.sampled_camera(configured)
         return (
             (1, self.sampled_camera(configured)) if configured.depth == "ray" else (-1, self.sampled_camera(convention))
@@ -168,6 +176,7 @@ class Sample:
     views: dict[int, View]
     pairs: Sequence[Pair]
     configured: Convention
+    _inverse: dict[int, Float32] = field(default_factory=dict, init=False, repr=False)
     _placed: dict[tuple[int, Convention], Placed] = field(default_factory=dict, init=False, repr=False)
 
     def errors(self, convention: Convention, factors: Float64) -> list[Float64]:
@@ -182,7 +191,7 @@ class Sample:
         z, depth, error, inside = np.empty(shape), np.empty(shape), np.empty(shape), np.empty(shape, np.bool_)
         find_matches(
             a.points, b.back @ a.pose[:3, :3], b.back @ (a.pose[:3, 3] - b.pose[:3, 3]), factors, _lens(b.camera),
-            fixed(self.views[pair[1]].depth), b.power, _lens(b.rays), u, v, z, depth, inside, error,
+            fixed(self._read_as(convention, pair[1])), b.power, _lens(b.rays), u, v, z, depth, inside, error,
         )  # fmt: skip
         return Matches(u, v, z, depth, inside, error)
 
@@ -192,11 +201,19 @@ class Sample:
             return known
         view, pose = self.views[position], self.views[position].pose(convention, self.configured)
         K, (power, rays) = view.sampled_camera(convention), view.rays(convention, self.configured)
-        depth = view.depth[view.v, view.u] * ray_lengths(rays, view.u, view.v) ** power
+        depth = self._read_as(convention, position)[view.v, view.u] * ray_lengths(rays, view.u, view.v) ** power
         points = np.stack([(view.u - K.cx) / K.fx * depth, (view.v - K.cy) / K.fy * depth, depth])
         back = np.linalg.inv(pose[:3, :3]).astype(np.float64)
         placed = self._placed[position, convention] = Placed(pose, back, K, power, rays, points)
         return placed
+
+    def _read_as(self, convention: Convention, position: int) -> Float32:
+        """Return depth (H, W) of a view as a convention reads it; an inverse is kept."""
+        if (convention.depth == INVERSE) == (self.configured.depth == INVERSE):
+            return self.views[position].depth
+        if position not in self._inverse:
+            self._inverse[position] = self.views[position].read_as(convention, self.configured)
+        return self._inverse[position]
 
     def motions(self, convention: Convention) -> list[tuple[Float64, Float64]]:
         """Return for each pair the rotation and translation from the first camera to the second."""

@@ -63,6 +63,9 @@ LABEL_RUNS = 6
 LABELLED_FRAMES = 8
 """Frames in which the labels of every model but the first are counted."""
 
+MOST_VOXELS = 2**20
+"""Voxels from a map's origin to its end, along an axis."""
+
 VOXEL_FACTORS = (0.5, 1.0, 2.0)
 """Voxel sizes for which the distribution of OP is reported, relative to the configured or the suggested one."""
 
@@ -92,6 +95,8 @@ class SceneCheck:
     `notes` name what looks wrong, but may be right: values that mean 'no depth', labels that are not registered.
     `depth_from` names the source of depth, where no file holds it;
     `sources` say where its parts come from, where that was found, a line each;
+    `refused` is what a run refuses besides;
+    `unread` names images in a folder of label maps of which none is read;
     `placed` says where its georeference comes from and how well it fits.
     If the geometry is unsound, overlap, noise and voxels are not measured.
     """
@@ -115,6 +120,8 @@ class SceneCheck:
     depth_from: str | None = None
     placed: str | None = None
     sources: tuple[str, ...] = ()
+    refused: tuple[str, ...] = ()
+    unread: str | None = None
 
     @property
     def of_scans(self) -> bool:
@@ -132,13 +139,14 @@ class SceneCheck:
         geometry = [self.verdict.text] if self.verdict.state == "unsound" else []
         if self.depth.valid == 0:
             geometry.append("no pixel of the sampled frames has valid depth; check the files and depth_scale")
-        return tuple(geometry)
+        return (*geometry, *self.refused)
 
     @property
     def problems_of_labels(self) -> tuple[str, ...]:
         """Return those of label maps."""
         ids = [labels.problem for labels in self.labels if labels.problem is not None]
-        return (*ids, *(line for each in self.label_findings for line in each.wrong))
+        unread = [] if self.unread is None or self.labels else [self.unread]
+        return (*unread, *ids, *(line for each in self.label_findings for line in each.wrong))
 
     def to_dict(self) -> dict[str, Any]:
         """Return the JSON object."""
@@ -173,6 +181,7 @@ def check_scene(scene: Scene, config: Config, told: Sequence[str] = ()) -> Scene
     first = models[0] if models else label_source(scene)
     if scene.of_scans:
         return _check_scans(scene, config, models, begun, indices, first)
+    scene.require_one_size(indices)
     inspection = Inspection(
         scene, indices, first, clusters(len(indices), CLUSTERS), POINTS, fused=FUSED_FRAMES, with_color=True
     )
@@ -193,6 +202,7 @@ def check_scene(scene: Scene, config: Config, told: Sequence[str] = ()) -> Scene
         depth_from=scene.depth_from,
         placed=scene.placed,
         sources=scene.sources,
+        unread=scene.unread,
         labels=tuple(_labels(scene, name, indices, config, inspection.tally) for name in models),
         label_findings=findings,
         notes=(
@@ -355,6 +365,7 @@ class Inspection:
         self.views: dict[int, View] = {}
         self.fused = evenly(len(indices), fused)
         self._first: Frame | None = None
+        self.farthest: tuple[float, Frame, tuple[int, int]] | None = None
         self._pairs = pairs_within(groups)
         self._compared = {position for group in groups for position in group}
         self._points = min(MOST_POINTS_A_VIEW, max(LEAST_POINTS_A_VIEW, points // max(1, len(self._pairs))))
@@ -367,9 +378,28 @@ class Inspection:
         positions = self._compared | set(self.fused)
         for position, frame in frames_at(positions, indices, read, passing_over=passing_over):
             self._first = self._first or frame
+            self._take_note(frame)
             if self._labelled:
                 self.tally.add(frame)
             self.views[position] = View.of(frame, self._points, labelled=self._labelled)
+
+    def _take_note(self, frame: Frame) -> None:
+        """Remember the farthest pixel of all frames."""
+        depth = np.where(frame.depth < np.inf, frame.depth, np.float32(0))  # NaN is not less
+        at = int(depth.argmax())
+        if self.farthest is None or float(depth.flat[at]) > self.farthest[0]:
+            v, u = divmod(at, depth.shape[1])
+            self.farthest = float(depth.flat[at]), dataclasses.replace(frame.every(64), files=frame.files), (u, v)
+
+    def too_far(self, voxel_size: float) -> str | None:
+        """Return the farthest pixel where a map of voxels of that size does not reach it."""
+        if self.farthest is None or self.farthest[0] < MOST_VOXELS * voxel_size:
+            return None
+        depth, frame, (u, v) = self.farthest
+        return (
+            f"{frame.where('depth')}: pixel ({u}, {v}) has depth {depth:,.0f} m, more than 2^20 voxels of"
+            f" {voxel_size:g} m away, so that a run refuses it; set max_depth: METRES, from which depth is not valid"
+        )
 
     def reading(self, options: Mapping[str, Any]) -> Reading:
         """Return how the scene is configured."""
@@ -431,6 +461,7 @@ def _with_coverage(checked: SceneCheck, inspection: Inspection, sample: Sample, 
     fused = [_persistence(views, coverage, size * factor, stride) for factor in VOXEL_FACTORS]
     return dataclasses.replace(
         checked,
+        refused=tuple(filter(None, (inspection.too_far(size),))),
         overlaps=tuple(overlaps),
         noise=noise,
         fused_frames=len(views),

@@ -18,7 +18,7 @@ from semstab.datasets.bag.finding import OfBags
 from semstab.datasets.bag.index import Content, Int64, read_once
 from semstab.datasets.bag.messages import Folder, Messages
 from semstab.datasets.bag.options import BagOptions
-from semstab.datasets.bag.reading import NANOSECONDS, OpenBag, seconds
+from semstab.datasets.bag.reading import NANOSECONDS, seconds
 from semstab.datasets.files.labels import SceneEntry
 from semstab.datasets.files.options import FileOptions, FrameSource
 from semstab.datasets.files.reader import FileDataset
@@ -56,7 +56,7 @@ class Bag(OfBags, FileDataset[BagOptions]):
         Raises:
             DataError: If the bag lacks a part, is damaged, or nothing fits together in time.
         """
-        bag = OpenBag(self.bags[folder])
+        bag = self.open_bag(folder)
         self._opened[folder] = recorded = Recorded(read_once(bag, self.options), self.options)
         return recorded.frames()
 

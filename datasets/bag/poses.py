@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -29,6 +30,12 @@ POSES: Mapping[str, Callable[[Any], tuple[str, Any]]] = {
 WORLDS = ("map", "world", "odom")
 """What the frames of a world have in their names; the first ones are preferred."""
 
+
+_OF_SENSOR = {
+    "camera": re.compile("optical"),
+    "sensor": re.compile("lidar|laser|velodyne|ouster|os_|livox|hesai|rslidar"),
+}
+"""What frames of a sensor itself have in their names: others are those of what it is mounted on, with other axes."""
 
 SAME = 1000
 """Nanoseconds by which a stamp of a file of poses may differ from that of the image that it is of."""
@@ -166,9 +173,14 @@ class SensorPoses:
         if not self._tf:
             return [], "there is no /tf; set trajectory: FILE, or pose: TOPIC"
         if len(chain) == 1:
-            known = ", ".join(self._transforms.frames()[:8])
-            frame = f"{self._sensor}_frame"
-            return [], f"'{sensor}', the frame of its {self._seen}, is not in /tf ({frame}: one of {known})"
+            known, option = self._transforms.frames(), f"{self._sensor}_frame"
+            of_sensor = [frame for frame in known if _OF_SENSOR[self._sensor].search(frame.lower())]
+            hint = f"{option}: one of {', '.join(of_sensor[:8])}, or " if of_sensor else ""
+            return [], (
+                f"'{sensor}', the frame of its {self._seen}, is not in /tf, which has {', '.join(known[:8])}"
+                f" ({hint}record /tf_static, too, or give {option}: FRAME with extrinsics: [x, y, z, qx, qy, qz, qw] of"
+                f" the {self._sensor} in it)"
+            )
         if world is not None:
             if bare(world) not in chain:
                 raise DataError(

@@ -6,6 +6,7 @@ The messages are of ROS's own types, whose fields are those of each distribution
 
 from __future__ import annotations
 
+import heapq
 import itertools
 import os
 import re
@@ -55,6 +56,55 @@ def _endings(folder: Path) -> set[str]:
     return {os.path.splitext(name)[1] for name in names}  # noqa: PTH122
 
 
+SPLIT = re.compile(r"(.*?)(?:_?\d{4}(?:-\d{2}){5})?_(\d{1,6})")
+"""The name of a part of a recording: NAME_3, or of ROS 1 NAME_2024-05-31-10-15-00_3."""
+
+MOST_BETWEEN = 5 * NANOSECONDS
+"""A recording goes on in the next part before so many nanoseconds have passed, ..."""
+
+MOST_OVERLAP = NANOSECONDS
+"""... and messages that were under way may be in it that are earlier by so many."""
+
+
+def recordings(paths: Sequence[Path]) -> list[list[Path]]:
+    """Return the files of a folder that are one recording each: the parts of one that was split are together.
+
+    Parts are numbered, each goes on in time where the one before ends, and they have topics in common.
+    """
+    groups: dict[tuple[str, str], dict[int, Path]] = {}
+    found: list[list[Path]] = []
+    for path in paths:
+        match = SPLIT.fullmatch(path.stem)
+        if match is None:
+            found.append([path])
+        else:
+            groups.setdefault((match[1], path.suffix.lower()), {}).setdefault(int(match[2]), path)
+    for numbered in groups.values():
+        for number in sorted(numbered):
+            before = numbered.get(number - 1)
+            if before is not None and found[-1][-1] == before and _goes_on(before, numbered[number]):
+                found[-1].append(numbered[number])
+            else:
+                found.append([numbered[number]])
+    known = {path for group in found for path in group}
+    return found + [[path] for path in paths if path not in known]
+
+
+def _goes_on(first: Path, second: Path) -> bool:
+    """Return whether the second file goes on where the first one ends; not if one cannot be read."""
+    try:
+        (_, end, topics), (start, _, others) = (_extent(path) for path in (first, second))
+    except (DataError, MissingDependencyError):
+        return False
+    return -MOST_OVERLAP <= start - end <= MOST_BETWEEN and bool(topics & others)
+
+
+def _extent(path: Path) -> tuple[int, int, set[str]]:
+    """Return the bag times of the first and the last message, and the topics that have any."""
+    bag = OpenBag(path)
+    return bag.start, bag.end, {topic.name for topic in bag.topics.values() if topic.count}
+
+
 @dataclass(frozen=True)
 class Topic:
     """A topic: its name, the type of its messages without '/msg/', sensor_msgs/Image, and how many there are."""
@@ -75,8 +125,12 @@ class Place:
 class OpenBag:
     """One bag, which is opened once; several threads may read from it.
 
-    Attributes:
+    Args:
         path: The file, or the folder of a rosbag2.
+        parts: The files of a recording that was split, of which `path` is the first, in the order of time.
+
+    Attributes:
+        path: The same.
         topics: Its topics by name, in their order.
 
     Raises:
@@ -84,7 +138,7 @@ class OpenBag:
         MissingDependencyError: If rosbags is not installed.
     """
 
-    def __init__(self, path: Path) -> None:
+    def __init__(self, path: Path, parts: Sequence[Path] = ()) -> None:
         self.path = path
         self._lock = threading.Lock()
         first = path.suffix.lower() == ".bag" and path.is_file()
@@ -98,19 +152,34 @@ class OpenBag:
             store: Any = get_typestore(Stores.ROS1_NOETIC if first else Stores.LATEST)
             if first:
                 store.register(get_types_from_msg(TF_MESSAGE, "tf2_msgs/msg/TFMessage"))
-            self._reader: Any = Reader1(path) if first else Reader2(path)
-            self._reader.open()
-            weakref.finalize(self, self._reader.close)
             self._deserialize = store.deserialize_ros1 if first else store.deserialize_cdr
-            self._connections: dict[str, list[Any]] = {}
-            for connection in self._reader.connections:
+        self._readers: list[Any] = []
+        for part in parts or (path,):
+            with self._one_line(path=part):
+                reader: Any = Reader1(part) if first else Reader2(part)
+                reader.open()
+                weakref.finalize(self, reader.close)
+                self._readers.append(reader)
+        with self._one_line():
+            self._connections: dict[str, list[tuple[Any, Any]]] = {}
+            for of, connection in ((one, each) for one in self._readers for each in one.connections):
                 if not isinstance(connection.topic, str):  # a database holds any type in any column
                     raise DataError(f"{path}: damaged: a topic is called {connection.topic!r}; record the bag again")
-                self._connections.setdefault(connection.topic, []).append(connection)
+                self._connections.setdefault(connection.topic, []).append((of, connection))
             self.topics: Mapping[str, Topic] = {
-                name: Topic(name, same[0].msgtype.replace("/msg/", "/"), sum(int(each.msgcount) for each in same))
+                name: Topic(name, same[0][1].msgtype.replace("/msg/", "/"), sum(int(each.msgcount) for _, each in same))
                 for name, same in self._connections.items()
             }
+
+    @property
+    def start(self) -> int:
+        """The bag time of the first message, nanoseconds."""
+        return min(int(reader.start_time) for reader in self._readers)
+
+    @property
+    def end(self) -> int:
+        """The bag time after the last message, nanoseconds."""
+        return max(int(reader.end_time) for reader in self._readers)
 
     def of_types(self, *types: str) -> list[str]:
         """Return the topics of messages of these types that have any message, by name."""
@@ -147,7 +216,7 @@ class OpenBag:
             DataError: If it is damaged.
         """
         with self._lock, self._one_line(f"{topic} at {seconds(place.time)}"):
-            messages = self._reader.messages(self._connections[topic], start=place.time, stop=place.time + 1)
+            messages = self._messages([topic], start=place.time, stop=place.time + 1)
             connection, _, raw = next(itertools.islice(messages, place.rank, None), (None, 0, b""))
             if connection is None:
                 raise DataError(
@@ -157,11 +226,8 @@ class OpenBag:
             return self._deserialize(raw, SAME_TYPE.get(connection.msgtype, connection.msgtype))
 
     def _raw(self, topics: Sequence[str]) -> Iterator[tuple[str, int, bytes, str]]:
-        wanted = [connection for name in topics for connection in self._connections.get(name, ())]
-        if not wanted:
-            return
         with self._lock, self._one_line():
-            messages = self._reader.messages(wanted)
+            messages = self._messages(topics)
         while True:
             with self._lock, self._one_line():
                 item = next(messages, None)
@@ -170,19 +236,29 @@ class OpenBag:
             connection, time, raw = item
             yield connection.topic, time, raw, SAME_TYPE.get(connection.msgtype, connection.msgtype)
 
+    def _messages(self, topics: Sequence[str], **times: int) -> Iterator[tuple[Any, int, bytes]]:
+        """Return connection, time and bytes of the messages of topics, in order of bag time over all parts."""
+        known = [each for name in topics for each in self._connections.get(name, ())]
+        streams = []
+        for reader in self._readers:
+            wanted = [connection for of, connection in known if of is reader]
+            streams += [reader.messages(wanted, **times)] if wanted else []
+        return heapq.merge(*streams, key=lambda item: item[1]) if len(streams) > 1 else iter(*streams or [()])
+
     @contextmanager
-    def _one_line(self, what: str = "") -> Iterator[None]:
+    def _one_line(self, what: str = "", path: Path | None = None) -> Iterator[None]:
         """Turn what rosbags raises for a damaged bag into DataError."""
         try:
             yield
         except DataError:
             raise
         except Exception as error:
-            where = f"{self.path}{f', {what}' if what else ''}"
+            where = f"{path or self.path}{f', {what}' if what else ''}"
             why = QUOTED.sub(r"\1", summarize_error(error)).rstrip(".")
             if isinstance(error, MemoryError):
                 why = "a length in it is damaged, or the memory does not suffice for a chunk"
-            suffix = next((end for end in SUFFIXES if end == self.path.suffix.lower()), ".db3")
+            endings = _endings(self.path) if self.path.is_dir() else {self.path.suffix.lower()}
+            suffix = next((end for end in SUFFIXES if end in endings), ".db3")
             raise DataError(f"{where}: not a whole bag ({why}); {REPAIR[suffix]}") from error
 
 

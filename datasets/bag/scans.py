@@ -79,7 +79,7 @@ class BagScans(OfBags, ScanDataset[BagScanOptions]):
         Raises:
             DataError: If the bag lacks a part, or is damaged.
         """
-        bag = OpenBag(self.bags[entry.folder])
+        bag = self.open_bag(entry.folder)
         self._opened[entry.folder] = recorded = RecordedScans(bag, self.options)
         return recorded.scans
 

@@ -178,6 +178,9 @@ def stored_depth(
     for value in options.invalid_depth:
         with np.errstate(over="ignore"):
             depth[depth == np.float32(value) / np.float32(stored_scale(frame, options))] = 0
+    if options.depth_kind == "inverse":
+        with np.errstate(over="ignore", divide="ignore"):
+            depth = np.where(depth > 0, 1 / depth, np.float32(0)).astype(np.float32)
     if options.max_depth is not None:
         depth[depth >= options.max_depth] = 0
     if frame.depth_lens is not None:

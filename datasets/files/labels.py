@@ -16,6 +16,7 @@ from semstab.core.types import UInt16
 from semstab.data.labels import IGNORE_16BIT, LabelSpace, ignore_id
 from semstab.datasets.files.options import Folders, LabelOptions, Template, inside, matching_folders
 from semstab.datasets.formats import images
+from semstab.datasets.formats.disk import natural, subfolders
 from semstab.datasets.formats.images import ANY_SIZE, FrameSize, Read, Size
 from semstab.datasets.geometry.lenses import Labels, Scores
 from semstab.datasets.scene import GROUND_TRUTH, listed
@@ -31,7 +32,7 @@ SUFFIXES: Mapping[Kind, tuple[str, ...]] = {
     "masks": images.MASK_SUFFIXES,
     "points": (".label", ".bin", ".npy", ".las", ".laz", ".ply"),
 }
-LOSSY_SUFFIXES = (".jpg", ".jpeg", ".JPG", ".JPEG")
+LOSSY_SUFFIXES = (".jpg", ".jpeg")
 DEFAULTS: Mapping[Kind, str] = {"labels": "labels/{model}/{name}", "scores": "scores/{model}/{name}"}
 REGIONS = "regions/{model}/{name}"
 LABEL_SPACE_FILE = "label_space.yaml"
@@ -99,6 +100,12 @@ class LabelSource:
         paths = (self.folders.one_of(place, LOSSY_SUFFIXES) for place in places)
         return next((path for path in paths if path is not None), None)
 
+    def why_none(self, frames: Sequence[Named]) -> str:
+        """Return why no frame has a file."""
+        if self.kind == "labels" and (lossy := self.lossy(frames)) is not None:
+            return f"{lossy} is a JPEG, which changes class ids; write label maps as PNG"
+        return f"no file of any frame, such as {self.missing(frames[0])[0]}"
+
     def missing(self, frame: Named) -> list[str]:
         """Return nothing, or the path that the file of that frame would have."""
         if self.file(frame) is not None:
@@ -123,6 +130,7 @@ def find_sources(
         DataError: For a folder that cannot be listed.
     """
     sources: dict[str, LabelSource] = {}
+    told: list[str] = []
     base = options.labels_root or entry.folder
     if options.labels_root is not None and not os.path.isdir(base):  # noqa: PTH112  Path.is_dir raises where the name is too long
         raise ConfigError(f"{base}: there is no such folder; correct labels_root")
@@ -143,12 +151,10 @@ def find_sources(
                 raise ConfigError(f"{entry.folder}: two label sources are called '{name}'; rename one")
             if source.first is not None:
                 sources[name] = source
-            elif kind == "labels" and (lossy := source.lossy(frames)) is not None:
-                logger.warning(
-                    "%s: %s is a JPEG, which changes class ids; write label maps as PNG; left out", name, lossy
-                )
             elif frames:
-                logger.warning("%s: no file of any frame, such as %s; left out", name, source.missing(frames[0])[0])
+                told.append(f"{name}: {source.why_none(frames)}; left out")
+    for line in told if sources or unread_labels(options, entry, frames) is None else ():
+        logger.warning("%s", line)
     if not sources and (options.labels or options.scores or options.labels_root):
         logger.warning(
             "%s: no label maps in %s fit the options labels and scores; expected %s",
@@ -159,6 +165,58 @@ def find_sources(
         source = LabelSource.of("labels", entry.folder, truth.filled(scene=entry.below_root), frames, folders)
         sources |= {GROUND_TRUTH: source} if source.first is not None else {}
     return sources
+
+
+MOST_FRAMES = 50
+"""Names of frames that are looked for in names of files."""
+
+
+def unread_labels(options: LabelOptions, entry: SceneEntry, frames: Sequence[Named]) -> str | None:
+    """Return the images that are in a folder labels/ of which none is read, and the setting that reads them.
+
+    None where options say where label maps are, or none is there.
+    """
+    folder = entry.folder / "labels"
+    if options.labels is not None or options.labels_root is not None or not folder.is_dir() or not frames:
+        return None
+    for place, template in (
+        (folder, "labels"),
+        *((folder / name, "labels/{model}") for name in subfolders(folder) if name != GROUND_TRUTH),
+    ):
+        suffixes = (*images.LABEL_SUFFIXES, *LOSSY_SUFFIXES, *OTHER_SUFFIXES)
+        files = sorted(
+            (path for path in place.iterdir() if path.suffix.lower() in suffixes), key=lambda p: natural(p.name)
+        )
+        if not files:
+            continue
+        known = [frame.name.rpartition("/")[2] for frame in frames[:MOST_FRAMES]]
+        first, pattern = files[0], next(filter(None, (_pattern(path, known) for path in files[:MOST_FRAMES])), None)
+        if pattern is None:
+            return (
+                f"{first}: is of no frame (these are called {', '.join(known[:2])}, ...), nor is another image in"
+                f" {place.relative_to(entry.folder)}; call them as the frames, {template}/{{name}}.png"
+            )
+        if first.suffix.lower() in LOSSY_SUFFIXES:
+            return f"{first} is a JPEG, which changes class ids; write label maps as PNG"
+        if first.suffix.lower() in OTHER_SUFFIXES:
+            return f"{first}: label maps are read as {', '.join(images.LABEL_SUFFIXES)}; write them as PNG"
+        said = f"{template}/{pattern}"
+        text = f"{{net: '{said}'}}" if template == "labels" else f"'{said}'"
+        return (
+            f"{first}: is read as the label map of no frame, nor is another of the {len(files)} images in"
+            f' {place.relative_to(entry.folder)}; set labels: {text} (--option "labels={text}")'
+        )
+    return None
+
+
+OTHER_SUFFIXES = (".tif", ".tiff", ".bmp", ".webp", ".gif")
+"""Images that hold no label maps which are read."""
+
+
+def _pattern(path: Path, names: Sequence[str]) -> str | None:
+    """Return the name of a file with {name} for the longest name of a frame in it, None where none is."""
+    there = [name for name in names if name in path.stem]
+    return path.stem.replace(max(there, key=len), "{name}", 1) if there else None
 
 
 def label_paths(options: LabelOptions, entry: SceneEntry, frames: Sequence[Named]) -> list[str]:
@@ -226,6 +284,7 @@ class LabelMaps:
         self.ground_truth = GROUND_TRUTH in labels
         self.regions = tuple(regions)
         self.class_ids = class_ids
+        self.unread = None if self.models else unread_labels(options, entry, frames)
         self._options = options
         self._folder = entry.folder
         self._frames = frames
@@ -315,7 +374,8 @@ class LabelMaps:
         Raises:
             DataError: If that fails; the message names it.
         """
-        labels = images.read_labels(path, self.space(model), read, own)
+        void = self._options.void_ids.get(model, ())
+        labels = images.read_labels(path, self.space(model), read, own, void)
         if model in self.class_ids:
             ids: Labels = self.class_ids[model][labels]
             if (unknown := ids == NO_ID).any():
@@ -323,7 +383,7 @@ class LabelMaps:
                     f"{path}: the id {labels[unknown][0]} is not in the table of classes; is it the right table?"
                 )
             labels = ids
-        if void := self._options.void_ids.get(model):
+        if void:
             labels = np.where(np.isin(labels, void), labels.dtype.type(ignore_id(labels)), labels)
         return labels
 

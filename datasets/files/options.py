@@ -5,7 +5,7 @@ from __future__ import annotations
 import logging
 import os
 import re
-from collections.abc import Callable, Collection
+from collections.abc import Callable, Collection, Mapping
 from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
 from typing import Annotated, Literal, Self
@@ -26,12 +26,13 @@ logger = logging.getLogger("semstab")
 
 Positive = Annotated[float, Field(gt=0, le=1e30)]
 Finite = Annotated[float, Field(allow_inf_nan=False)]
-Id = Annotated[int, Field(ge=0, le=65535)]
+Id = Annotated[int, Field(ge=-(2**31), le=65535)]
 
 Taxonomy = Annotated[str | None, Field(description="taxonomy of the label maps: a name or a YAML file")]
 ScoresLayout = Annotated[Literal["KHW", "HWK"] | None, Field(description="axes of score arrays")]
 DepthKind = Annotated[
-    Literal["planar", "ray"] | None, Field(description="depth along the optical axis, or along the ray of the pixel")
+    Literal["planar", "ray", "inverse"] | None,
+    Field(description="depth along the optical axis, along the ray of the pixel, or 1 over the first"),
 ]
 MetresPerUnit = Annotated[Positive | None, Field(description="metres in a unit of the poses")]
 DepthScale = Annotated[Positive | None, Field(description="units of the depth files in a metre")]
@@ -233,6 +234,7 @@ class Folders:
 
     def __init__(self) -> None:
         self._names: dict[str, frozenset[str]] = {}
+        self._small: dict[str, Mapping[str, str]] = {}
 
     def has(self, path: Path) -> bool:
         """Return whether there is a file or folder of that path."""
@@ -253,11 +255,29 @@ class Folders:
         return file_digest(path)
 
     def one_of(self, path: Path, suffixes: Collection[str]) -> Path | None:
-        """Return the path where it has one of the suffixes, else that with the first suffix there is a file of."""
+        """Return the file of a path that has one of the suffixes, else of that with the first suffix there is one of.
+
+        A suffix may be in small or in capital letters.
+        """
         if path.suffix.lower() in suffixes:
-            return path if self.has(path) else None
+            return path if self.has(path) else self._alike(path)
         candidates = (path.with_name(path.name + suffix) for suffix in suffixes)
-        return next((candidate for candidate in candidates if self.has(candidate)), None)
+        return next((file for file in map(self._alike, candidates) if file is not None), None)
+
+    def _alike(self, path: Path) -> Path | None:
+        """Return the file of a path in whose name the case of the suffix does not count."""
+        if self.has(path):
+            return path
+        folder, name = os.path.split(path)
+        if folder not in self._small:
+            self._small[folder] = {_small_suffix(each): each for each in self._names.get(folder, ())}
+        there = self._small[folder].get(_small_suffix(name))
+        return None if there is None else path.with_name(there)
+
+
+def _small_suffix(name: str) -> str:
+    stem, suffix = os.path.splitext(name)  # noqa: PTH122  of a hundred thousand names
+    return stem + suffix.lower()
 
 
 # The files of a frame.

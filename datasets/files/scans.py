@@ -21,7 +21,7 @@ from pydantic import Field
 from semstab.config import Settings, nearest
 from semstab.core.types import Float32, Float64, Mask, UInt16
 from semstab.data.frames import Frame, Intrinsics
-from semstab.data.labels import IGNORE_16BIT, LabelSpace
+from semstab.data.labels import IGNORE_8BIT, IGNORE_16BIT, LabelSpace
 from semstab.datasets.files import options as opt
 from semstab.datasets.files.labels import SEPARATE, LabelSource, SceneEntry
 from semstab.datasets.files.options import Folders, Template, matching_folders
@@ -275,15 +275,19 @@ class ScanScene(Scene):
             raise DataError(
                 f"{self.folder}: {listed(source.missing(scan), str(self.folder))}; choose scans that have it, or add it"
             )
-        stored = self._dataset.ids(file, self._files.read)
+        stored = None if file.suffix == LABEL else self._ids(file, 0)
+        points = self._dataset.points(scan.points, self._files.read)
+        if stored is None:
+            stored = self._ids(file, len(points))
         truth = None if self._truth is None else self._truth.file(scan)
-        moving = None if truth is None else self._dataset.moving(lambda: self._dataset.ids(truth, self._files.read))
+        moving = None if truth is None else self._dataset.moving(lambda: self._ids(truth, len(points)))
         files = {"labels": str(file), "mask": str(truth)}
-        return self._framed(index, self._labels(model, stored, file), files, moving)
+        return self._framed(index, points, self._labels(model, stored, file), files, moving)
 
     def geometry(self, index: int, *, color: bool = False) -> Frame:
         """Return the scan but for its labels: all points are of class 0."""
-        return self._framed(index, None, {})
+        points = self._dataset.points(self._scan(index).points, self._files.read)
+        return self._framed(index, points, None, {})
 
     def intrinsics(self, index: int, shape: tuple[int, ...]) -> Intrinsics:
         """Raise DataError: a scan has none."""
@@ -332,14 +336,32 @@ class ScanScene(Scene):
             return labels
         ids: UInt16 = table[labels]
         if (unknown := ids == NO_ID).any():
-            raise DataError(f"{file}: the id {labels[unknown][0]} is no class of the format; is it another format?")
+            used = np.unique(labels[labels != IGNORE_16BIT])
+            why = "is it another format?"
+            if used[-1] < MOST_TRAINED or used[-1] == IGNORE_8BIT:
+                why = (
+                    f"are ids {used[0]} to {used[used < IGNORE_8BIT][-1]} those that a network is trained with? write"
+                    f" them back by learning_map_inv, or name their classes: taxonomies: {{{model}: FILE.yaml}}"
+                )
+            raise DataError(f"{file}: the id {labels[unknown][0]} is no class of the format; {why}")
         return ids
 
+    def _ids(self, file: Path, points: int) -> npt.NDArray[np.integer[Any]]:
+        """Return stored ids (N,) of a file of a scan of so many points, by whose number .label has another width."""
+        size = file.stat().st_size if file.suffix == LABEL and file.is_file() else 0
+        if points and size in (2 * points, 8 * points):
+            return narrow_ids(file, self._files.read(file), points)
+        return self._dataset.ids(file, self._files.read)
+
     def _framed(
-        self, index: int, labels: npt.NDArray[Any] | None, files: Mapping[str, str], moving: Mask | None = None
+        self,
+        index: int,
+        points: npt.NDArray[np.floating[Any]],
+        labels: npt.NDArray[Any] | None,
+        files: Mapping[str, str],
+        moving: Mask | None = None,
     ) -> Frame:
         scan = self._scan(index)
-        points = self._dataset.points(scan.points, self._files.read)
         near, far = self.options.min_range or 0.0, self.options.max_range or math.inf
         with np.errstate(over="ignore", invalid="ignore"):  # numbers beyond float32 are no valid points
             if self._dataset.in_world:
@@ -433,6 +455,30 @@ def classes_in(values: npt.NDArray[Any], name: str, where: str) -> npt.NDArray[n
             " label_field to one of classes, not of scores"
         )
     return values.astype(np.int64)
+
+
+LABEL = ".label"
+"""The suffix of ids of points, which are uint32 in the formats that have it."""
+
+MOST_TRAINED = 34
+"""More than the ids that a network is trained with: 20 of SemanticKITTI, 17 of nuScenes, 34 of Cityscapes."""
+
+
+def narrow_ids(path: Path, data: bytes, points: int) -> npt.NDArray[np.integer[Any]]:
+    """Return ids (N,) of a .label of uint16 or int64, of which N points tell the width.
+
+    Raises:
+        DataError: If some of 64 bits are no ids of 16.
+    """
+    if len(data) == 2 * points:
+        return np.frombuffer(data, "<u2")
+    ids = np.frombuffer(data, "<i8")
+    if (ids < 0).any() or (ids > IGNORE_16BIT).any():
+        raise DataError(
+            f"{path}: {len(data)} bytes for {points} points are int64, but ids go from {ids.min()} to {ids.max()};"
+            " write uint32"
+        )
+    return ids
 
 
 def ids_of(path: Path, data: bytes) -> npt.NDArray[np.integer[Any]]:

@@ -32,6 +32,7 @@ from semstab.datasets.formats.images import (
     Read,
     Size,
     color_size,
+    depth_size,
     read_color,
     read_confidence,
     read_mask,
@@ -106,9 +107,11 @@ class FileScene(Scene):
         self.models = self._maps.models
         self.ground_truth = self._maps.ground_truth
         self.regions = self._maps.regions
+        self.unread = self._maps.unread
         self.label_paths = tuple(label_paths(options, entry, frames))
         self._digests: dict[tuple[int, str], bytes] = {}
         self._depths = RecentArrays(DEPTH_BYTES)
+        self._shapes: dict[Camera, tuple[int, ...]] = {}
         self._tracked: dict[int, bool] = {}
         self._surface = surface
         self._surface_seen = False
@@ -242,6 +245,7 @@ class FileScene(Scene):
             source, read = self._frame(index), self._reader(index, DEPTH)
             own = FrameSize(lambda: self._image_pixels(index, of_depth=True))
             depth = stored_depth(source, self.options, read, lambda shape: self.intrinsics(index, shape), own)
+            self._require_one_size(source, depth)
             return depth if source.confidence is None else self._confident(index, depth, source.confidence)
         depth = self._surface.depth(self._view(index))
         if not self._surface_seen and not depth.any():
@@ -250,6 +254,47 @@ class FileScene(Scene):
         if self.options.max_depth is not None:
             depth[depth >= self.options.max_depth] = 0
         return depth
+
+    def require_one_size(self, indices: Sequence[int]) -> None:
+        """Raise DataError where depth images of one camera have several sizes, and the intrinsics say for none.
+
+        Images that need no more than their beginning to tell their size are looked at.
+        """
+        for camera in dict.fromkeys(self._frames[index].camera for index in indices if self._surface is None):
+            self._require_usual(camera, [self._frames[index] for index in indices])
+
+    def _require_one_size(self, source: FrameSource, depth: Float32) -> None:
+        """Raise the same where depth that was read has another size than the first that was."""
+        if depth.shape != self._shapes.setdefault(source.camera, depth.shape):
+            self._require_usual(source.camera, self._frames, source, depth.shape)
+
+    def _require_usual(
+        self,
+        camera: Camera,
+        frames: Sequence[FrameSource],
+        other: FrameSource | None = None,
+        shape: tuple[int, ...] = (),
+    ) -> None:
+        """Raise DataError with the first of a camera's frames whose size is not the usual one, or with that other."""
+        if camera.size is not None or self.options.intrinsics_size is not None:
+            return
+        own = [frame for frame in frames if frame.camera is camera or frame.camera == camera]
+        sizes = [(frame, size) for frame in own if (size := depth_size(frame.depth)) is not None]
+        known = [size for _, size in sizes]
+        usual = max(dict.fromkeys(known), key=known.count, default=None)
+        if other is not None and usual is None:
+            H, W = self._shapes[camera]
+            usual, sizes = (W, H), [(other, (shape[1], shape[0]))]
+        odd = [(frame, size) for frame, size in sizes if size != usual]
+        if not odd or usual is None:
+            return
+        frame, (width, height) = odd[0]
+        more = f", and {len(odd) - 1} more," if len(odd) > 1 else ""
+        raise DataError(
+            f"{frame.depth}: depth{more} is {width}x{height} where that of the others is {usual[0]}x{usual[1]}, but the"
+            f" intrinsics are for one size; take these frames out, or, where all show the same view, set"
+            f" intrinsics_size: [{usual[0]}, {usual[1]}]"
+        )
 
     def _confident(self, index: int, depth: Float32, file: Path) -> Float32:
         """Return depth without that of pixels whose confidence is too low."""
@@ -398,9 +443,7 @@ class FileScene(Scene):
         )  # fmt: skip
 
     def _stored(self, index: int, values: Pixels, shape: tuple[int, ...], path: Path, what: str) -> Pixels:
-        """Return the content of a file at the depth's pixels; where it must have them, `Frame` raises an error."""
-        if self.labels_like_depth and self._frame(index).label_lens is None:
-            return values
+        """Return the content of a file at the depth's pixels."""
         return self._fitted(index, values, shape, str(path), what)
 
     def _fitted(
@@ -423,14 +466,10 @@ class FileScene(Scene):
         elsewhere = source.label_lens is not None or source.label_camera is not None
 
         def require(size: Size) -> None:
-            if elsewhere:
-                return
-            if self.labels_like_depth and size != shape:
-                (h, w), (H, W) = size, shape
-                raise DataError(f"{path}: {what} {w}x{h} but depth is {W}x{H}; bring them to one size")
-            require_same_view(size, shape, str(path), f"{what} {{}} but depth is {{}}")
+            if not elsewhere:
+                require_same_view(size, shape, str(path), f"{what} {{}} but depth is {{}}")
 
-        return FrameSize(lambda: self._image_pixels(index), require)
+        return FrameSize(lambda: self._image_pixels(index), require, (shape[0], shape[1]))
 
     def _image_pixels(self, index: int, *, of_depth: bool = False) -> int:
         """Return the pixels of a frame's image, of depth also of its camera; 0 where neither is known.

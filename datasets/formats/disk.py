@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import codecs
 import hashlib
 import io
 import math
@@ -46,7 +47,13 @@ def read_bytes(path: Path, limit: int = MAX_BYTES) -> bytes:
 
 def read_text(path: Path, limit: int) -> str:
     """Return the text of a file; raises what `read_bytes` raises."""
-    return read_bytes(path, limit).decode("utf-8-sig", errors="replace")
+    return as_text(read_bytes(path, limit))
+
+
+def as_text(data: bytes) -> str:
+    """Return the text of a file in UTF-8, or in UTF-16, which editors and shells of Windows write."""
+    utf_16 = data.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE))
+    return data.decode("utf-16" if utf_16 else "utf-8-sig", errors="replace")
 
 
 def digest(data: bytes) -> bytes:
@@ -88,12 +95,18 @@ def files_by_stem(folder: Path, suffixes: Container[str]) -> dict[str, str]:
 def files_named(folder: Path, before: str, after: str) -> dict[str, Path]:
     """Return the files 'BEFORE name AFTER' of a folder by name, in natural order; none where there is no folder.
 
+    The case of AFTER, which is a suffix, does not count.
+
     Raises:
         DataError: If the folder cannot be listed.
     """
-    fitting = (entry.name for entry in _entries(folder) if entry.name.startswith(before) and entry.name.endswith(after))
-    names = sorted((name[len(before) : len(name) - len(after)] for name in fitting), key=natural)
-    return {name: folder / f"{before}{name}{after}" for name in names if name}
+    end, found = after.lower(), dict[str, str]()
+    for entry in _entries(folder):
+        name = entry.name[len(before) : len(entry.name) - len(after)]
+        fits = entry.name.startswith(before) and entry.name.lower().endswith(end)
+        if name and fits and (name not in found or entry.name.endswith(after)):
+            found[name] = entry.name
+    return {name: folder / found[name] for name in sorted(found, key=natural)}
 
 
 def _entries(folder: Path) -> Iterator[os.DirEntry[str]]:
@@ -285,16 +298,49 @@ MAX_TEXT_BYTES = 2**16
 
 
 def read_pose(path: Path) -> Float64:
-    """Return a (4, 4) matrix from 16 numbers, or from the 12 of its upper rows, apart by whitespace or commas.
+    """Return a (4, 4) matrix from 16 numbers, or from the 12 of its upper rows.
+
+    They are in a text, apart by whitespace or commas, in an .npy array, or in a .json: rows, or one list, or an object
+    with one such value.
 
     Raises:
         DataError: For anything else.
     """
-    numbers = _numbers(path)
+    suffix = path.suffix.lower()
+    if suffix == ".npy":
+        array = decode_array(path, read_bytes(path, MAX_TEXT_BYTES), "pose")
+        numbers = np.ravel(array).astype(np.float64).tolist()
+    else:
+        numbers = _of_json(path) if suffix == ".json" else _numbers(path)
     if len(numbers) not in (12, 16):
         hint = " (position and quaternion?)" if len(numbers) in (7, 8) else ""
         raise DataError(f"{path}: expected a 4x4 or 3x4 matrix, got {len(numbers)} numbers{hint}; convert it")
     return np.array([*numbers, 0, 0, 0, 1][:16], dtype=np.float64).reshape(4, 4)
+
+
+def _of_json(path: Path) -> list[float]:
+    """Return the numbers of the only value of a JSON file that holds a matrix.
+
+    Raises:
+        DataError: If it holds none, or several.
+    """
+    content = read_content(path, MAX_TEXT_BYTES)
+    values = [content] if isinstance(content, list) else []
+    if isinstance(content, dict):
+        values = [value for value in content.values() if isinstance(value, list) and _size(value) in (12, 16)]
+    if len(values) != 1:
+        raise DataError(
+            f"{path}: expected a 4x4 or 3x4 matrix, in rows, or an object with one, got {len(values)}; write [[r11,"
+            " r12, r13, t1], ...]"
+        )
+    try:
+        return [float(value) for value in np.ravel(np.array(values[0], dtype=np.float64))]
+    except (ValueError, TypeError, OverflowError) as error:
+        raise DataError(f"{path}: expected a matrix of numbers, got {repr(values[0])[:60]}") from error
+
+
+def _size(value: list[Any]) -> int:
+    return sum(len(row) if isinstance(row, list) else 1 for row in value)
 
 
 def read_intrinsics(path: Path) -> Intrinsics:
@@ -310,6 +356,40 @@ def read_intrinsics(path: Path) -> Intrinsics:
         )
     side = 3 if len(numbers) == 9 else 4
     K = np.array(numbers, dtype=np.float64).reshape(side, side)[:3, :3]
+    return _pinhole(path, K)
+
+
+def read_camera(path: Path) -> tuple[Intrinsics, tuple[int, int] | None]:
+    """Return intrinsics of a JSON file, and the (width, height) of the image that they are for, where it says so.
+
+    It has the names of Open3D, an intrinsic_matrix whose columns follow each other; or fx, fy, cx, cy; or a matrix of
+    three rows.
+
+    Raises:
+        DataError: For anything else.
+    """
+    content = read_object(path)
+    where = str(path)
+    sized = content.get("width") is not None and content.get("height") is not None
+    size = (pixels(content, "width", where), pixels(content, "height", where)) if sized else None
+    columns = content.get("intrinsic_matrix")
+    rows = [value for value in content.values() if isinstance(value, list) and len(value) == 3 and _size(value) == 9]
+    if isinstance(columns, list) and len(columns) == 9:
+        numbers = [number({"intrinsic_matrix": value}, "intrinsic_matrix", where) for value in columns]
+        K = np.array(numbers, dtype=np.float64).reshape(3, 3).T
+    elif {"fx", "fy", "cx", "cy"} <= content.keys():
+        fx, fy, cx, cy = (number(content, key, where) for key in ("fx", "fy", "cx", "cy"))
+        K = Intrinsics(fx, fy, cx, cy).matrix
+    elif len(rows) == 1 and all(isinstance(row, list) and len(row) == 3 for row in rows[0]):
+        K = np.array([[number({"the matrix": value}, "the matrix", where) for value in row] for row in rows[0]])
+    else:
+        raise DataError(
+            f"{path}: holds no camera; write width, height and intrinsic_matrix as Open3D does, or fx, fy, cx, cy"
+        )
+    return _pinhole(path, K), size
+
+
+def _pinhole(path: Path, K: Float64) -> Intrinsics:
     if not np.isfinite(K).all() or K[1, 0] != 0 or K[2].tolist() != [0, 0, 1]:
         raise DataError(f"{path}: {K.tolist()} is no camera matrix; write fx 0 cx 0 fy cy 0 0 1, in rows")
     try:
@@ -319,11 +399,26 @@ def read_intrinsics(path: Path) -> Intrinsics:
 
 
 def _numbers(path: Path) -> list[float]:
-    words = read_text(path, MAX_TEXT_BYTES).replace(",", " ").split()
+    text = read_text(path, MAX_TEXT_BYTES)
+    require_decimal_points(str(path), text)
+    words = text.replace(",", " ").split()
     try:
         return [float(word) for word in words]
     except ValueError as error:
         raise DataError(f"{path}: expected numbers ({summarize_error(error)}); write the matrix as text") from error
+
+
+DECIMAL_COMMA = re.compile(r"[-+]?\d+,\d+(?:[eE][-+]?\d+)?")
+
+
+def require_decimal_points(where: str, text: str) -> None:
+    """Raise DataError where numbers apart by whitespace have decimal commas, as in 'NUMBER,DIGITS NUMBER,DIGITS'."""
+    words = text.split()
+    commas = [word for word in words if "," in word]
+    if commas and len(words) > 1 and all(DECIMAL_COMMA.fullmatch(word) for word in commas):
+        raise DataError(
+            f"{where}: numbers have decimal commas ({commas[0]}); write points: {commas[0].replace(',', '.')}"
+        )
 
 
 # Text files with one record a line (trajectories, lists of images): all of it, or one DataError with the line.
@@ -359,6 +454,7 @@ def read_table(path: Path, columns: int, what: str) -> Float64:
     for number, text in records(path):
         words = text.replace(",", " ").split()
         if len(words) != columns:
+            require_decimal_points(f"{path}: line {number}", text)
             raise DataError(f"{path}: line {number} has {len(words)} values; expected {columns} ({what})")
         values.extend(to_number(word, path, number) for word in words)
     if not values:

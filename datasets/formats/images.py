@@ -12,7 +12,7 @@ import math
 import os
 import re
 import struct
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Collection, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -24,14 +24,14 @@ import numpy.typing as npt
 
 from semstab.core.types import Float32, Mask, UInt8, UInt16, UInt32
 from semstab.data.labels import IGNORE_8BIT, IGNORE_16BIT, LabelSpace
-from semstab.datasets.formats.disk import AGAIN, Claimed, decode_array, read_bytes
+from semstab.datasets.formats.disk import AGAIN, NPY_SHAPE, Claimed, decode_array, read_bytes
 from semstab.datasets.geometry.lenses import Labels
 from semstab.errors import ConfigError, DataError, summarize_error
 
 if TYPE_CHECKING:
     from PIL.ImageFile import ImageFile
 
-DEPTH_SUFFIXES = (".png", ".npy", ".npz", ".exr", ".tiff", ".tif")
+DEPTH_SUFFIXES = (".png", ".npy", ".npz", ".exr", ".tiff", ".tif", ".pfm")
 LABEL_SUFFIXES = (".png", ".npy", ".npz")
 SCORE_SUFFIXES = (".npz", ".npy")
 COLOR_SUFFIXES = (".png", ".jpg", ".jpeg", ".tif", ".tiff")
@@ -39,6 +39,9 @@ MASK_SUFFIXES = (".png",)
 
 MILLIMETRES = 1000.0
 NO_CLASS = IGNORE_16BIT
+HEADER_BYTES = 256
+"""Bytes that hold the size of an array or of a float map."""
+
 MOST_SCORES = 4096
 """Most classes of scores whose classes are not known."""
 
@@ -54,11 +57,17 @@ ORDINARY = 2**22
 BEYOND_IMAGE = 4
 """Times the pixels of its frame's image that a larger file may have."""
 
+BEYOND_DEPTH = 16
+"""Times the pixels of its frame's depth that a larger label map, scores or mask may have, where there is no image."""
+
 MAX_PHOTOGRAPH = 2**28
 """Most pixels of a colour image."""
 
 DENSEST = 64
-"""Pixels that a byte of a colour image may stand for, if that takes more than `MAX_IMAGE_BYTES`: of photographs ten."""
+"""Pixels that a byte of a colour image may stand for, if that takes more than `MAX_IMAGE_BYTES`: of photographs ten.
+
+As many bytes of scores, of another size than the depth, that a byte of their file may stand for.
+"""
 
 MAX_SIDE = 2**16
 """Most pixels of a side: a few bytes of a damaged header can claim 16 x 8,388,364, which takes seconds to unpack."""
@@ -74,10 +83,12 @@ class FrameSize:
     Attributes:
         pixels: Gives the pixels of its image, 0 where they are not known; asked where a file claims many.
         require: Raises DataError for a size (H, W) that cannot be of the frame's view.
+        depth: Shape (H, W) of its depth, for other files; None where it does not bound them.
     """
 
     pixels: Callable[[], int] = lambda: 0
     require: Callable[[Size], None] = lambda size: None
+    depth: Size | None = None
 
 
 ANY_SIZE = FrameSize()
@@ -107,6 +118,8 @@ def read_depth(path: Path, scale: float | None = None, read: Read = read_bytes, 
         depth = _decode_tiff(path, data, own)
     elif suffix == ".exr":
         depth = _decode_exr(path, data, own)
+    elif suffix == ".pfm":
+        depth = _decode_pfm(path, data, own)
     else:
         depth = decode_array(path, data, "depth", _claimed(path, own, 4))
     if depth.ndim != 2 or depth.dtype.kind not in "fui":
@@ -130,11 +143,15 @@ def _unpacked(samples: npt.NDArray[Any]) -> Float32 | None:
 
 
 def read_labels(
-    path: Path, space: LabelSpace | None = None, read: Read = read_bytes, own: FrameSize = ANY_SIZE
+    path: Path,
+    space: LabelSpace | None = None,
+    read: Read = read_bytes,
+    own: FrameSize = ANY_SIZE,
+    void: Collection[int] = (),
 ) -> Labels:
     """Return the class ids (H, W) uint8 or uint16, in the ids of the file; RGB maps through the colours of `space`.
 
-    Wider integers are narrowed.
+    Wider integers are narrowed; of these the ids `void` are ignored.
 
     Raises:
         DataError: For a colour or an id that no class can have, an RGB map without `space`, another type, or a damaged
@@ -142,7 +159,7 @@ def read_labels(
     """
     data = read(path)
     if path.suffix.lower() != ".png":
-        return _narrow(path, decode_array(path, data, "labels", _claimed(path, own, 2)), space)
+        return _narrow(path, decode_array(path, data, "labels", _claimed(path, own, 4)), space, void)
     with _whole_png(path, data, own, {"grey": 1, "palette": 1, "RGB": 6, "RGBA": 8}) as png:
         if png.kind not in ("grey", "palette") and (png.kind not in ("RGB", "RGBA") or png.bits != 8):
             raise DataError(
@@ -183,8 +200,15 @@ def read_scores(
         if (classes or MOST_SCORES) < K:
             raise DataError(f"{path}: has scores of {K} classes, but there are {classes or f'at most {MOST_SCORES}'}")
         _check_pixels(path, W, H, own=own)
+        taken = math.prod(shape) * dtype.itemsize
+        if sizes[layout] != size and taken > max(MAX_IMAGE_BYTES // 2, DENSEST * len(data)):
+            raise DataError(
+                f"{path}: claims scores of shape {shape} in {len(data)} bytes, but depth is {size[1]}x{size[0]};"
+                " bring them to one size"
+            )
 
-    scores = decode_array(path, read(path), "scores", claimed)
+    data = read(path)
+    scores = decode_array(path, data, "scores", claimed)
     return np.ascontiguousarray(scores.transpose(1, 2, 0) if layout == "KHW" else scores)
 
 
@@ -248,20 +272,46 @@ def color_size(path: Path) -> Size:
         return image.size
 
 
+def depth_size(path: Path) -> Size | None:
+    """Return (width, height) of a depth image from its header; None where that does not tell, or is damaged."""
+    suffix = path.suffix.lower()
+    try:
+        if suffix in (".png", ".tif", ".tiff"):
+            return color_size(path)
+        with path.open("rb") as file:
+            head = file.read(HEADER_BYTES)
+    except (OSError, DataError):  # raised where the image is needed
+        return None
+    if suffix == ".pfm" and (match := PFM_HEADER.match(head)):
+        return int(match[2]), int(match[3])
+    if suffix == ".npy" and (shape := NPY_SHAPE.search(head)):
+        sides = [int(side) for side in re.findall(rb"\d+", shape[1])]
+        return (sides[1], sides[0]) if len(sides) == 2 else None
+    return None
+
+
 # --- labels ---------------------------------------------------------------------------------------------------------
 
 
-def _narrow(path: Path, ids: npt.NDArray[Any], space: LabelSpace | None) -> Labels:
+def _narrow(path: Path, ids: npt.NDArray[Any], space: LabelSpace | None, void: Collection[int]) -> Labels:
     """Return integer ids of any width as uint8 where the classes (without `space`: the ids) fit, else uint16."""
     if ids.ndim != 2 or ids.size == 0 or ids.dtype.kind not in "ui":
         raise DataError(f"{path}: labels must be integer ids (H, W), got {ids.dtype} of shape {ids.shape}")
     if ids.dtype in (np.uint8, np.uint16):
         return ids
-    low, high = int(ids.min()), int(ids.max())
+    known, bounds = np.ones(ids.shape, np.bool_), np.iinfo(ids.dtype)
+    for value in void:  # without copies of wide ids, which isin makes
+        known &= ids != value
+    low, high = int(ids.min(where=known, initial=bounds.max)), int(ids.max(where=known, initial=bounds.min))
+    low, high = (low, high) if low <= high else (0, 0)
     if low < 0 or high > IGNORE_16BIT:
-        raise DataError(f"{path}: label ids from {low} to {high}; store ids from 0, and 255 (65535) for 'ignore'")
+        outside = np.unique(ids[known & ((ids < 0) | (ids > IGNORE_16BIT))])
+        mend = f"; if {outside[0]} is 'ignore', set void_ids: {{MODEL: [{outside[0]}]}}" if len(outside) == 1 else ""
+        raise DataError(f"{path}: label ids from {low} to {high}{mend}; store ids from 0, and 255 (65535) for 'ignore'")
     fits = high <= IGNORE_8BIT and (space is None or max(space.ids) < IGNORE_8BIT)
-    return ids.astype(np.uint8) if fits else ids.astype(np.uint16)
+    narrowed: Labels = ids.astype(np.uint8) if fits else ids.astype(np.uint16)
+    narrowed[~known] = IGNORE_8BIT if fits else IGNORE_16BIT
+    return narrowed
 
 
 def _labels_by_color(path: Path, image: UInt8, space: LabelSpace) -> Labels:
@@ -277,9 +327,47 @@ def _labels_by_color(path: Path, image: UInt8, space: LabelSpace) -> Labels:
         y, x = np.argwhere(unknown)[0]
         raise DataError(
             f"{path}: colour {tuple(image[y, x, :3].tolist())} at pixel ({x}, {y}) ({np.count_nonzero(unknown)} pixels)"
-            f" is no class of '{space.name}'; set taxonomy to the one whose colours the image has"
+            f" is no class of '{space.name}'; {_cause(image[..., :3], unknown, table)}"
         )
     return ids.astype(np.uint8) if max(space.ids) < IGNORE_8BIT else ids
+
+
+NEIGHBOURS = 4
+"""Pixels from a mixed one, at most, to those whose colours are mixed in it."""
+
+MIXED_SHARE, LEAST_KNOWN = 0.8, 0.3
+"""The share of the unknown pixels that mixtures explain, and of all that have a class besides."""
+
+
+def _cause(image: UInt8, unknown: Mask, table: UInt16) -> str:
+    """Return why colours (H, W, 3) may be no class, and what to do."""
+    used = [name for name, channel in zip(("red", "green", "blue"), range(3), strict=True) if image[..., channel].any()]
+    if (image == image[..., :1]).all():
+        return "its three channels are equal: are they ids? save one of them, image[..., 0], as grey"
+    if len(used) == 1:
+        return f"only its {used[0]} channel is not 0: are these ids, as CARLA's? save that channel alone, as grey"
+    if np.count_nonzero(table[_packed(image[..., ::-1])] == NO_CLASS) < 0.05 * unknown.size:
+        return (
+            "with red and blue exchanged it is one: OpenCV writes BGR; exchange them (image[..., ::-1]) and save again"
+        )
+    mixed = _is_mixed(image, unknown) | _is_mixed(image.swapaxes(0, 1), unknown.T).T
+    if (~unknown).mean() >= LEAST_KNOWN and mixed[unknown].mean() >= MIXED_SHARE:
+        return "such colours are mixtures of neighbouring classes at borders; resize label maps by the nearest pixel"
+    return "set taxonomy to the one whose colours the image has"
+
+
+def _is_mixed(image: UInt8, unknown: Mask) -> Mask:
+    """Return the unknown pixels (H, W) whose colour lies between those of the next known ones in their row."""
+    H, W = unknown.shape
+    u = np.arange(W)
+    before = np.maximum.accumulate(np.where(unknown, -W, u), axis=1)
+    after = np.minimum.accumulate(np.where(unknown, 2 * W, u)[:, ::-1], axis=1)[:, ::-1]
+    near = unknown & (u - before <= NEIGHBOURS) & (after - u <= NEIGHBOURS)
+    rows = np.arange(H)[:, None]
+    a, b = (image[rows, at.clip(0, W - 1)].astype(np.int16) for at in (before, after))
+    between = (image >= np.minimum(a, b) - 1) & (image <= np.maximum(a, b) + 1)
+    mixed: Mask = near & between.all(axis=2)
+    return mixed
 
 
 @functools.lru_cache(maxsize=2)
@@ -450,6 +538,30 @@ def _decode_exr(path: Path, data: bytes, own: FrameSize) -> npt.NDArray[Any]:
     return depth
 
 
+PFM_HEADER = re.compile(rb"P([Ff])\s+(\d{1,9})\s+(\d{1,9})\s+([-+.\deE]{1,40})\s")
+
+
+def _decode_pfm(path: Path, data: bytes, own: FrameSize) -> npt.NDArray[Any]:
+    """Return one channel (H, W) of a portable float map, whose rows go from the bottom to the top."""
+    header = PFM_HEADER.match(data)
+    if header is None:
+        raise DataError(f"{path}: not a PFM image (it begins with {data[:8]!r}); {AGAIN}")
+    width, height, channels = int(header[2]), int(header[3]), 1 if header[1] == b"f" else 3
+    _check_pixels(path, width, height, 4 * channels + 4, own)
+    try:
+        order = "<" if float(header[4]) < 0 else ">"
+    except ValueError as error:
+        raise DataError(f"{path}: not a whole PFM image; {AGAIN}") from error
+    needed, there = 4 * width * height * channels, len(data) - header.end()
+    if there < needed:
+        raise DataError(f"{path}: truncated: {width}x{height} pixels need {needed} bytes, it has {there}; {AGAIN}")
+    stored = np.frombuffer(data, f"{order}f4", width * height * channels, header.end())
+    bits = stored.view(np.uint32).reshape(-1, channels)  # NaN, too, is what it is in the other channels
+    if channels > 1 and (bits != bits[:, :1]).any():
+        raise DataError(f"{path}: expected one channel, got {channels} that differ; export the depth channel alone")
+    return stored.reshape(height, width, channels)[::-1, :, 0]
+
+
 @functools.cache
 def reads_exr() -> bool:
     """Return whether the installed OpenCV was built with EXR."""
@@ -500,6 +612,12 @@ def _check_pixels(path: Path, width: int, height: int, pixel_bytes: int = 1, own
     if pixels > most:
         raise DataError(f"{path}: claims {width}x{height} pixels (at most {most} are read); is it damaged?")
     own.require((height, width))
+    if own.depth is not None and pixels > max(ORDINARY, BEYOND_DEPTH * math.prod(own.depth)) and not own.pixels():
+        H, W = own.depth
+        raise DataError(
+            f"{path}: claims {width}x{height} pixels, but depth is {W}x{H} (without an image, {BEYOND_DEPTH} times the"
+            " pixels of the depth are read at most); bring them to one size"
+        )
 
 
 def _check_photograph(path: Path, data: bytes, width: int, height: int) -> None:

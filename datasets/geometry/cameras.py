@@ -93,6 +93,12 @@ def to_camera_to_world(T: Poses, convention: str, axes: str, where: str) -> Pose
         return T
     if (largest := np.abs(T).max()) > LARGEST_COORDINATE:
         raise DataError(f"{where}: the pose holds {largest:g}, which no camera's has; is the file damaged?")
+    factor = T[3, 3]
+    if np.abs(T[3, :3]).max() == 0 and abs(factor - 1) > UNIT_TOLERANCE / 10 and factor != 0:
+        raise DataError(
+            f"{where}: the pose is multiplied by {factor:.6g} (its last row is 0 0 0 {factor:.6g}); divide it by its"
+            " last element"
+        )
     if convention == "world_to_camera":
         try:
             T = np.linalg.inv(T).astype(np.float64, copy=False)
