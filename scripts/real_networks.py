@@ -41,7 +41,7 @@ Numbers. results/real-networks.csv has a row for each network in each condition:
     effective_classes      1 / probability that two observations from anywhere agree (Hill number of order 2)
     largest_class, _share  the class with most observations
     voxels, mean_op, recurrent_share     of the map; recurrent: OP >= 3
-    spots, views           what alpha rests on
+    spots, views           what alpha rests on; cells of rows that were measured before alpha was estimated from spots
 results/real-networks.json has versions, commands, digests (SHA-256) of weights and sequences, and for each condition
 Spearman's rank correlation of a measure with the published mIoU, and with the effective number of classes, over
 `networks` networks. Its 95 % interval comes from 9,999 bootstrap samples of networks (scipy.stats.bootstrap, percentile
@@ -172,8 +172,10 @@ class Row:
     voxels: int
     mean_op: float
     recurrent_share: float
-    spots: int
-    views: int
+    spots: int = 0
+    views: int = 0
+    cells: int = 0
+    """Instead of spots, in rows that were measured before alpha was estimated from spots."""
 
 
 MEASURES = ("alpha", "vss", "agree", "flicker")
