@@ -23,8 +23,9 @@ the page to sort and filter; `python scripts/leaderboard_page.py` writes these t
   two classes, one class), and clusters of colour named by eye. A model may be stable and wrong: read alpha beside
   accuracy.
 - `apc_shelf@1`: the labels and the scores that were published with the data.
-- `livingroom@1`: ten networks of two families, trained on PASCAL VOC ([how](real-networks.md)). They were timed on two
-  cores that did other work, too: do not compare their milliseconds.
+- `livingroom@1`: ten networks of two families, trained on PASCAL VOC ([how](real-networks.md)).
+
+These models were timed on two cores that did other work, too: their milliseconds are no measure of speed.
 
 ```bash
 semstab-bench benchmark city@1 -m sim-steady -m sim-flicker -m sim-soft -m trick-two-class \\
