@@ -74,9 +74,9 @@ GATE, ENOUGH = 0.05, 50
 """That standard deviation is taken of differences up to this, relative, if a frame has at least so many."""
 
 SPARSE, ALONE, DENSE = 0.3, 0.7, 0.1
-"""Share of an image's pixels that have depth below which depth is sparse, as a LiDAR's in an image is, if fewer than
-this share of these pixels have one next to them; and share of the
-labels at pixels without depth from which on labels are read where a spot falls, not at the next pixel with depth."""
+"""Depth of an image is sparse, as from a LiDAR, if fewer than this share of its pixels have depth, and fewer than this
+share of these have one next to them; and share of the labels at pixels without depth from which on labels are read
+where a spot falls, not at the next pixel with depth."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -216,7 +216,7 @@ class Sampler:
 
     def _find_in_points(self, sparse: Sparse, T: Float64, seed: int) -> None:
         """Add spots among the points of sparse depth."""
-        from semstab.statistics.loops.spots import new_in_points
+        from semstab.statistics.loops.sparse import new_in_points
 
         place = sparse.camera, sparse.around, sparse.reach, sparse.pixels
         where = self._allowed(), T, self._edge, self._share, self._low, _factor(len(sparse.w)), LOOKED_AT, seed
@@ -271,7 +271,7 @@ class Sampler:
         return tuple(column[:m] for column in out)
 
     def _answers_of_points(self, frame: Frame, sparse: Sparse, T: Float64, seed: int) -> tuple[Any, ...]:
-        from semstab.statistics.loops.spots import answer_points, answer_sparse, project_sparse
+        from semstab.statistics.loops.sparse import answer_points, answer_sparse, project_sparse
 
         n = self._spots
         spot, nearest, (x, y, error, room) = np.empty(n, np.int32), np.empty(n, np.int64), np.empty((4, n))
@@ -399,7 +399,7 @@ def _factor(total: int) -> int:
 
 def _sparse(frame: Frame, K: int) -> Sparse | None:
     """Return the points of a scan, or of an image with sparse depth; None of an image with dense depth."""
-    from semstab.statistics.loops.spots import directions, drawn
+    from semstab.statistics.loops.sparse import directions, drawn
 
     if frame.points is not None:
         points = fixed(frame.points.reshape(-1, 3))
