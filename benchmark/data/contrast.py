@@ -127,8 +127,7 @@ class Ignored:
         missing: Share of their pixels.
         psa_low, psa_high: Bounds of the agreement of two views of a spot, whatever the missing observations would have
             been (Manski 1990): the worst case, and the best.
-        alpha: By the convention that what is left out agrees as by chance: alpha of what it labelled, times the share
-            of pairs of views of which it labelled both.
+        alpha: By the convention that a pair of views disagrees if the model left out one of them: see `LabelledPairs`.
     """
 
     model: str

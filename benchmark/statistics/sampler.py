@@ -61,7 +61,7 @@ STILL = 1.0
 """Pixels by which no point of an image moves while a camera stands still."""
 
 SIGMAS, LEAST, MOST = 1.0, 0.002, 0.05
-"""A pixel shows a spot if their depths differ by at most so many standard deviations of how they differ in the flight,
+"""A pixel shows a spot if their depths differ by at most SIGMAS standard deviations of how they differ in the flight,
 which depth noise and errors of poses cause; the least and the most of this tolerance, relative. A third of the answers
 is lost by this, whatever the labels; with a wider tolerance more answers come from other surfaces than the spot's. Of a
 first frame, which has nothing to differ from, the noise within it counts."""
@@ -71,7 +71,7 @@ SURE, SMOOTH = 4.0, 0.0005
 relative, from which on depth comes from planes through the pixels around."""
 
 GATE, ENOUGH = 0.05, 50
-"""That standard deviation is taken of differences up to this, relative, if a frame has at least so many."""
+"""That standard deviation comes from differences up to GATE, relative, of frames that have ENOUGH of them."""
 
 SPARSE, ALONE, DENSE = 0.3, 0.7, 0.1
 """Depth of an image is sparse, as from a LiDAR, if fewer than this share of its pixels have depth, and fewer than this

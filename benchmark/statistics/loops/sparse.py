@@ -9,14 +9,18 @@ from semstab.statistics.loops.spots import (
     OFF,
     PLACES,
     STEEPEST,
+    add_spot,
     area,
     aside,
+    first_side,
     fraction,
-    free,
+    in_sensor,
     in_world,
     mixed,
     number_of,
     own_label,
+    squared,
+    two_labels,
 )
 
 ON_A_PLANE = 0.03
@@ -160,12 +164,9 @@ def new_in_points(
                 if near > 0.5 * here:
                     x, y, here = x + dx, y + dy, near
             px, py, pz = in_world(*back(x, y, here, camera, around), T)
-            own = free(px, py, pz, edge, share, low, table, True)
-            if own >= 0:
-                point[n, 0], point[n, 1], point[n, 2], hashed[n] = px, py, pz, own
-                n += 1
-                if n == len(hashed):
-                    return n
+            n = add_spot(px, py, pz, edge, share, low, table, point, hashed, n)
+            if n == len(hashed):
+                return n
     return n
 
 
@@ -191,10 +192,7 @@ def project_sparse(point, grid, u, v, w, camera, around, reach, dense, T, spot, 
     fx, fy, cx, cy = camera
     n = 0
     for i in range(len(point)):
-        a, b, c = point[i, 0] - T[0, 3], point[i, 1] - T[1, 3], point[i, 2] - T[2, 3]
-        X = T[0, 0] * a + T[1, 0] * b + T[2, 0] * c
-        Y = T[0, 1] * a + T[1, 1] * b + T[2, 1] * c
-        Z = T[0, 2] * a + T[1, 2] * b + T[2, 2] * c
+        X, Y, Z = in_sensor(point[i, 0], point[i, 1], point[i, 2], T)
         distance = np.sqrt(X * X + Y * Y + Z * Z) if around else Z
         if not distance > 1e-9:
             continue
@@ -211,7 +209,7 @@ def project_sparse(point, grid, u, v, w, camera, around, reach, dense, T, spot, 
             if at < 0 or least > NEXT:
                 continue
             there, along_x, along_y = w[at], 0.0, 0.0
-        spot[n], x[n], y[n], error[n], room[n], nearest[n] = i, p, q, there * distance - 1.0, 0.0, at
+        spot[n], x[n], y[n], error[n], nearest[n] = i, p, q, there * distance - 1.0, at
         room[n] = abs(along_x) + abs(along_y)
         n += 1
     return n
@@ -230,22 +228,19 @@ def answer_sparse(
             continue
         column, row, here = np.int64(np.floor(x[i] + 0.5)), np.int64(np.floor(y[i] + 0.5)), w[nearest[i]]
         own, dx, dy = own_label(labels, unlabelled, row, column, K), column - x[i], row - y[i]
-        second, third, ex, ey = own, own, dx, dy
+        out[n], near[n], far[n], beyond[n] = spot[i], own, own, own
+        square[n] = squared(dx, dy, here, fx, fy)
         if own < K:
-            start = np.int64(mixed(np.uint32(np.uint32(seed) ^ hashed[spot[i]])) & np.uint32(3))
+            side = first_side(seed, hashed[spot[i]])
             for turn in range(4):
-                step_x, step_y = aside((start + turn) & 3)
-                a, b = column + 2 * step_x, row + 2 * step_y
-                if a < 0 or b < 0 or a >= W or b >= H:
+                step_x, step_y = aside((side + turn) & 3)
+                if not (0 <= column + 2 * step_x < W and 0 <= row + 2 * step_y < H):
                     continue
-                first = own_label(labels, unlabelled, row + step_y, column + step_x, K)
-                last = own_label(labels, unlabelled, b, a, K)
-                if first < K and last < K:
-                    second, third, ex, ey = first, last, dx + step_x, dy + step_y
+                first, last = two_labels(labels, unlabelled, row, column, step_x, step_y, K)
+                if first < K:
+                    far[n], beyond[n] = first, last
+                    square[n, 1] = squared(dx + step_x, dy + step_y, here, fx, fy)
                     break
-        out[n], near[n], far[n], beyond[n] = spot[i], own, second, third
-        square[n, 0] = ((dx / fx) ** 2 + (dy / fy) ** 2) / (here * here)
-        square[n, 1] = ((ex / fx) ** 2 + (ey / fy) ** 2) / (here * here)
         n += 1
     return n
 
@@ -291,7 +286,7 @@ def answer_points(
         if abs(error[i]) > allowed:
             continue
         at = nearest[i]
-        step_x, step_y = aside(np.int64(mixed(np.uint32(np.uint32(seed) ^ hashed[spot[i]])) & np.uint32(3)))
+        step_x, step_y = aside(first_side(seed, hashed[spot[i]]))
         half = 0.5 * reach
         first = next_point(
             grid, u, v, w, at, u[at] + half * step_x, v[at] + half * step_y, reach, around, allowed, room[i]
@@ -310,6 +305,6 @@ def answer_points(
             dx, dy = u[j] - x[i], v[j] - y[i]
             if around:
                 dx = dx - columns * np.round(dx / columns)
-            square[n, k] = ((narrow * dx / fx) ** 2 + (dy / fy) ** 2) / (w[at] * w[at])
+            square[n, k] = squared(narrow * dx, dy, w[at], fx, fy)
         n += 1
     return n

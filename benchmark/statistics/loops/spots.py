@@ -213,6 +213,27 @@ def free(px, py, pz, edge, share, low, table, taken):
 
 
 @serial
+def add_spot(px, py, pz, edge, share, low, table, point, hashed, n):
+    """Add a point as spot n if its coarse cell is in the sample and has none; return how many spots there are."""
+    own = free(px, py, pz, edge, share, low, table, True)
+    if own < 0:
+        return n
+    point[n, 0], point[n, 1], point[n, 2], hashed[n] = px, py, pz, own
+    return n + 1
+
+
+@serial
+def in_sensor(px, py, pz, T):
+    """Return a point of the world in the axes of the sensor."""
+    a, b, c = px - T[0, 3], py - T[1, 3], pz - T[2, 3]
+    return (
+        T[0, 0] * a + T[1, 0] * b + T[2, 0] * c,
+        T[0, 1] * a + T[1, 1] * b + T[2, 1] * c,
+        T[0, 2] * a + T[1, 2] * b + T[2, 2] * c,
+    )
+
+
+@serial
 def area(here, along_x, along_y, x, y, fx, fy):
     """Return the area of the surface that a pixel at ray (x, y, 1) shows, m^2, from inverse depth and its slopes.
 
@@ -274,12 +295,9 @@ def new_in_image(depth, camera, T, allowed, edge, share, low, stride, factor, lo
             there = smoothed(depth, row, column, here, u - column, v - row, allowed)
             z = 1.0 / (there if there > 0.5 * here else here)
             px, py, pz = in_world((u - cx) / fx * z, (v - cy) / fy * z, z, T)
-            own = free(px, py, pz, edge, share, low, table, True)
-            if own >= 0:
-                point[n, 0], point[n, 1], point[n, 2], hashed[n] = px, py, pz, own
-                n += 1
-                if n == len(hashed):
-                    return n
+            n = add_spot(px, py, pz, edge, share, low, table, point, hashed, n)
+            if n == len(hashed):
+                return n
     return n
 
 
@@ -324,12 +342,10 @@ def project(point, depth, camera, T, noise, spot, x, y, error, room):
     fx, fy, cx, cy = camera
     n = 0
     for i in range(len(point)):
-        a, b, c = point[i, 0] - T[0, 3], point[i, 1] - T[1, 3], point[i, 2] - T[2, 3]
-        z = T[0, 2] * a + T[1, 2] * b + T[2, 2] * c
+        right, down, z = in_sensor(point[i, 0], point[i, 1], point[i, 2], T)
         if not z > 1e-9:
             continue
-        u = (T[0, 0] * a + T[1, 0] * b + T[2, 0] * c) / z * fx + cx
-        v = (T[0, 1] * a + T[1, 1] * b + T[2, 1] * c) / z * fy + cy
+        u, v = right / z * fx + cx, down / z * fy + cy
         if not (-0.5 <= u < W - 0.5 and -0.5 <= v < H - 0.5):
             continue
         column, row = np.int64(np.floor(u + 0.5)), np.int64(np.floor(v + 0.5))
@@ -366,6 +382,34 @@ def aside(side):
 
 
 @serial
+def first_side(seed, hashed):
+    """Return the side at which the second answer for a spot is looked for first, 0 to 3: by frame and coarse cell."""
+    return np.int64(mixed(np.uint32(np.uint32(seed) ^ hashed)) & np.uint32(3))
+
+
+@serial
+def two_labels(labels, unlabelled, row, column, step_x, step_y, K):
+    """Return the labels of the next two pixels in a direction, K or more if one has none."""
+    first = own_label(labels, unlabelled, row + step_y, column + step_x, K)
+    last = own_label(labels, unlabelled, row + 2 * step_y, column + 2 * step_x, K)
+    return (first, last) if max(first, last) < K else (np.int64(K), np.int64(K))
+
+
+@serial
+def shows(depth, row, column, here, along_x, along_y, dx, dy, allowed):
+    """Return whether a pixel (dx, dy) away from another shows the surface that goes on there with these slopes."""
+    there, expected = inverse(depth, row + dy, column + dx), here + along_x * dx + along_y * dy
+    slack = 1.5 * allowed + SLACK * (abs(dx) + abs(dy)) * (abs(along_x) + abs(along_y)) / here
+    return there > 0.0 and abs(there - expected) <= slack * here
+
+
+@serial
+def squared(dx, dy, here, fx, fy):
+    """Return the squared distance, metres^2 across the ray, of a point (dx, dy) pixels away at an inverse depth."""
+    return ((dx / fx) ** 2 + (dy / fy) ** 2) / (here * here)
+
+
+@serial
 def answer(
     spot, x, y, room, allowed, depth, labels, unlabelled, K, camera, hashed, seed, out, near, far, beyond, square
 ):
@@ -384,36 +428,24 @@ def answer(
             continue
         column, row = np.int64(np.floor(x[i] + 0.5)), np.int64(np.floor(y[i] + 0.5))
         own, here = own_label(labels, unlabelled, row, column, K), inverse(depth, row, column)
-        second, third, dx, dy = own, own, column - x[i], row - y[i]
-        ex, ey = dx, dy
+        out[n], near[n], far[n], beyond[n] = spot[i], own, own, own
+        dx, dy = column - x[i], row - y[i]
+        square[n] = squared(dx, dy, here, fx, fy)
         if own < K:
             along_x, along_y = slopes(depth, row, column, here)
-            start = np.int64(mixed(np.uint32(np.uint32(seed) ^ hashed[spot[i]])) & np.uint32(3))
+            side = first_side(seed, hashed[spot[i]])
             for turn in range(4):
-                step_x, step_y = aside((start + turn) & 3)
-                labelled = np.int64(K)
-                for times in range(2, 0, -1):
-                    a, b = column + times * step_x, row + times * step_y
-                    there = inverse(depth, b, a)
-                    expected = here + times * (along_x * step_x + along_y * step_y)
-                    slack = 1.5 * allowed + SLACK * times * (abs(along_x) + abs(along_y)) / here
-                    if there == 0.0 or abs(there - expected) > slack * here:
-                        labelled = np.int64(K)
-                        break
-                    its = own_label(labels, unlabelled, b, a, K)
-                    if its >= K:
-                        labelled = np.int64(K)
-                        break
-                    if times == 2:
-                        labelled = its
-                    else:
-                        second, third = its, labelled
-                        ex, ey = dx + step_x, dy + step_y
-                if labelled < K:
+                step_x, step_y = aside((side + turn) & 3)
+                surface = row, column, here, along_x, along_y
+                if not shows(depth, *surface, step_x, step_y, allowed):
+                    continue
+                if not shows(depth, *surface, 2 * step_x, 2 * step_y, allowed):
+                    continue
+                first, last = two_labels(labels, unlabelled, row, column, step_x, step_y, K)
+                if first < K:
+                    far[n], beyond[n] = first, last
+                    square[n, 1] = squared(dx + step_x, dy + step_y, here, fx, fy)
                     break
-        out[n], near[n], far[n], beyond[n] = spot[i], own, second, third
-        square[n, 0] = ((dx / fx) ** 2 + (dy / fy) ** 2) / (here * here)
-        square[n, 1] = ((ex / fx) ** 2 + (ey / fy) ** 2) / (here * here)
         n += 1
     return n
 
