@@ -123,7 +123,7 @@ def test_without_asking_there_is_what_the_map_alone_tells(tmp_path) -> None:
     table = VoxelTable.load(tmp_path / "run" / "voxels" / f"{entry.unit.slug}.parquet")
     spots = SpotObservations.load(tmp_path / "run" / "observations" / f"{entry.unit.slug}.parquet")
     assert to_json(entry.statistics) == to_json(describe(table, spots=spots, name="a"))
-    assert entry.statistics.drift.trend is None
+    assert entry.statistics.drift.flips is None
     assert result.comparisons == ()
     again = semstab.run(configure(root, events=True), out=tmp_path / "run", report=False)  # kept
     assert to_json(again.runs[0].statistics) == to_json(entry.statistics)
@@ -162,9 +162,9 @@ def test_the_first_backend_that_keeps_a_log_has_all_statistics(tmp_path) -> None
     root = tiny_scene.write(tmp_path / "wall", ("a",))
     result = semstab.run(configure(root, backends=["open3d"], check="numpy", statistics=True), report=False)
     open3d, numpy = result.runs
-    assert open3d.statistics.drift.trend is None
+    assert open3d.statistics.drift.flips is None
     assert open3d.statistics.correctness is not None
-    assert numpy.statistics.drift.trend is not None
+    assert numpy.statistics.drift.flips is not None
     assert numpy.statistics.agreement.voxel_alpha.value == pytest.approx(open3d.statistics.agreement.voxel_alpha.value)
     assert numpy.statistics.headline.alpha.value == open3d.statistics.headline.alpha.value
     plain = semstab.run(configure(root, backends=["open3d"], check="numpy"), report=False)
@@ -185,7 +185,7 @@ def test_no_ground_truth_no_judgement(tmp_path) -> None:
     (root / "labels/gt").rmdir()
     (entry,) = semstab.run(configure(root, statistics=True), report=False).runs
     assert entry.statistics.correctness is entry.statistics.geometry is None
-    assert entry.statistics.drift.trend is not None
+    assert entry.statistics.drift.flips is not None
 
 
 def test_models_of_different_classes_are_not_compared(tmp_path) -> None:
@@ -244,9 +244,7 @@ def test_the_tables_of_a_study_have_the_numbers_of_its_units(studied) -> None:
         assert row["psa"] == pytest.approx(dataclasses.asdict(own.agreement.psa), nan_ok=True)
         assert row["flip_rate"] == own.drift.flips.rate.value
     for row in rows_of(found, "drift"):
-        trend = base[row["model"]].drift.trend
-        assert row["trend_voxels"] == trend.voxels
-        assert row["trend_percent"]["value"] == pytest.approx(100 * trend.share.value, nan_ok=True)
+        assert row["voxels"] == base[row["model"]].drift.voxels
         assert row["sbd"] - row["sbd_null"] == pytest.approx(row["sbd_excess"]["value"])
     for row in rows_of(found, "ceiling"):
         assert row["disagreement"]["value"] == pytest.approx(row["geometry"]["value"] + row["model"]["value"])

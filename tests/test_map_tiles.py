@@ -198,12 +198,12 @@ def judged(wall, tmp_path_factory):
 
 
 def test_statistics_of_tiles_are_those_of_the_whole_map(judged) -> None:
-    """With log and ground truth: trends, flips, quadrants; each column of each voxel."""
+    """With log and ground truth: flips, quadrants; each column of each voxel."""
     assert_same_run(*judged)
     whole, tiles = judged
     (statistics,) = (run["statistics"] for run in summary_of(tiles)["runs"])
     assert all(statistics[name] is not None for name in ("geometry", "correctness", "flipping"))
-    assert statistics["drift"]["trend"]["voxels"] > 0
+    assert statistics["drift"]["flips"]["rate"]["value"] > 0
     one, other = (semstab.load(folder) for folder in (tiles, whole))
     names = parquet.read_schema(other.result.records[0].voxels_file).names
     names = [name for name in names if name != "evidence"]

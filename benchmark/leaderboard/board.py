@@ -159,7 +159,7 @@ def _unranked(own: Mapping[str, Result], benchmark: Benchmark) -> dict[str, tupl
 
 def _levels(handle: RunHandle) -> list[str]:
     statistics = [entry.summary.statistics for entry in handle.scenes.values()]
-    return ["" if own is None else own.verdict.level for own in statistics]
+    return ["" if own is None else own.verdict.decisive for own in statistics]
 
 
 def _name(about: Submission, handle: RunHandle) -> str:

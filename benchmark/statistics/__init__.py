@@ -14,7 +14,7 @@ from semstab.data.statistics import Estimate, Reliability
 from semstab.statistics.agreement import class_agreement, decompose, disagreement, fleiss_kappa, krippendorff_alpha, psa
 from semstab.statistics.correctness import consistent_wrong, correctness, join_truth, reliability
 from semstab.statistics.correlogram import correlogram
-from semstab.statistics.drift import expected_sbd, flips, trends
+from semstab.statistics.drift import expected_sbd, flips
 from semstab.statistics.geometry import ceiling, losses, rendered
 from semstab.statistics.map_statistics import Analysis, analyse, describe
 from semstab.statistics.model_comparison import compare_models, coverage, paired
@@ -56,6 +56,5 @@ __all__ = [
     "reliability",
     "rendered",
     "standardised",
-    "trends",
     "verdict",
 ]
