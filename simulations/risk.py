@@ -30,7 +30,7 @@ from scipy.stats import mannwhitneyu
 
 import semstab
 from semstab import backends
-from semstab.comparison.runs import open_run
+from semstab.comparison.entries import open_run
 from semstab.data.measures import dominant
 from semstab.data.voxels import VoxelTable
 from semstab.statistics.agreement import CONSISTENT, psa

@@ -17,16 +17,16 @@ from posed_writer import write_posed
 from rich.console import Console
 
 import semstab
+from semstab.compare_runs import load_comparison, markdown
 from semstab.comparison.differences import corrected, over_scenes
+from semstab.comparison.entries import open_runs
 from semstab.comparison.pairing import pair
-from semstab.comparison.runs import open_runs
-from semstab.comparison.tables import print_comparison, sentences
-from semstab.comparison.writing import load_comparison, markdown
 from semstab.data.contrast import Against, Contrast, RunComparison, SceneComparison
 from semstab.data.frames import Frame, Intrinsics
 from semstab.data.georeference import Georeference
 from semstab.data.statistics import Interval
 from semstab.errors import ConfigError, DataError
+from semstab.report.comparison.tables import print_comparison, sentences
 
 FAULTY = (2, 5, 8)
 CLASSES = ["wall", "door", "window", "floor"]

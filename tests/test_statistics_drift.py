@@ -10,7 +10,6 @@ import numpy as np
 import pytest
 from simulated_events import grid, log_of, log_of_evidence, soft
 
-from semstab.data.events import Events
 from semstab.data.information import js_divergence, normalise
 from semstab.metrics import sbd, vss
 from semstab.statistics import describe, expected_sbd, flips

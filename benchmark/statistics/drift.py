@@ -20,6 +20,7 @@ from semstab.statistics.agreement import ONE_HOT
 
 FLIP_RATE = Quantity(key="flip_rate", title="Flip rate", better="lower", needs="events")
 
+
 @dataclass(frozen=True, eq=False)
 class Flips:
     """Changes of the predicted class between successive observations of a voxel (n,); NaN where undefined.

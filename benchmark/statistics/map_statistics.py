@@ -256,7 +256,9 @@ def _agreement(means: Mapping[str, Interval], classes: tuple[ClassAgreement, ...
     return FrameAgreement(**{name: means[name] for name in names}, classes=classes)
 
 
-def _drift(repeats: int, means: Mapping[str, Interval], locations: ClusterSums, log: ClusterSums | None) -> DriftStatistics:
+def _drift(
+    repeats: int, means: Mapping[str, Interval], locations: ClusterSums, log: ClusterSums | None
+) -> DriftStatistics:
     """Return SBD and its null; without a log only for one-hot evidence, and without flips."""
     rates, (sampled, known) = None, (locations[name][:, 1].sum() for name in ("psa", "null"))
     if log is not None:

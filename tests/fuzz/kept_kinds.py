@@ -14,7 +14,7 @@ from kind import Kind
 from posed_config import configure
 
 import semstab
-from semstab.comparison.writing import compare, load_comparison
+from semstab.compare_runs import compare, load_comparison
 from semstab.configure import load_config, resolve
 from semstab.conformance import case_folder, compared
 from semstab.data.frames import Intrinsics

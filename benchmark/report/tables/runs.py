@@ -74,7 +74,8 @@ def _row(record: Record) -> Row:
     correct = None if statistics is None else statistics.correctness
     return (
         run.unit.scene, run.unit.model, "" if verdict is None else verdict.decisive,
-        unknown if verdict is None else 100 * verdict.decisive_probability, unknown if headline is None else headline.alpha,
+        unknown if verdict is None else 100 * verdict.decisive_probability,
+        unknown if headline is None else headline.alpha,
         "" if headline is None else headline.alpha.scope,
         unknown if statistics is None else 100 * statistics.agreeing, record.image_space.compensated_flicker_percent,
         *means, unknown if correct is None else correct.miou, run.table.voxel_size, run.frames,
