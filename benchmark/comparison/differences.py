@@ -11,6 +11,7 @@ from pathlib import Path
 
 import numpy as np
 
+from semstab.comparison.caution import cautions
 from semstab.comparison.entries import Entry, Flicker, RunHandle, open_models, open_runs, shared_scenes
 from semstab.comparison.locations import Changes, worse_areas
 from semstab.comparison.pairing import Common, joint_class, pair
@@ -337,11 +338,18 @@ def differences_of(
             )
             for each in handles
         ),
-        overall=_over_all(scenes),
+        overall=(overall := _over_all(scenes)),
         scenes=tuple(scenes),
+        cautions=tuple(dict.fromkeys(text for own in overall for text in _cautions(handles, own, scenes))),
     )
     ups = {scene: up for each in reversed(handles) for scene, entry in each.scenes.items() if (up := entry.up)}
     return ComparisonData(result, changes, ups)
+
+
+def _cautions(handles: Sequence[RunHandle], against: Against, scenes: Sequence[SceneComparison]) -> Iterator[str]:
+    base, other = handles[0], next(each for each in handles if each.name == against.other)
+    entries = [(base.scenes[each.scene], other.scenes[each.scene]) for each in scenes]
+    return cautions((base.name, other.name), entries, against.contrasts)
 
 
 def _scene(scene: str, runs: Sequence[RunHandle], scope: Scope) -> tuple[SceneComparison, dict[str, Changes]]:

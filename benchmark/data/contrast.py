@@ -211,6 +211,7 @@ class RunComparison:
 
     Attributes:
         overall: Macro means over the scenes, each counting once.
+        cautions: What stands against taking the more stable run for the better one.
     """
 
     schema: int
@@ -218,9 +219,11 @@ class RunComparison:
     runs: tuple[Compared, ...]
     overall: tuple[Against, ...]
     scenes: tuple[SceneComparison, ...]
+    cautions: tuple[str, ...] = ()
 
     def __repr__(self) -> str:
         scenes = ", ".join(scene.scene for scene in self.scenes)
         lines = [f"<RunComparison with {self.base} on {scenes}>"]
         lines += [f"  {own.stated}" for own in self.overall]
+        lines += [f"  caution: {text}" for text in self.cautions]
         return "\n".join(lines)

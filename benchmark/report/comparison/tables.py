@@ -293,7 +293,7 @@ BASES: dict[Basis, str] = {
 
 def sentences(comparison: RunComparison) -> list[str]:
     """Return the results of one run after the other, then notes on data that could not be compared."""
-    return [*answers(comparison), *notes(comparison)]
+    return [*answers(comparison), *(f"caution: {text}." for text in comparison.cautions), *notes(comparison)]
 
 
 def answers(comparison: RunComparison) -> list[str]:
@@ -428,7 +428,7 @@ def print_comparison(
 
     `out` is the folder that they were written to.
     """
-    for sentence in answers(comparison):
+    for sentence in (*answers(comparison), *(f"caution: {text}." for text in comparison.cautions)):
         console.print(sentence, highlight=False, markup=False)
     for table in tables(comparison):
         if table.name == "comparison" or (verbose and table.name in SHOWN):
