@@ -116,13 +116,13 @@ def test_the_classes_with_most_of_the_disagreement_are_listed(tmp_path, monkeypa
 
 def test_without_asking_there_is_what_the_map_alone_tells(tmp_path) -> None:
     root = tiny_scene.write(tmp_path / "wall", ("a",))
-    result = semstab.run(configure(root, events=True), out=tmp_path / "run", report=False)
+    result = semstab.run(configure(root, events=True, truth=False), out=tmp_path / "run", report=False)
     (entry,) = result.runs
     table = VoxelTable.load(tmp_path / "run" / "voxels" / f"{entry.unit.slug}.parquet")
     spots = SpotObservations.load(tmp_path / "run" / "observations" / f"{entry.unit.slug}.parquet")
     assert to_json(entry.statistics) == to_json(describe(table, spots=spots, name="a"))
     assert entry.statistics.drift.flips is None
-    again = semstab.run(configure(root, events=True), out=tmp_path / "run", report=False)  # kept
+    again = semstab.run(configure(root, events=True, truth=False), out=tmp_path / "run", report=False)  # kept
     assert to_json(again.runs[0].statistics) == to_json(entry.statistics)
 
 
@@ -200,9 +200,12 @@ def test_summaries_of_several_scenes_say_which_one_a_verdict_is_of(tmp_path, cap
     for scene in ("x", "y"):
         tiny_scene.write(tmp_path / "walls" / scene, ("a",))
     print_summary(semstab.run(configure(tmp_path / "walls"), report=False), Console(width=80))
-    printed = " ".join(capsys.readouterr().out.split())
-    assert "x a no verdict" in printed
-    assert "y a no verdict" in printed
+    lines = capsys.readouterr().out.splitlines()
+    start = next(k for k, line in enumerate(lines) if line.startswith("  by scene"))
+    assert [" ".join(line.split()[:4]) for line in lines[start + 1 : start + 3]] == [
+        f"{scene} no verdict {alpha}"
+        for scene, alpha in zip("xy", (line.split()[3] for line in lines[start + 1 : start + 3]), strict=True)
+    ]
 
 
 # --- A study ----------------------------------------------------------------------------------------------------------
