@@ -84,9 +84,6 @@ def export(
     classify: str | Path | None = None,
     radius: float | None = None,
     join: str | Path | None = None,
-    commit: str | Path | None = None,
-    onto: str | Path | None = None,
-    beside: str | Path | None = None,
     task_format: str | None = None,
     most: int = MOST,
     code: Sequence[str] = (),
@@ -109,9 +106,6 @@ def export(
             `radius`.
         radius: Metres, a voxel's edge where not given.
         join: A Parquet file with further columns of the same voxels, such as `compare` writes.
-        commit: Name of `thresholds` in the version before.
-        onto: Name of `classify` in the version before.
-        beside: Name of `join` in the version before.
         task_format: 'coco', 'labelstudio', 'cvat' or 'fiftyone': write annotation tasks for it, the locations
             where frames disagree, instead of the map.
         most: The largest number of annotation tasks.
@@ -129,7 +123,6 @@ def export(
         >>> file.path.name
         'map.ply'
     """
-    classify, join, thresholds = classify or onto, join or beside, thresholds or commit
     run, model = model_of(run, model)
     files = [Path(file) for file in ([to] if isinstance(to, str | Path) else to)]
     _require_writable(files, (asprs, join, thresholds), task_format)
