@@ -130,12 +130,12 @@ def test_the_columns_go_along_in_an_export(runs, fault, tmp_path):
     listed = [area.number for area in own.areas if area.what == "agreement"]
     assert set(listed) <= set(columns["area"].to_numpy().tolist())
     file = runs / "compared" / own.columns
-    semstab.export(runs / "old", tmp_path / "map.parquet", measures=["change", "area"], beside=file)
+    semstab.export(runs / "old", tmp_path / "map.parquet", measures=["change", "area"], join=file)
     exported = pq.read_table(tmp_path / "map.parquet")
     assert (exported["area"].to_numpy() > 0).sum() == (columns["area"].to_numpy() > 0).sum()
     assert exported["change"].null_count == exported.num_rows - own.compared
     with pytest.raises(DataError, match=r"voxels of 0\.125 m"):
-        semstab.export(runs / "coarse", tmp_path / "map.csv", measures=["change"], beside=file)
+        semstab.export(runs / "coarse", tmp_path / "map.csv", measures=["change"], join=file)
 
 
 def test_runs_of_other_voxel_sizes_and_frames_of_reference_are_hardly_compared(runs):

@@ -295,7 +295,7 @@ def test_a_cloud_takes_from_tiles_what_it_takes_from_the_whole_map(both, tmp_pat
     written = []
     for folder in both:
         out = tmp_path / f"{folder.name}.ply"
-        (exported,) = export(folder, out, onto=cloud, radius=0.3)
+        (exported,) = export(folder, out, classify=cloud, radius=0.3)
         written.append((out.read_bytes(), exported.content))
     assert written[0] == written[1]
     assert "100.0%" not in written[0][1]

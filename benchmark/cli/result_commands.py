@@ -205,7 +205,7 @@ def export(
     join: Annotated[Path | None, typer.Option(
         metavar="FILE", help="Parquet with more columns of the voxels: OUT/columns of compare.")] = None,
     task_format: Annotated[str | None, typer.Option(
-        "--format", metavar="coco|labelstudio|cvat|fiftyone",
+        "--format", metavar="coco",
         help="Annotation tasks instead of the map: locations where frames disagree.")] = None,
     most: Annotated[int, typer.Option("--most", "-n", min=1, help="Largest number of annotation tasks.")] = 50,
     code: OwnCode = None,

@@ -23,10 +23,6 @@ class FigureFormat(StrEnum):
     svg = "svg"
 
 
-FORMER_TABLES = {"glance": "overview", "remedies": "filters"}
-"""The names of tables in 0.3, with the current names; the old ones work for one version."""
-
-
 COMPARISON = "comparison"
 """The beginning of the names of the tables that compare a run's models: they are made on demand."""
 
@@ -71,7 +67,7 @@ def show(
         listed = f"tables  {', '.join([*by_name, COMPARISON] if len(result.models) > 1 else by_name)}"
         print_lines(textwrap.wrap(listed, 80, initial_indent="  ", subsequent_indent=" " * 10))
     for name in what or ():
-        matching = [table for key, table in by_name.items() if key.startswith(FORMER_TABLES.get(name, name))]
+        matching = [table for key, table in by_name.items() if key.startswith(name)]
         if not matching:
             raise ConfigError(f"{run}: no table '{name}'; the tables are {', '.join(by_name)}")
         print_lines(f"{to_terminal(table)}\n" for table in matching)

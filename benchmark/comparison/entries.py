@@ -24,7 +24,7 @@ import numpy as np
 from semstab.config import nearest
 from semstab.core.files import ScratchFolder, atomic_path, parse_json, read_limited
 from semstab.core.json_form import from_json, to_json
-from semstab.data import earlier, parquet
+from semstab.data import parquet
 from semstab.data.contrast import FrameShare
 from semstab.data.digests import require_unchanged
 from semstab.data.georeference import Georeference
@@ -378,8 +378,6 @@ def load_summary(path: str | Path) -> RunHandle:
             if archive.getinfo(CONTENT).file_size > LONGEST_CONTENT:
                 raise DataError(f"{path}: its text has more than {LONGEST_CONTENT} bytes; write the summary again")
             text = parse_json(archive.read(CONTENT))
-            if isinstance(text, dict) and text.get("schema") == earlier.SMALL:
-                text = earlier.translated(text, path) | {"schema": SCHEMA}
             if not isinstance(text, dict) or (text.get("kind"), text.get("schema")) != (KIND, SCHEMA):
                 raise DataError("it is of another kind or version")
             content = from_json(_Content, text, path)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Callable, Mapping, Sequence
-from typing import TYPE_CHECKING, Any, ClassVar, Literal, Self
+from typing import TYPE_CHECKING, Any, Literal, Self
 
 import yaml
 from pydantic import Field, ValidationError, ValidationInfo, field_validator
@@ -147,7 +147,6 @@ class Config(Settings):
         (0.5, 'numba')
     """
 
-    earlier: ClassVar[Mapping[str, str]] = {"backbones": "models"}
     name: str = Field("run", min_length=1, description="the title of the report; a study's is its file's by default")
     description: str = Field("", description="one line")
     dataset: DatasetConfig = Field(DatasetConfig(), description="name and options of the dataset")

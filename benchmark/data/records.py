@@ -148,7 +148,7 @@ class FrameQuality:
     """The worth of single frames' labels, as filters left them; shares are 0 to 1, NaN where undefined.
 
     Attributes:
-        model, filters: The source of the labels, and the filters over it ('ema:0.6+threshold:0.5'; '' for nothing).
+        model, filters: The source of the labels, and the filters over it ('ema:0.6+guided:8'; '' for nothing).
         changed: Share of the pixels that the model labels to which the filters give another label, or none.
         flicker: Share of the pixels that two frames in a row see whose label changes, camera motion removed: also where
             the frame before has no depth, unlike `ImageSpace.compensated_flicker_percent`.

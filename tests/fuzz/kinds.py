@@ -262,7 +262,7 @@ def of_results(folder: Path) -> Iterator[Kind]:
     for cloud in (small_cloud(folder / "cloud.ply", table.centers), las_at(folder / "cloud.laz", table.centers),
                   las_at(folder / "cloud.las", table.centers)):  # fmt: skip
         out = folder / f"out{cloud.suffix}"
-        yield Kind(f"onto {cloud.name}", (cloud,), lambda file, out=out: onto(out, onto=file))
+        yield Kind(f"onto {cloud.name}", (cloud,), lambda file, out=out: onto(out, classify=file))
     codes = folder / "codes.yaml"
     codes.write_text("wall: 6\ndoor: 20\n")
     yield Kind("asprs.yaml", (codes,), lambda file: onto(folder / "coded.las", asprs=file))

@@ -30,7 +30,7 @@ SCENE_NAME, CELL = 18, 6
 
 def many_scenes(result: Result, records: Sequence[Record], width: int) -> Iterator[str]:
     """Yield the answer, a row for each model over all scenes, a line for each scene, and what refutes a verdict."""
-    listed = ", ".join(result.scenes[:3]) + (", ..." if len(result.scenes) > 3 else "")
+    listed = ", ".join(result.scenes) if len(result.scenes) <= 3 else f"{len(result.scenes)} scenes"
     yield from head_lines(listed, result, [record.summary for record in records], width)
     for text in (told := list(answers(result))):
         yield from wrapped(text)
