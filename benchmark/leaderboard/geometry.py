@@ -9,6 +9,7 @@ from __future__ import annotations
 import dataclasses
 import functools
 import json
+import math
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -90,7 +91,7 @@ def spots_of(seen: Iterable[Frame], truth: Iterable[Frame] | None, classes: tupl
         classes: Names of the classes.
     """
     sample, frames = _sampled(seen, 1)
-    sums, shares = sums_of_spots(sample), ()
+    sums, shares = sums_of_spots(sample), tuple[float, ...]()
     near, far = sums.near, sums.far
     assert near is not None
     assert far is not None
@@ -103,16 +104,19 @@ def spots_of(seen: Iterable[Frame], truth: Iterable[Frame] | None, classes: tupl
         needed, at = np.zeros(len(keys)), rows_in(keys_of(known), keys)
         needed[at[at >= 0]] = known["observations"][at >= 0, 0]
         shares = _class_shares(sample)
-    n = float(answers.sum())
+    n = max(float(answers.sum()), 1.0)
     rows = np.concatenate([keys, np.stack([answers, needed], axis=1).astype(np.int64)], axis=1)
-    distances = (float(part["square"].sum()) / n if n else 0.0 for part in (near, far))
-    return Spots(classes, frames, near.edge, near.step, *distances, shares, tuple(map(tuple, rows.tolist())))
+    return Spots(
+        classes, frames, near.edge, near.step, float(near["square"].sum()) / n, float(far["square"].sum()) / n, shares,
+        tuple(map(tuple, rows.tolist())),
+    )  # fmt: skip
 
 
 def few_rows(scenes: Mapping[str, Spots]) -> dict[str, Spots]:
     """Return the spots of scenes, with larger cubes until there are few rows."""
-    made = dict(scenes)
-    while sum(len(spots.rows) for spots in made.values()) > MOST_ROWS:
+    made, before = dict(scenes), math.inf
+    while before > (rows := sum(len(spots.rows) for spots in made.values())) > MOST_ROWS:
+        before = rows
         made = {name: spots.coarsened() for name, spots in made.items()}
     return made
 

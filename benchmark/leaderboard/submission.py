@@ -22,6 +22,7 @@ from semstab.comparison.entries import Entry, RunHandle, open_run, save_summary
 from semstab.config import Config, Settings, read_yaml, validated
 from semstab.core.code import only_named
 from semstab.core.json_form import from_json, to_json
+from semstab.data.digests import require_unchanged
 from semstab.data.records import Result
 from semstab.data.results import slug
 from semstab.datasets import GROUND_TRUTH
@@ -114,6 +115,7 @@ def submissions(run: Path, path: Path, card: ModelCard | None = None) -> Iterato
     with only_named(file, ()):
         config = Config.build(read_yaml(file), str(file))
     benchmark = _benchmark_of(run, config)
+    require_unchanged(file)
     models = [name for name in result.models if name != GROUND_TRUTH]
     if len(models) > 1 and (path.suffix or card is not None):
         what = path if path.suffix else "--card"
