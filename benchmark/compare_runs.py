@@ -52,12 +52,12 @@ def charts(comparison: RunComparison) -> dict[str, list[dict[str, str]]]:
         for row in against.contrasts:
             if row.measure in shown:
                 dot = (colors[against.other], against.other, row.difference)
-                panels.setdefault(shown[row.measure].title, {}).setdefault(scope, []).append(dot)
+                panels.setdefault(shown[row.measure].named, {}).setdefault(scope, []).append(dot)
     for quantity in (quantity for quantity in IN_CLASSES if quantity is not PSA):
         for own in comparison.overall if any(own.by_class for own in comparison.overall) else ():
             for row in (*own.contrasts, *own.by_class):
                 if row.measure == (MIOU.key if quantity is IOU and not row.of else quantity.key):
-                    dots = by_class.setdefault(quantity.title, {}).setdefault(row.of or "all classes", [])
+                    dots = by_class.setdefault(quantity.named, {}).setdefault(row.of or "all classes", [])
                     dots.append((colors[own.other], own.other, row.difference))
     less = f"less {comparison.base}"
     return {

@@ -50,7 +50,7 @@ def steady(city, classes):
 def test_a_generator_gives_what_a_run_gives(steady, city):
     run = semstab.run({
         "dataset": {"name": "city", "options": OPTIONS}, "scenes": ["scene0"], "models": ["sim-steady"],
-        "voxel_size": SIZE, "taxonomy": None, "exclude": {}, "check": None, "check_geometry": False,
+        "voxel_size": SIZE, "taxonomy": None, "exclude": {}, "check": None, "check_geometry": False, "truth": False,
     })  # fmt: skip
     own, other = steady.record(), run.record()
     assert own.summary.table == other.summary.table
@@ -62,7 +62,7 @@ def test_a_generator_gives_what_a_run_gives(steady, city):
     assert (steady.summary.alpha_low, steady.summary.alpha_high, steady.summary.confidence) == (
         alpha.low, alpha.high, 0.95,
     )  # fmt: skip
-    assert steady.summary.psa == other.statistics.agreement.psa.value
+    assert steady.summary.psa_op2 == other.statistics.agreement.psa.value
     assert steady.summary.flicker == own.image_space.compensated_flicker_percent > 0
     assert steady.summary.frames == len(city)
     assert len(steady.record().table()) == steady.summary.voxels
@@ -76,7 +76,7 @@ def test_frames_and_tensors_and_scores_are_taken(city, classes, steady):
     soft = [{**given, "labels": None, "scores": eye[given["labels"]]} for given in frames_of(city, "sim-steady")]
     for given in (frames, tensors, soft):
         result = semstab.fuse(given, voxel_size=SIZE, classes=classes)
-        assert result.summary.recurrent_vss == pytest.approx(steady.summary.recurrent_vss, abs=1e-12)
+        assert result.summary.vss_op3 == pytest.approx(steady.summary.vss_op3, abs=1e-12)
         assert result.summary.alpha == pytest.approx(steady.summary.alpha, abs=1e-12)
 
 

@@ -30,8 +30,8 @@ def run(tmp_path_factory):
 def test_the_summary_has_a_row_a_unit_and_a_unit_series_and_events(run):
     assert list(run.summary["model"]) == ["a", "b"]
     for (_, row), summary in zip(run.summary.iterrows(), run.result.runs, strict=True):
-        assert row["vss"] == summary.table.means.value["vss"]
-        assert row["recurrent_entropy"] == summary.table.recurrent.means.value["entropy"]
+        assert row["vss_all"] == summary.table.means.value["vss"]
+        assert row["entropy_op3"] == summary.table.recurrent.means.value["entropy"]
         assert row["voxels"] == summary.table.voxels
     assert list(run.series(model="b")["frame"]) == [0, 1, 2]
     assert len(run.events(model="b")) == run.table(model="b").op.sum()
