@@ -313,6 +313,14 @@ def test_rules_on_measures_of_the_register(run, tmp_path):
     fails(ConfigError, "no measure 'rival 1'", parse, "rival 1 < 0.1")
 
 
+def test_the_label_source_may_be_an_option(run):
+    named, option = (
+        cli("gate", *words, "--rule", "psa > 0.01") for words in ((f"{run}:a",), (str(run), "--model", "a"))
+    )
+    assert (named.exit_code, named.output) == (option.exit_code, option.output)
+    assert "OP>=2: " in named.output
+
+
 @pytest.mark.parametrize(("arguments", "line"), [
     (["--rule", "alpha drop < 0.02"], "a drop needs a baseline; give --against RUN"),
     (["--rule", "class q: alpha > 0.1"], "no class 'q'"),
@@ -509,7 +517,7 @@ def test_a_change_of_alpha_is_what_a_comparison_says_of_the_same_runs(run, quiet
     """Of observations that both labelled: a run that left out some does not gain or lose by which it left out."""
     new, base = f"{quiet_models}:part", f"{run}:a"
     monkeypatch.setattr(differences, "LEAST_VOXELS", 1)
-    (compared,) = semstab.compare([base, new]).overall
+    (compared,) = semstab.compare(base, new).overall
     rules = ["alpha drop < 0.02", "class *: alpha rise < 0.02", "alpha > 0.1", "voxel alpha drop < 0.02"]
     of_all, *of_classes, alone, voxels = gate(new, base, gate_config(rules=rules)).judgements
     (found,) = (row for row in compared.contrasts if row.measure == "alpha")
@@ -539,7 +547,7 @@ def test_runs_of_other_strides_say_nothing_of_what_was_left_out(run, tmp_path):
     """Of pixels of another size it was said that both runs left 40 % without a label."""
     out = tmp_path / "strided"
     semstab.run(configure(run.parent / "wall", check=None, models=["a"], pixel_stride=2), out=out, report=False)
-    (scene,) = semstab.compare([f"{run}:a", out]).scenes
+    (scene,) = semstab.compare(f"{run}:a", out).scenes
     assert scene.basis == "observations"
     assert (scene.observations.ignored, scene.observations.depends) == ((), False)
     notes = gate(out, f"{run}:a", gate_config(rules=["alpha drop < 0.02"])).notes

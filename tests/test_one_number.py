@@ -145,7 +145,7 @@ def test_compare_and_gate_judge_the_numbers_of_the_screen(run):
     titles = {quantity.key: quantity.named for quantity in quantities()}
     for record in result.select():
         own = f"{folder}:{record.unit.model}"
-        (scene,) = (s for s in semstab.compare([own, own]).scenes if s.scene == record.unit.scene)
+        (scene,) = (s for s in semstab.compare(own, own).scenes if s.scene == record.unit.scene)
         shown = {titles[row.measure].lower(): row.base for row in scene.against[0].contrasts}
         numbers = {name.lower().removesuffix(", %"): value for name, value in numbers_of(record).items()}
         known = {name: value for name, value in numbers.items() if not math.isnan(value)}

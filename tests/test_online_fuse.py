@@ -92,14 +92,15 @@ def test_truth_tells_what_is_right(city, classes):
 
 def test_results_are_compared_gated_and_exported_as_runs_are(steady, city, classes, tmp_path):
     other = semstab.fuse(frames_of(city, "sim-flicker"), voxel_size=SIZE, classes=classes, model="flicker")
-    comparison = semstab.compare([steady, other], tmp_path / "versus")
+    comparison = semstab.compare(steady, other, out=tmp_path / "versus")
     assert [own.name for own in comparison.runs] == ["steady", "flicker"]
     assert (tmp_path / "versus/report.html").exists()
     assert repr(other).startswith("<FusedResult 'frames': 1 unit, fused by numba>\n  frames, flicker: ")
     assert [own.source for own in comparison.runs] == [None, None]
     assert repr(comparison).startswith("<RunComparison with steady on frames>\n  flicker: alpha -")
     again = semstab.fuse(frames_of(city, "sim-steady"), voxel_size=SIZE, classes=classes, model="steady")
-    assert [own.name for own in semstab.compare([steady, again]).runs] == ["steady", "steady (2)"]
+    with pytest.raises(ConfigError, match=r"two results are named 'steady'; give each a name: semstab\.fuse"):
+        semstab.compare(steady, again)
     gate = semstab.GateConfig(rules=("alpha drop < 0.02",))
     assert repr(semstab.gate(other, steady, gate)).splitlines()[0] == (
         "<GateResult: fails; flicker against steady on frames>"

@@ -73,7 +73,7 @@ def test_the_parts_of_a_run_at_a_prompt_are_one_line_each(run):
 
 def test_a_comparison_and_a_gate_at_a_prompt_are_a_few_lines(run):
     a, b = f"{run.folder}:a", f"{run.folder}:b"
-    compared = semstab.compare([a, b])
+    compared = semstab.compare(a, b)
     (line,) = repr(compared).splitlines()[1:]
     assert line.startswith("  b: ")
     assert repr(compared.scenes[0]).splitlines()[1:] == [f"  {compared.scenes[0].against[0].stated}"]
