@@ -49,6 +49,7 @@ fuzz-short: setup-dev
 faults: setup-dev
 	$(BIN)/python tests/faults/kills.py $(or $(FAULTS),280)
 	$(BIN)/python tests/faults/disk.py 12
+	$(BIN)/python tests/faults/forgeries.py results city@1 sim-soft
 
 MUTANTS := --lines 100 --seed 0
 mutants: setup-dev

@@ -8,7 +8,7 @@ from __future__ import annotations
 from pathlib import Path
 
 from semstab.core.files import write_text
-from semstab.leaderboard.board import boards, by_scene, headline
+from semstab.leaderboard.board import boards, tables_of
 from semstab.report.tables.table import to_markdown
 
 ROOT = Path(__file__).parents[1]
@@ -17,7 +17,7 @@ PAGE = ROOT / "docs/leaderboard.md"
 HEAD = """# Leaderboard
 
 Results of the [benchmarks](benchmarks.md) that can be run here. `semstab-bench leaderboard results --out site` makes
-the page to sort and filter; `python scripts/leaderboard_page.py` writes these tables.
+a page of them; `python scripts/leaderboard_page.py` writes these tables.
 
 - `city@1`: simulated models of known quality, tricks that buy stability without knowledge (a map painted in the world,
   two classes, one class), and clusters of colour named by eye. A model may be stable and wrong: read alpha beside
@@ -25,7 +25,9 @@ the page to sort and filter; `python scripts/leaderboard_page.py` writes these t
 - `apc_shelf@1`: the labels and the scores that were published with the data.
 - `livingroom@1`: ten networks of two families, trained on PASCAL VOC ([how](real-networks.md)).
 
-These models were timed on two cores that did other work, too: their milliseconds are no measure of speed.
+Each number but those "as stated" is computed from the sums of a result, which are checked against the definition
+([how](benchmarks.md#what-is-checked)). These models were timed on two cores that did other work, too: their
+milliseconds are no measure of speed.
 
 ```bash
 semstab-bench benchmark city@1 -m sim-steady -m sim-flicker -m sim-soft -m trick-two-class \\
@@ -43,8 +45,7 @@ def page() -> str:
     """Return the text of the page."""
     parts = [HEAD]
     for board in boards(ROOT / "results"):
-        tables = [headline(board)] + ([by_scene(board)] if len(board.benchmark.scenes) > 1 else [])
-        parts += map(to_markdown, tables)
+        parts += map(to_markdown, tables_of(board))
     return "\n".join(parts)
 
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import json
 import math
 import shutil
 from io import StringIO
@@ -21,6 +20,7 @@ from semstab.compare_runs import load_comparison, markdown
 from semstab.comparison.differences import corrected, over_scenes
 from semstab.comparison.entries import open_runs
 from semstab.comparison.pairing import pair
+from semstab.core.files import read_sealed, write_sealed
 from semstab.data.contrast import Against, Contrast, RunComparison, SceneComparison
 from semstab.data.frames import Frame, Intrinsics
 from semstab.data.georeference import Georeference
@@ -239,8 +239,7 @@ def test_bad_input_is_one_line_and_the_command_writes_markdown(runs, tmp_path):
     with pytest.raises(ConfigError, match="name two runs or more"):
         semstab.compare(runs / "old")
     broken = shutil.copytree(runs / "old", tmp_path / "broken")
-    content = json.loads((broken / "summary.json").read_text())
-    (broken / "summary.json").write_text(json.dumps({**content, "runs": [3]}))
+    write_sealed(broken / "summary.json", read_sealed(broken / "summary.json") | {"runs": [3]})
     with pytest.raises(DataError, match=r"summary\.json"):
         semstab.compare(runs / "old", broken)
     (tmp_path / "full").mkdir()

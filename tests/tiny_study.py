@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
 from typing import Any
 
@@ -11,6 +10,7 @@ import tiny_scene
 from posed_config import dataset_of
 
 from semstab.config import Config
+from semstab.core.files import read_sealed
 from semstab.engine import Observer
 
 FRAMES = 10
@@ -40,8 +40,8 @@ def configure(root: Path, **settings: Any) -> Config:
 
 
 def summary(out: Path) -> dict[str, Any]:
-    """The study's summary.json without timings: what must come out the same."""
-    found = json.loads((out / "summary.json").read_text())
+    """The study's summary.json without timings and its digest: what must come out the same."""
+    found = read_sealed(out / "summary.json")
     runs = [{key: value for key, value in run.items() if key not in TIMES} for run in found["runs"]]
     return {**found, "runs": runs}
 

@@ -105,21 +105,20 @@ def gate(
 def leaderboard(
     folder: Annotated[Path, typer.Argument(metavar="FOLDER", help="Folder with results, files of --submit.")],
     out: Annotated[Path | None, typer.Option(
-        "--out", "-o", help="Folder for index.html, and JSON, CSV and Markdown of each benchmark.")] = None,
+        "--out", "-o", help="Folder for index.html, one plain page.")] = None,
     definition: Annotated[list[Path] | None, typer.Option(
         "--benchmark", metavar="FILE", help="Definition of a benchmark that does not ship; repeatable.")] = None,
     quiet: Quiet = False,
 ) -> None:  # fmt: skip
     """Check results of benchmarks that were handed in, and rank them with intervals."""
-    from semstab.leaderboard.board import boards, lines, write_site
+    from semstab.leaderboard.board import boards, lines, write_page
     from semstab.leaderboard.definition import load_benchmark
 
     definitions = {each.id: each for each in map(load_benchmark, definition or ())}
     made = boards(folder, definitions)
     print_lines(lines(made), quiet=quiet)
     if out is not None:
-        write_site(made, out)
-        print_lines([f"  page  {out / 'index.html'}"], quiet=quiet)
+        print_lines([f"  page  {write_page(made, out)}"], quiet=quiet)
 
 
 def calibrate(

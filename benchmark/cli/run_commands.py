@@ -147,6 +147,8 @@ def benchmark(
     about = None if card is None else ModelCard.load(card)
     if submit is not None and submit.suffix:
         require_output(submit, [card])
+    if submit is not None:
+        definition.require_geometry()
     predictors = parse_predictors(prediction.predict or [], prediction.model_options, prediction.filters or [])
     if prediction.filters and not prediction.predict:
         raise ConfigError("--filter stands over a model that --predict chooses")

@@ -343,11 +343,13 @@ class _Content:
     about: dict[str, Any] = field(default_factory=dict)
 
 
-def save_summary(run: RunHandle, path: str | Path, most: int = 1_000_000, *, single: bool = False) -> None:
+def save_summary(
+    run: RunHandle, path: str | Path, most: int = 1_000_000, *, single: bool = False, keep_spots: bool = False
+) -> None:
     """Write all data of a later comparison except voxels into one file.
 
     Its cubes of space and groups of frames are as fine as `most` bytes allow; sums are rounded to single precision on
-    request, which halves the file.
+    request, which halves the file; `keep_spots` makes sums of the map coarser alone.
 
     Raises:
         DataError: If even the coarsest sums need more.
@@ -359,7 +361,7 @@ def save_summary(run: RunHandle, path: str | Path, most: int = 1_000_000, *, sin
     content = json.dumps({"kind": KIND, "schema": SCHEMA, **to_json(_Content(run.model, scenes, {**run.about}))})
     sums = [entry.sums for entry in run.scenes.values()]
     while len(data := _archive(content, sums, single=single)) > most:
-        coarser = [_coarser(each) for each in sums]
+        coarser = [_coarser(each, keep_spots=keep_spots) for each in sums]
         if all(np.array_equal(a.cell, b.cell) and a.step == b.step for a, b in zip(coarser, sums, strict=True)):
             raise DataError(f"{path}: a summary of {len(sums)} scenes takes {len(data)} bytes; use fewer scenes")
         sums = coarser
@@ -432,8 +434,9 @@ def _archive(content: str, sums: list[ClusterSums], *, single: bool) -> bytes:
     return data.getvalue()
 
 
-def _coarser(sums: ClusterSums) -> ClusterSums:
+def _coarser(sums: ClusterSums, *, keep_spots: bool) -> ClusterSums:
     """Join two groups of frames each where there are many, else cubes."""
+    coarsened = sums.map_coarsened if keep_spots else sums.coarsened
     if sums.step and sums.frames > MANY_GROUPS:
-        return sums.coarsened(sums.edge, 2 * sums.step)
-    return sums.coarsened(2 * sums.edge, sums.step)
+        return coarsened(sums.edge, 2 * sums.step)
+    return coarsened(2 * sums.edge, sums.step)

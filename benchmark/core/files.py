@@ -210,6 +210,34 @@ def write_json(path: str | Path, value: Any) -> None:
     write_text(path, json.dumps(to_json(value), indent=2, allow_nan=False) + "\n")
 
 
+SEAL = "digest"
+"""The field of a sealed JSON file that has the digest of all others."""
+
+
+def write_sealed(path: str | Path, value: Any) -> None:
+    """Write a dataclass or mapping as `write_json` does, with the digest of its fields as a last one."""
+    content = to_json(value)
+    write_json(path, content | {SEAL: content_key(content)})
+
+
+def require_seal(path: str | Path, content: Any) -> dict[str, Any]:
+    """Return the content of a sealed JSON file without its digest.
+
+    Raises:
+        DataError: If the digest is another one, so that the file has changed since it was written.
+    """
+    fields = {key: value for key, value in content.items() if key != SEAL} if isinstance(content, dict) else {}
+    with suppress(RecursionError, UnicodeError):
+        if fields and content.get(SEAL) == content_key(fields):
+            return fields
+    raise DataError(f"{path}: has changed since the run wrote it; run the same command again")
+
+
+def read_sealed(path: str | Path) -> dict[str, Any]:
+    """Read what `write_sealed` wrote; raise DataError with the file's name where it cannot be read or has changed."""
+    return require_seal(path, read_json(path))
+
+
 def csv_text(text: str) -> str:
     """Return a name for a cell of a CSV file, in which a spreadsheet sees no formula."""
     return f"'{text}" if text.startswith(("=", "+", "-", "@", "\t", "\r")) else text

@@ -6,21 +6,21 @@ from collections.abc import Mapping
 from functools import lru_cache
 from pathlib import Path
 
-from semstab.core.files import file_digest, read_json, write_json
+from semstab.core.files import file_digest, read_sealed, write_sealed
 from semstab.errors import DataError
 
 DIGESTS = "digests.json"
-"""The file in the folder of a run, beside summary.json: the digest of each table by its path in the folder."""
+"""The file in the folder of a run, beside summary.json: the digest of each table, and of config.yaml, by path."""
 
 SCHEMA = 1
 
 DEEPEST = 2
-"""Folders between a run's and a file: voxels/SCENE__MODEL__BACKEND/tile=X_Y.parquet."""
+"""Most folders between a run's and a file: voxels/SCENE__MODEL__BACKEND/tile=X_Y.parquet."""
 
 
 def write_digests(folder: Path, digests: Mapping[str, str]) -> None:
     """Write the digests of a run's files."""
-    write_json(folder / DIGESTS, {"schema": SCHEMA, "files": dict(sorted(digests.items()))})
+    write_sealed(folder / DIGESTS, {"schema": SCHEMA, "files": dict(sorted(digests.items()))})
 
 
 def require_unchanged(path: str | Path) -> None:
@@ -32,7 +32,7 @@ def require_unchanged(path: str | Path) -> None:
         DataError: If its digest is another one.
     """
     path = Path(path)
-    for folder in path.absolute().parents[1 : 1 + DEEPEST]:
+    for folder in path.absolute().parents[: 1 + DEEPEST]:
         if (digests := folder / DIGESTS).is_file():
             expected = _digests_in(digests, *_state(digests)).get(path.absolute().relative_to(folder).as_posix())
             if expected is not None and path.exists() and _digest_of(path, *_state(path)) != expected:
@@ -48,8 +48,8 @@ def _state(path: Path) -> tuple[int, int, int]:
 
 @lru_cache(maxsize=64)
 def _digests_in(path: Path, *_: int) -> Mapping[str, str]:
-    content = read_json(path)
-    files = content.get("files") if isinstance(content, dict) and content.get("schema") == SCHEMA else None
+    content = read_sealed(path)
+    files = content.get("files") if content.get("schema") == SCHEMA else None
     if not isinstance(files, dict):
         raise DataError(f"{path}: holds no digests of this version; run the same command again")
     return files

@@ -22,8 +22,10 @@ from semstab.core.files import (
     atomic_path,
     file_digest,
     read_json,
+    read_sealed,
     remove_leftovers,
-    write_json,
+    require_seal,
+    write_sealed,
     write_text,
 )
 from semstab.core.json_form import from_json, to_json
@@ -167,8 +169,8 @@ class Folder:
             return None
         try:
             if unit.regions:
-                return from_json(RegionFlicker, read_json(file), file)
-            record = from_json(Record, read_json(file), file)
+                return from_json(RegionFlicker, read_sealed(file), file)
+            record = from_json(Record, read_sealed(file), file)
         except DataError:
             logger.warning("%s: damaged; the unit is computed again", file)
             return None
@@ -179,7 +181,7 @@ class Folder:
         assert work.record is not None
         self.save_files(work)
         key = unit_key(work.unit.identity, work.record.input)
-        write_json(self.path / UNITS / f"{key}.json", work.record)
+        write_sealed(self.path / UNITS / f"{key}.json", work.record)
         shutil.rmtree(self.path / TILES / key, ignore_errors=True)
         with contextlib.suppress(OSError):
             (self.path / TILES).rmdir()  # where nothing of other units is left
@@ -223,7 +225,7 @@ class Folder:
         )
 
     def save_result(self, result: Result, kept: Iterable[Record]) -> None:
-        """Write summary.json, manifest.json, and the digests of the units' files.
+        """Write summary.json, manifest.json, and the digests of the settings and the units' files.
 
         Raises:
             DataError: If one of these files is gone.
@@ -239,9 +241,9 @@ class Folder:
         for run, name in itertools.product(runs, OF_THE_UNIT):
             del run[name]
         del content["manifest"]
-        write_json(self.path / "summary.json", {"schema": SCHEMA, "runs": runs, **content})
-        write_json(self.path / "manifest.json", result.manifest)
-        write_digests(self.path, digests)
+        write_sealed(self.path / "summary.json", {"schema": SCHEMA, "runs": runs, **content})
+        write_sealed(self.path / "manifest.json", result.manifest)
+        write_digests(self.path, digests | {SETTINGS: file_digest(self.path / SETTINGS).hex()})
 
     @contextlib.contextmanager
     def started(self, config: Config) -> Iterator[Start]:
@@ -355,11 +357,12 @@ def load_result(folder: str | Path) -> Result:
     content = read_json(path)
     if not isinstance(content, dict) or content.get("schema") != SCHEMA:
         raise DataError(f"{path}: is not a summary of this version of semstab; run it again, into another folder")
+    content = require_seal(path, content)
     result = from_json(Result, {**content, "records": content.get("runs")}, path)
     if problem := _contradiction(result):
         raise DataError(f"{path}: {problem}; it is damaged, or of another version; run it again")
     records = _with_files(result.records, lambda file: folder / file)
-    manifest = from_json(dict[str, Any], read_json(folder / "manifest.json"), folder / "manifest.json")
+    manifest = read_sealed(folder / "manifest.json")
     return dataclasses.replace(result, records=records, manifest=manifest)
 
 

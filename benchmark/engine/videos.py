@@ -13,7 +13,7 @@ from pathlib import Path
 import numpy as np
 
 from semstab.config import Config
-from semstab.core.files import content_key, read_json, remove_leftovers, write_json
+from semstab.core.files import content_key, read_sealed, remove_leftovers, write_sealed
 from semstab.core.json_form import from_json, to_json
 from semstab.core.prefetch import prefetch
 from semstab.data.frames import Frame
@@ -80,15 +80,15 @@ class MeasuredEarlier:
         """Store the records of the models on a video; their pictures are made again from its frames."""
         for task, record in zip(tasks, records, strict=True):
             bare = dataclasses.replace(record, pictures=())
-            write_json(self._file(task), {"key": self._key(task), "record": to_json(bare)})
+            write_sealed(self._file(task), {"key": self._key(task), "record": to_json(bare)})
 
     def _load(self, task: Task) -> VideoRecord | None:
         path = self._file(task)
         if not path.is_file():
             return None
         try:
-            content = read_json(path)
-            if not isinstance(content, dict) or content.get("key") != self._key(task):
+            content = read_sealed(path)
+            if content.get("key") != self._key(task):
                 return None
             record = from_json(VideoRecord, content.get("record"), path)
         except DataError:

@@ -1,36 +1,101 @@
-"""The table of a benchmark: results that were handed in, checked, ranked with intervals, as a page, JSON and CSV."""
+"""The table of a benchmark: results that were handed in, ranked by sums that were checked, with intervals; as a page.
+
+Each number of it is computed from the sums. What rests on the word of whoever handed a result in is a table apart.
+"""
 
 from __future__ import annotations
 
+import dataclasses
 import math
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
-from semstab.comparison.entries import Entry, RunHandle
+from semstab.comparison.entries import RunHandle
 from semstab.comparison.ranking import over_places, ranked
-from semstab.core.files import write_json, write_text
-from semstab.data.statistics import UNKNOWN, Interval
+from semstab.core.files import write_text
+from semstab.data.statistics import UNKNOWN, HeadlineStatistics, Interval, Level, SpotAgreement
 from semstab.errors import ConfigError, DataError
 from semstab.leaderboard.definition import Benchmark, Number
+from semstab.leaderboard.geometry import Spots
 from semstab.leaderboard.submission import SUFFIX, Submission, load_submission
-from semstab.report.charts import point_chart
+from semstab.leaderboard.sums import completed, labelled_share
 from semstab.report.html import filled, table_block
-from semstab.report.tables.table import Column, Group, Row, Table, relations, to_csv, to_json, to_markdown
-from semstab.statistics.intervals import estimate, mean_over_frames, scope_of
+from semstab.report.tables.table import Column, Group, Row, Table
+from semstab.statistics.cluster_sums import ClusterSums, chance_of
+from semstab.statistics.intervals import estimate, scope_of
+from semstab.statistics.verdict import verdict
 
-NUMBERS: Mapping[Number, Column] = {
-    "alpha": Column("alpha", "alpha", 3, "higher"),
-    "flicker": Column("flicker_percent", "flicker, %", 2, "lower"),
+OF_TRUTH: Mapping[Number, Column] = {
     "accuracy": Column("accuracy", "accuracy", 3, "higher"),
     "miou": Column("miou", "mIoU", 3, "higher"),
     "wrong_of_consistent": Column("wrong_of_consistent", "consistent but wrong", 3, "lower"),
 }
-"""The columns of a headline."""
+"""The columns that need ground truth."""
+
+
+@dataclass(frozen=True, eq=False)
+class SceneNumbers:
+    """The numbers of a model in a scene, from its sums.
+
+    Attributes:
+        whole: The sums, in which an answer that is missing disagrees.
+        alpha: Alpha of these, by which models are ranked.
+        of_labelled: Alpha of the answers that there are.
+        labelled: Share of the answers that a model has to give that it gives.
+        level: Of the verdict.
+        truth: Numbers that need ground truth, by their keys.
+    """
+
+    whole: ClusterSums
+    alpha: Interval
+    of_labelled: Interval
+    labelled: float
+    level: Level
+    truth: Mapping[Number, Interval]
+
+    @classmethod
+    def of(cls, sums: ClusterSums, spots: Spots) -> SceneNumbers:
+        """Return the numbers of sums that were checked."""
+        whole = completed(sums, spots)
+        alpha, of_labelled = (estimate(each, "alpha", scope=scope_of(each)) for each in (whole, sums))
+        keys = OF_TRUTH if sums.truth else ()
+        truth = {key: estimate(sums, key, scope=scope_of(sums, key=key)) for key in keys}
+        labelled = labelled_share(sums, spots)
+        level = _level(whole, spots, alpha, _at_least_wrong(sums, truth))
+        return cls(whole, alpha, of_labelled, labelled, level, truth)
+
+
+def _level(whole: ClusterSums, spots: Spots, alpha: Interval, wrong: Interval) -> Level:
+    """Return the level of the verdict, with all answers that a model has to give."""
+    near = whole.near
+    assert near is not None
+    voxels, evidence = round(float(whole["voxels"].sum())), near["evidence"].sum(axis=0)
+    largest, n = int(evidence.argmax()), float(evidence.sum())
+    agreement = SpotAgreement(
+        spacing=math.nan, spots=round(float(near["voxels"].sum())), cubes=near.cells, frames=spots.frames,
+        views=len(np.unique(near.frame)) * max(near.step, 1), chance=chance_of(near),
+        largest_class=whole.classes[largest], largest_share=float(evidence[largest]) / n if n else math.nan,
+        labelled=1.0, classes=(),
+    )  # fmt: skip
+    headline = HeadlineStatistics(alpha, UNKNOWN, UNKNOWN, UNKNOWN, wrong)
+    return verdict("", headline=headline, spots=agreement, voxels=voxels, share=1.0).level
+
+
+def _at_least_wrong(sums: ClusterSums, truth: Mapping[Number, Interval]) -> Interval:
+    """Return the wrong among the consistent locations, whose lower end is at least what agreement and accuracy give.
+
+    Two views agree on a wrong label at least as often as they agree, less the share of the right labels.
+    """
+    near, wrong = sums.near, truth.get("wrong_of_consistent", UNKNOWN)
+    assert near is not None
+    n = float(near["observations"].sum())
+    agreeing = float(near["agreeing"].sum()) / n if n else math.nan
+    least = 1 - truth["accuracy"].high / agreeing if truth and agreeing > 0 else math.nan
+    return dataclasses.replace(wrong, value=float(np.fmax(wrong.value, least)), low=float(np.fmax(wrong.low, least)))
 
 
 @dataclass(frozen=True, eq=False)
@@ -40,9 +105,8 @@ class BoardRow:
     Attributes:
         rank: 1 plus the number of models that are shown to be more stable; None for a model that is not ranked.
         last: The worst rank that is possible: the models below it are shown to be less stable.
-        numbers: Of the headline, over all places, with their intervals.
-        scenes: Alpha in each scene, with the verdict's level.
-        classes: Alpha of each class, the mean over scenes that assess it.
+        scenes: Its numbers in each scene.
+        places: The place of each scene.
     """
 
     file: str
@@ -50,9 +114,8 @@ class BoardRow:
     about: Submission
     rank: int | None
     last: int
-    numbers: Mapping[str, Interval]
-    scenes: Mapping[str, tuple[Interval, str]]
-    classes: Mapping[str, float]
+    scenes: Mapping[str, SceneNumbers]
+    places: tuple[str, ...]
 
     @property
     def ranks(self) -> str:
@@ -62,11 +125,33 @@ class BoardRow:
         return str(self.rank) if self.rank == self.last else f"{self.rank} to {self.last}"
 
     @property
+    def alpha(self) -> Interval:
+        """Alpha, the mean over places, in which an answer that is missing disagrees."""
+        return self._mean([own.alpha for own in self.scenes.values()])
+
+    @property
+    def of_labelled(self) -> Interval:
+        """Alpha of the answers that there are, the mean over places."""
+        return self._mean([own.of_labelled for own in self.scenes.values()])
+
+    @property
+    def labelled(self) -> float:
+        """Share of the answers that a model has to give that it gives, the mean over scenes."""
+        return float(np.mean([own.labelled for own in self.scenes.values()]))
+
+    def truth(self, key: Number) -> Interval:
+        """Return a number that needs ground truth, the mean over places."""
+        return self._mean([own.truth.get(key, UNKNOWN) for own in self.scenes.values()])
+
+    @property
     def verdict(self) -> str:
         """The levels of its verdicts, in print: 'stable', 'stable 3, usable 2'."""
-        levels = [level for _, level in self.scenes.values()]
-        counts = Counter(levels).most_common()
+        counts = Counter(own.level for own in self.scenes.values()).most_common()
         return ", ".join(level if len(counts) == 1 else f"{level} {n}" for level, n in counts)
+
+    def _mean(self, values: Sequence[Interval]) -> Interval:
+        known = [not math.isnan(own.value) for own in values]
+        return over_places(values, self.places) if all(known) else UNKNOWN
 
 
 @dataclass(frozen=True, eq=False)
@@ -88,7 +173,7 @@ class Board:
 
 
 Result = tuple[str, Submission, RunHandle]
-"""The file of a result, what it says of its model, and its numbers."""
+"""The file of a result, what it says of its model, and its sums."""
 
 
 def boards(folder: Path, definitions: Mapping[str, Benchmark] | None = None) -> tuple[Board, ...]:
@@ -100,7 +185,7 @@ def boards(folder: Path, definitions: Mapping[str, Benchmark] | None = None) -> 
 
     Raises:
         ConfigError: If there is no such folder, or no result in it.
-        DataError: For a file that is no result, or contradicts itself or its benchmark.
+        DataError: For a file that is no result, or whose sums cannot be.
     """
     if not folder.is_dir():
         raise ConfigError(f"{folder}: there is no such folder; give the folder with the results")
@@ -124,104 +209,71 @@ def board_of(benchmark: Benchmark, results: Sequence[Result]) -> Board:
     if twice := next((name for name in names if names.count(name) > 1), None):
         first, second = (file for (file, _, _), name in zip(results, names, strict=True) if name == twice)
         raise DataError(f"{first} and {second}: both are called '{twice}'; name one otherwise in its card")
-    own, places = dict(zip(names, results, strict=True)), benchmark.places()
-    unranked = _unranked(own, benchmark)
+    places, geometry = benchmark.places(), benchmark.geometry
+    numbers = {
+        name: {scene: SceneNumbers.of(handle.scenes[scene].sums, geometry[scene]) for scene in benchmark.scenes}
+        for name, (_, _, handle) in zip(names, results, strict=True)
+    }
+    unranked = _unranked(numbers)
     compared = [name for name in names if not any(name in left for left in unranked.values())]
-    sums = [{name: own[name][2].scenes[scene].sums for name in compared} for scene in benchmark.scenes]
-    ranking = ranked(sums, compared, places)
+    ranking = ranked(
+        [{name: numbers[name][scene].whole for name in compared} for scene in numbers[names[0]]], compared, places
+    )
     rank: dict[str, int | None] = {name: number for number, group in ranking.ranks for name in group}
     worse = dict.fromkeys(compared, 0)
     for each in ranking.differences:
         if each.shown:
             worse[each.model if each.value > 0 else each.other] += 1
-    last = {name: len(compared) - number for name, number in worse.items()}
-    rows = [_row(benchmark, name, result, rank.get(name), last.get(name, 0)) for name, result in own.items()]
-    rows.sort(key=lambda row: (math.inf if row.rank is None else row.rank, -row.numbers["alpha"].value))
+    rows = [
+        BoardRow(file, name, about, rank.get(name), len(compared) - worse.get(name, 0), numbers[name], places)
+        for name, (file, about, _) in zip(names, results, strict=True)
+    ]
+    rows.sort(key=lambda row: (math.inf if row.rank is None else row.rank, *_falling(row.alpha.value), row.name))
     return Board(benchmark, tuple(rows), unranked)
 
 
-NOT_RANKED = {"uninformative": "nearly the whole map is one class", "misleading": "consistent labels are often wrong"}
-"""Levels of verdicts in all scenes at which alpha assesses no labels, and why."""
-
-OTHER_CLASSES = "their classes are others"
+def _falling(value: float) -> tuple[bool, float]:
+    return math.isnan(value), 0.0 if math.isnan(value) else -value
 
 
-def _unranked(own: Mapping[str, Result], benchmark: Benchmark) -> dict[str, tuple[str, ...]]:
+NOT_RANKED: Mapping[Level, str] = {
+    "uninformative": "nearly the whole map is one class",
+    "misleading": "consistent labels are often wrong",
+    "no verdict": "too few locations were seen twice",
+}
+"""Levels at which alpha assesses no labels, and why: a model that has one in most scenes is not ranked."""
+
+
+def _unranked(numbers: Mapping[str, Mapping[str, SceneNumbers]]) -> dict[str, tuple[str, ...]]:
     """Return the models that alpha cannot rank, by the reason."""
-    classes = {name: handle.scenes[benchmark.scenes[0]].classes for name, (_, _, handle) in own.items()}
-    most = max(classes.values(), key=[*classes.values()].count)
-    reasons = {OTHER_CLASSES: tuple(name for name in own if classes[name] != most)}
-    for level, reason in NOT_RANKED.items():
-        left = [name for name, (_, _, handle) in own.items() if {*_levels(handle)} == {level}]
-        reasons[reason] = tuple(name for name in left if classes[name] == most)
-    return {reason: names for reason, names in reasons.items() if names}
-
-
-def _levels(handle: RunHandle) -> list[str]:
-    statistics = [entry.summary.statistics for entry in handle.scenes.values()]
-    return ["" if own is None else own.verdict.decisive for own in statistics]
+    reasons: dict[str, tuple[str, ...]] = {}
+    for name, scenes in numbers.items():
+        levels = Counter(own.level for own in scenes.values() if own.level in NOT_RANKED or math.isnan(own.alpha.value))
+        if 2 * levels.total() > len(scenes) or any(math.isnan(own.alpha.value) for own in scenes.values()):
+            reason = NOT_RANKED.get(levels.most_common(1)[0][0], NOT_RANKED["no verdict"])
+            reasons[reason] = (*reasons.get(reason, ()), name)
+    return reasons
 
 
 def _name(about: Submission, handle: RunHandle) -> str:
     return str(about.card.get("name") or handle.model)
 
 
-def _row(benchmark: Benchmark, name: str, result: Result, rank: int | None, last: int) -> BoardRow:
-    file, about, handle = result
-    entries, places = [handle.scenes[scene] for scene in benchmark.scenes], benchmark.places()
-    shown = dict.fromkeys(("alpha", *benchmark.measures))
-    numbers: dict[str, Interval] = {
-        key: _over_places([_number(entry, key) for entry in entries], places) for key in shown
-    }
-    alphas = [_number(entry, "alpha") for entry in entries]
-    scenes = dict(zip(benchmark.scenes, zip(alphas, _levels(handle), strict=True), strict=True))
-    return BoardRow(file, name, about, rank, last, numbers, scenes, _classes(entries))
-
-
-def _number(entry: Entry, key: Number) -> Interval:
-    """Return a number of a scene with its interval, from its sums."""
-    if key == "flicker":
-        frames = np.array([*entry.flicker], dtype=np.int64)
-        return mean_over_frames(frames, np.array([*entry.flicker.values()]))
-    if key != "alpha" and not entry.sums.truth:
-        return UNKNOWN
-    return estimate(entry.sums, key, scope=scope_of(entry.sums, key=key))
-
-
-def _over_places(values: Sequence[Interval], places: Sequence[str]) -> Interval:
-    known = [not math.isnan(own.value) for own in values]
-    return over_places(values, places) if all(known) else UNKNOWN
-
-
-def _classes(entries: Sequence[Entry]) -> dict[str, float]:
-    alphas: dict[str, list[float]] = {}
-    for entry in entries:
-        spots = None if entry.summary.statistics is None else entry.summary.statistics.spots
-        for own in () if spots is None else spots.classes:
-            if own.counts_for_verdict and math.isfinite(own.alpha.value):
-                alphas.setdefault(own.name, []).append(own.alpha.value)
-    return {name: float(np.mean(values)) for name, values in alphas.items()}
-
-
-Rows = tuple[Row, ...]
-
 # --- Tables -----------------------------------------------------------------------------------------------------------
 
 
 def headline(board: Board) -> Table:
-    """Return the table of a benchmark: rank, model, the headline's numbers, cost and origin."""
-    shown = [key for key in NUMBERS if key in board.benchmark.measures]
+    """Return the table of a benchmark: rank, model, and the numbers that follow from its sums."""
+    shown = [key for key in OF_TRUTH if key in board.benchmark.measures]
     columns = (
-        Column("rank", "rank"), Column("model", "model"), *(NUMBERS[key] for key in shown),
-        Column("verdict", "verdict"), Column("milliseconds", "ms a frame", 1, "lower"),
-        Column("parameters", "parameters, M", 1), Column("by", "by"), Column("made", "day"),
-        Column("semstab", "semstab"),
+        Column("rank", "rank"), Column("model", "model"), Column("alpha", "alpha", 3, "higher"),
+        Column("of_labelled", "of what it labels", 3, "higher"), Column("labelled", "labelled, %", 1, "higher"),
+        *(OF_TRUTH[key] for key in shown), Column("verdict", "verdict"),
     )  # fmt: skip
-    rows: Rows = tuple(
+    rows: tuple[Row, ...] = tuple(
         (
-            row.ranks, row.name, *(row.numbers[key] for key in shown), row.verdict, row.about.milliseconds,
-            float(row.about.card.get("parameters") or math.nan), str(row.about.card.get("by", "")), row.about.made,
-            row.about.semstab,
+            row.ranks, row.name, row.alpha, row.of_labelled, 100 * row.labelled, *(row.truth(key) for key in shown),
+            row.verdict,
         )
         for row in board.rows
     )  # fmt: skip
@@ -230,100 +282,88 @@ def headline(board: Board) -> Table:
     what = f"{count} {'place' if benchmark.flights else 'scene'}{'' if count == 1 else 's'}"
     caption = (
         f"{benchmark.description[0].upper()}{benchmark.description[1:]}; definition {benchmark.digest}. Means over"
-        f" {what}, with intervals at 95 %. A rank is 1 plus the number of models that are shown to be more stable in"
-        " alpha (paired by frames and cubes, Holm); 'to' names the last rank that is possible: models that share ranks"
-        " are not told apart. Milliseconds are of the model on the machine that it was run on, and unknown where label"
-        " maps were read."
+        f" {what}, with intervals at 95 %, all computed from sums that were checked. Alpha counts an answer that a"
+        " model leaves out as one that disagrees. A rank is 1 plus the number of models that are shown to be more"
+        " stable in it (paired by frames and cubes, Holm); 'to' names the last rank that is possible: models that"
+        " share ranks are not told apart."
     )
     caption += "".join(f" {text[0].upper()}{text[1:]}." for text in board.reasons)
     named = f"{benchmark.id} ({benchmark.digest})"
-    return Table(f"leaderboard-{benchmark.id}", benchmark.id, caption, columns, (Group("", rows),), "", named)
+    return _table(board, "leaderboard", benchmark.id, caption, columns, rows, named)
 
 
 def by_scene(board: Board) -> Table:
-    """Return alpha of each model in each scene, with the level of its verdict."""
+    """Return alpha of each model in each scene."""
     scenes = board.benchmark.scenes
     columns = (Column("model", "model"), *(Column(scene, scene, 3, "higher") for scene in scenes))
-    rows: Rows = tuple((row.name, *(row.scenes[scene][0] for scene in scenes)) for row in board.rows)
-    caption = "Alpha in each scene, with intervals at 95 %."
-    return Table(
-        f"scenes-{board.benchmark.id}", f"{board.benchmark.id} by scene", caption, columns, (Group("", rows),), ""
+    rows: tuple[Row, ...] = tuple((row.name, *(row.scenes[scene].alpha for scene in scenes)) for row in board.rows)
+    return _table(
+        board, "scenes", f"{board.benchmark.id} by scene", "Alpha in each scene, with intervals at 95 %.", columns, rows
     )
 
 
-def by_class(board: Board) -> Table:
-    """Return alpha of each model for each class that counts somewhere."""
-    names = list(dict.fromkeys(name for row in board.rows for name in row.classes))
-    columns = (Column("model", "model"), *(Column(name, name, 3, "higher") for name in names))
-    rows: Rows = tuple((row.name, *(row.classes.get(name, math.nan) for name in names)) for row in board.rows)
-    caption = "Alpha of a class against all others, the mean over scenes in which it counts for the verdict."
-    return Table(
-        f"classes-{board.benchmark.id}", f"{board.benchmark.id} by class", caption, columns, (Group("", rows),), ""
-    )
+def stated(board: Board) -> Table:
+    """Return what rests on the word of whoever handed a result in."""
+    columns = (
+        Column("model", "model"), Column("by", "by"), Column("made", "day"), Column("semstab", "semstab"),
+        Column("milliseconds", "ms a frame", 1), Column("parameters", "parameters, M", 1),
+        Column("machine", "machine"), Column("license", "licence"), Column("trained_on", "trained on"),
+        Column("url", "address"), Column("notes", "notes"),
+    )  # fmt: skip
+    rows: tuple[Row, ...] = tuple(_stated(row) for row in board.rows)
+    kept = [k for k, column in enumerate(columns) if k == 0 or any(_is_told(row[k]) for row in rows)]
+    rows = tuple(tuple(row[k] for k in kept) for row in rows)
+    caption = "Not checked: stated by whoever handed the result in. Ranks do not depend on it."
+    shown = tuple(columns[k] for k in kept)
+    return _table(board, "stated", f"{board.benchmark.id}, as stated", caption, shown, rows)
 
 
-# --- Files ------------------------------------------------------------------------------------------------------------
+def _stated(row: BoardRow) -> Row:
+    about, card = row.about, row.about.card
+    texts = {key: str(card.get(key) or "") for key in ("by", "license", "trained_on", "url", "notes")}
+    machine = f"{about.processor}, {about.cores} cores"
+    return (
+        row.name, texts["by"], about.made, about.semstab, about.milliseconds,
+        float(card.get("parameters") or math.nan), machine, texts["license"], texts["trained_on"], texts["url"],
+        texts["notes"],
+    )  # fmt: skip
 
 
-def write_site(made: Sequence[Board], out: Path) -> list[Path]:
-    """Write index.html, and for each benchmark NAME@VERSION.json, .csv and .md; return the paths."""
-    written = []
-    for board in made:
-        table, stem = headline(board), out / board.benchmark.id
-        for suffix, text in ((".csv", to_csv(table)), (".md", to_markdown(table))):
-            written.append(stem.with_name(stem.name + suffix))
-            write_text(written[-1], text)
-        written.append(stem.with_name(f"{stem.name}.json"))
-        write_json(written[-1], _content(board))
-    written.append(out / "index.html")
-    write_text(written[-1], filled("leaderboard.html.j2", boards=[_section(board) for board in made]))
-    return written
+def _is_told(cell: object) -> bool:
+    return not math.isnan(cell) if isinstance(cell, float) else bool(cell)
 
 
-def _content(board: Board) -> dict[str, Any]:
-    benchmark = board.benchmark
-    return {
-        "benchmark": benchmark.id, "digest": benchmark.digest,
-        "results": [
-            {
-                "rank": row.rank, "last_rank": row.last, "name": row.name, "file": row.file, "about": row.about,
-                "numbers": row.numbers, "classes": row.classes,
-                "scenes": {scene: {"alpha": alpha, "level": level} for scene, (alpha, level) in row.scenes.items()},
-            }
-            for row in board.rows
-        ],
-        "tables": [to_json(table) for table in (headline(board), by_scene(board), by_class(board))],
-    }  # fmt: skip
+def _table(
+    board: Board, name: str, title: str, caption: str, columns: tuple[Column, ...], rows: tuple[Row, ...], of: str = ""
+) -> Table:
+    return Table(f"{name}-{board.benchmark.id}", title, caption, columns, (Group("", rows),), "", of)
 
 
-def _section(board: Board) -> dict[str, Any]:
+def tables_of(board: Board) -> list[Table]:
+    """Return the tables of a benchmark."""
+    several = len(board.benchmark.scenes) > 1
+    return [headline(board), *([by_scene(board)] if several else []), stated(board)]
+
+
+# --- The page ---------------------------------------------------------------------------------------------------------
+
+
+def write_page(made: Sequence[Board], out: Path) -> Path:
+    """Write index.html; return its path."""
+    path = out / "index.html"
+    write_text(path, filled("leaderboard.html.j2", boards=[_section(board) for board in made]))
+    return path
+
+
+def _section(board: Board) -> dict[str, object]:
     benchmark = board.benchmark
     return {
         "id": benchmark.id,
         "description": benchmark.description,
         "facts": [*_facts(benchmark)],
         "superseded": benchmark.superseded_by,
-        "charts": [*_charts(board)],
-        "table": table_block(headline(board)),
-        "more": [table_block(table) for table in (by_scene(board), by_class(board))],
-        "cards": [(row.name, [*_card(row)]) for row in board.rows],
-        "caption": relations(headline(board).caption),
+        "tables": [table_block(table) for table in tables_of(board)],
     }
-
-
-def _charts(board: Board) -> Iterator[dict[str, str]]:
-    """Yield stability against accuracy, cost and size, where two models have both."""
-    rows = [row for row in board.rows if row.verdict != "uninformative"]
-    accuracy = [(row.name, row.numbers.get("accuracy", UNKNOWN).value, row.numbers["alpha"]) for row in rows]
-    cost = [(row.name, row.about.milliseconds, row.numbers["alpha"]) for row in rows]
-    size = [(row.name, float(row.about.card.get("parameters") or math.nan), row.numbers["alpha"]) for row in rows]
-    for title, points, label in (
-        ("Stability and accuracy", accuracy, "accuracy of the fused labels"),
-        ("Stability and cost", cost, "milliseconds a frame"),
-        ("Stability and size", size, "parameters, millions"),
-    ):
-        if sum(math.isfinite(x) for _, x, _ in points) > 1:
-            yield {"title": title, "chart": point_chart(points, label, "alpha")}
 
 
 def _facts(benchmark: Benchmark) -> Iterator[tuple[str, str]]:
@@ -337,24 +377,11 @@ def _facts(benchmark: Benchmark) -> Iterator[tuple[str, str]]:
     yield "citation", benchmark.citation
 
 
-def _card(row: BoardRow) -> Iterator[tuple[str, str]]:
-    about = row.about
-    for key, title in (
-        ("by", "by"), ("url", "address"), ("license", "licence"), ("trained_on", "trained on"), ("notes", "notes"),
-    ):  # fmt: skip
-        if about.card.get(key):
-            yield title, str(about.card[key])
-    yield "result", f"{row.file}, {about.made}, semstab {about.semstab}"
-    yield "machine", f"{about.processor}, {about.cores} cores, {about.platform}, Python {about.python}"
-    if about.packages:
-        yield "packages", ", ".join(f"{name} {version}" for name, version in about.packages.items())
-
-
 def lines(made: Sequence[Board]) -> Iterator[str]:
     """Yield what a terminal shows: the rank, the model and alpha of each result."""
     for board in made:
         count = len(board.rows)
         yield f"{board.benchmark.id} ({board.benchmark.digest}), {count} result{'' if count == 1 else 's'}"
         for row in board.rows:
-            yield f"  {row.ranks:>8}  {row.name:<28} alpha {row.numbers['alpha'].text()}"
+            yield f"  {row.ranks:>8}  {row.name:<28} alpha {row.alpha.text()}"
         yield from (f"  {text}" for text in board.reasons)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import hashlib
 import json
 from collections.abc import Iterator, Mapping, Sequence
@@ -24,13 +25,15 @@ from semstab.config import (
 from semstab.configure import load_config, predicted_config, shipped_benchmarks
 from semstab.core.prefetch import prefetch
 from semstab.data.labels import LabelSpace
-from semstab.datasets import Scene, open_dataset
+from semstab.datasets import GROUND_TRUTH, Scene, open_dataset
 from semstab.errors import ConfigError, DataError
+from semstab.leaderboard.geometry import Spots, few_rows, geometry_file, load_geometry, spots_of
+from semstab.pixels.preparation import leave_out
 from semstab.predict.predictor import PredictorConfig
-from semstab.task import frame_indices
+from semstab.task import Task, frame_indices, read
 
 Number = Literal["alpha", "flicker", "accuracy", "miou", "wrong_of_consistent"]
-"""The numbers of a headline; see `semstab.leaderboard.board.COLUMNS`."""
+"""The numbers of a headline; flicker does not follow from sums, so that runs have it, and the table does not."""
 
 WITHOUT_NUMBERS = {"description", "get", "license", "citation", "superseded_by"}
 """What may change in a version: words, no number follows from them."""
@@ -94,8 +97,7 @@ class Benchmark(Settings):
         content = self.model_dump(mode="json", exclude=WITHOUT_NUMBERS, exclude_defaults=True)
         if self.taxonomy is not None:
             content["classes"] = LabelSpace.load(self.taxonomy).classes
-        text = json.dumps(content, sort_keys=True)
-        return hashlib.blake2b(text.encode(), digest_size=8).hexdigest()
+        return _hash(content)
 
     def places(self) -> tuple[str, ...]:
         """Return the place of each scene: scenes that are one place flown again count as one together."""
@@ -195,6 +197,57 @@ class Benchmark(Settings):
                     f"{name}: {len(indices)} frames are selected, but {self.id} has {len(known)}; {self._again}"
                 )
 
+    @functools.cached_property
+    def geometry(self) -> Mapping[str, Spots]:
+        """Its spots by scene.
+
+        Raises:
+            DataError: If it has none, so that results cannot be checked.
+        """
+        self.require_geometry()
+        path = geometry_file(self.path)
+        scenes = load_geometry(path, self.data_digest)
+        if {*scenes} != {*self.scenes}:
+            raise DataError(f"{path}: it is of other scenes than {self.id}; write it with scripts/benchmark_digests.py")
+        return scenes
+
+    def require_geometry(self) -> None:
+        """Raise DataError where the spots of its scenes are not known, so that results of it cannot be checked."""
+        if self.digests is None or not geometry_file(self.path).is_file():
+            raise DataError(
+                f"{self.id}: the spots of its scenes are not known, so that results of it cannot be checked; run"
+                " scripts/benchmark_digests.py on its data"
+            )
+
+    @property
+    def path(self) -> Path:
+        """Its file."""
+        return shipped_benchmarks()[self.id] if self.file is None else Path(self.file)
+
+    @property
+    def data_digest(self) -> str:
+        """A hash of the hashes of its data."""
+        return _hash(self.digests)
+
+    def geometry_of(self, data: Path | None = None) -> dict[str, Spots]:
+        """Return the spots of its scenes, from its data."""
+        return few_rows({name: self._spots(scene) for name, scene in self.open_scenes(data).items()})
+
+    def _spots(self, scene: Scene) -> Spots:
+        indices = self.selected(scene)
+        seen = (
+            leave_out(each.item, (), masks=self.exclude.masks).every(self.pixel_stride)
+            for each in prefetch(scene.geometry, indices)
+        )
+        sources = [*((GROUND_TRUTH,) if scene.ground_truth else ()), *scene.models]
+        source = scene.label_space(sources[0]) if sources else LabelSpace.load(str(self.taxonomy))
+        target = source if self.taxonomy is None else LabelSpace.load(self.taxonomy)
+        truth = None
+        if scene.ground_truth:
+            task = Task(scene, GROUND_TRUTH, indices, source.mapping_to(target), (), exclude=self.exclude)
+            truth = (each.item for each in prefetch(lambda k: read(task, k, self.pixel_stride), indices))
+        return spots_of(seen, truth, target.classes)
+
     @property
     def _again(self) -> str:
         return f"it is another copy of the data: {self.get}" if self.get else "this semstab draws another city"
@@ -215,6 +268,11 @@ class Benchmark(Settings):
         """Yield frames of a scene with their hashes, in order."""
         for index, fetched in zip(indices, prefetch(scene.fingerprints, indices), strict=True):
             yield index, fetched.item
+
+
+def _hash(content: Any) -> str:
+    text = json.dumps(content, sort_keys=True)
+    return hashlib.blake2b(text.encode(), digest_size=8).hexdigest()
 
 
 def load_benchmark(named: str | Path) -> Benchmark:

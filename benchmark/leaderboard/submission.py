@@ -7,6 +7,7 @@ import importlib.metadata
 import math
 import os
 import platform
+import re
 import sys
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
@@ -21,27 +22,26 @@ from semstab.comparison.entries import Entry, RunHandle, open_run, save_summary
 from semstab.config import Config, Settings, read_yaml, validated
 from semstab.core.code import only_named
 from semstab.core.json_form import from_json, to_json
+from semstab.data.digests import require_unchanged
 from semstab.data.records import Result
 from semstab.data.results import slug
-from semstab.data.statistics import HeadlineStatistics, Interval
 from semstab.datasets import GROUND_TRUTH
 from semstab.engine.folder import load_result
 from semstab.errors import ConfigError, DataError
 from semstab.leaderboard.definition import Benchmark, load_benchmark
+from semstab.leaderboard.geometry import Spots
+from semstab.leaderboard.sums import checked
 from semstab.predict.dataset import NAME as PREDICTED
-from semstab.statistics.cluster_sums import ClusterSums, chance_of, functional, value
-from semstab.statistics.verdict import verdict
 
 SUFFIX = ".semstab"
 """Suffix of the files."""
 
 LARGEST = 600_000
-"""Bytes of a file at most: sums are made coarser until they fit, which changes no number, but the ends of intervals.
+"""Bytes of a file at most: sums of the map are made coarser until they fit, which changes no number, but the ends of
+intervals. Alpha and ranks are of spots, whose cubes are the definition's."""
 
-Most move by less than .01; where frames agree everywhere, few cubes leave a much lower end."""
-
-ALIKE = 1e-5
-"""Largest difference between a number that a file states and the one that follows from its sums."""
+LONGEST_LINE = 500
+"""Most characters of a line that is told of a model or a machine."""
 
 PACKAGES = ("numpy", "numba", "open3d", "torch", "transformers", "tflite-runtime", "ai-edge-litert")
 """Packages whose versions are told, where they are installed."""
@@ -53,7 +53,7 @@ def _one_line(text: str) -> str:
     return text
 
 
-Line = Annotated[str, Field(max_length=500), AfterValidator(_one_line)]
+Line = Annotated[str, Field(max_length=LONGEST_LINE), AfterValidator(_one_line)]
 
 
 class ModelCard(Settings):
@@ -115,6 +115,7 @@ def submissions(run: Path, path: Path, card: ModelCard | None = None) -> Iterato
     with only_named(file, ()):
         config = Config.build(read_yaml(file), str(file))
     benchmark = _benchmark_of(run, config)
+    require_unchanged(file)
     models = [name for name in result.models if name != GROUND_TRUTH]
     if len(models) > 1 and (path.suffix or card is not None):
         what = path if path.suffix else "--card"
@@ -123,10 +124,11 @@ def submissions(run: Path, path: Path, card: ModelCard | None = None) -> Iterato
         handle = open_run(f"{run}:{model}")
         require_whole(benchmark, handle)
         about = _about(benchmark, result, config, handle, card or ModelCard())
-        handle = dataclasses.replace(handle, about=to_json(about))
+        scenes = {scene: _in_cubes(entry, benchmark.geometry[scene]) for scene, entry in handle.scenes.items()}
+        handle = dataclasses.replace(handle, about=to_json(about), scenes=scenes)
         file = path if path.suffix else path / f"{benchmark.id}__{slug(model)}{SUFFIX}"
         file.parent.mkdir(parents=True, exist_ok=True)
-        save_summary(handle, file, LARGEST, single=True)
+        save_summary(handle, file, LARGEST, single=True, keep_spots=True)
         yield file, handle
 
 
@@ -140,7 +142,7 @@ def load_submission(
         definitions: Benchmarks that do not ship with semstab, by NAME@VERSION.
 
     Raises:
-        ConfigError, DataError: If it is no result of a benchmark that is known, or its numbers contradict its sums.
+        ConfigError, DataError: If it is no result of a benchmark that is known, or its sums cannot be.
     """
     if path.is_dir():
         raise DataError(f"{path}: it is a folder; results are files that --submit wrote")
@@ -158,10 +160,28 @@ def load_submission(
             f"{path}: it is of another definition of {benchmark.id} ({about.digest}; this semstab has"
             f" {benchmark.digest}); run the benchmark again"
         )
+    _require_statement(path, about)
     require_whole(benchmark, handle)
-    for scene, entry in handle.scenes.items():
-        _require_consistent(path, handle.model, scene, entry)
-    return benchmark, about, handle
+    return benchmark, about, dataclasses.replace(handle, scenes=_checked(path, benchmark, handle))
+
+
+def _checked(path: Path, benchmark: Benchmark, handle: RunHandle) -> dict[str, Entry]:
+    """Return the scenes with their sums as the definition has them; flicker, which nothing vouches for, is left out."""
+    made = {}
+    for scene in benchmark.scenes:
+        entry = handle.scenes[scene]
+        sums = checked(
+            f"{path}: {scene}", entry.sums, benchmark.geometry[scene], truth=benchmark.statistics,
+            voxel_size=benchmark.voxel_size,
+        )  # fmt: skip
+        made[scene] = dataclasses.replace(entry, small=(sums, {}))
+    return made
+
+
+def _in_cubes(entry: Entry, spots: Spots) -> Entry:
+    """Return a scene with the sums of its spots in the cubes of the definition."""
+    near, far = (part and part.coarsened(spots.edge, spots.step) for part in (entry.sums.near, entry.sums.far))
+    return dataclasses.replace(entry, small=(dataclasses.replace(entry.sums, near=near, far=far), entry.flicker))
 
 
 def require_whole(benchmark: Benchmark, handle: RunHandle) -> None:
@@ -216,39 +236,17 @@ def _about(benchmark: Benchmark, result: Result, config: Config, handle: RunHand
     )
 
 
-def _within_range(sums: ClusterSums, key: str, k: int | None = None) -> float:
-    """Return a number of sums; alpha, which is extrapolated, is stated as 1 where it comes out higher."""
-    return min(value(sums, key, k), functional(key, k).high)
-
-
-def _require_consistent(path: Path, model: str, scene: str, entry: Entry) -> None:
-    """Raise DataError where a stated number does not follow from the sums, or the level not from the numbers."""
-    statistics, sums = entry.summary.statistics, entry.sums
-    assert statistics is not None
-    own, spots, repeated = statistics.headline, statistics.spots, statistics.repeated
-    stated: dict[str, tuple[float, float]] = {
-        key: (interval.value, _within_range(sums, key))
-        for key, interval in (("alpha", own.alpha), ("psa", own.psa), *(_of_truth(own) if sums.truth else ()))
-        if not interval.undecided
-    }
-    if spots is not None and sums.near is not None:
-        stated["chance"] = spots.chance, chance_of(sums.near)
-        for row in spots.classes:
-            stated[f"alpha of {row.name}"] = (
-                row.alpha.value,
-                _within_range(sums, "alpha", entry.classes.index(row.name)),
-            )
-    for key, (number, follows) in stated.items():
-        if not math.isclose(number, follows, abs_tol=ALIKE) and not (math.isnan(number) and math.isnan(follows)):
-            raise DataError(f"{path}: {scene}: {key} is stated as {number:.6g}, but its sums give {follows:.6g}")
-    follow = verdict(model, headline=own, spots=spots, voxels=repeated.voxels, share=repeated.share)
-    if statistics.verdict.level != follow.level:
-        level = statistics.verdict.level
-        raise DataError(f"{path}: {scene}: the level is stated as '{level}', but its numbers give '{follow.level}'")
-
-
-def _of_truth(own: HeadlineStatistics) -> tuple[tuple[str, Interval], ...]:
-    return ("accuracy", own.accuracy), ("wrong_of_consistent", own.wrong_of_consistent)
+def _require_statement(path: Path, about: Submission) -> None:
+    """Raise DataError where what stands beside the sums is no statement: a line of text, a day, a time."""
+    texts = {name: getattr(about, name) for name in ("made", "semstab", "python", "platform", "processor")}
+    texts |= {f"packages.{name}": f"{name} {version}" for name, version in about.packages.items()}
+    for name, text in texts.items():
+        if len(text) > LONGEST_LINE or not text.isprintable():
+            raise DataError(f"{path}: about.{name}: is no line of at most {LONGEST_LINE} characters; write it again")
+    if not re.fullmatch(r"\d{4}-\d\d-\d\d", about.made):
+        raise DataError(f"{path}: about.made: is no day such as 2026-11-29; write it again")
+    if about.milliseconds < 0 or about.cores < 1:
+        raise DataError(f"{path}: about: milliseconds or cores are negative; write it again")
 
 
 def _version(package: str) -> str | None:

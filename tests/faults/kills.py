@@ -33,6 +33,7 @@ import video_scene
 import yaml
 
 from semstab.cli import app
+from semstab.core.files import read_sealed
 from semstab.recording.target import is_whole
 
 Words = list[str]
@@ -91,7 +92,7 @@ def beside(words: Words, logs: tuple[Path, Path], seconds: float) -> str | None:
 
 def of_run(out: Path) -> Any:
     """What a run or a study leaves: the summary without times, its files, and whether the recording is whole."""
-    found = json.loads((out / "summary.json").read_text())
+    found = read_sealed(out / "summary.json")
     runs = [{key: value for key, value in run.items() if key not in TIMES} for run in found["runs"]]
     recording = out / "recording.rrd"
     names = sorted(str(path.relative_to(out)) for path in out.rglob("*") if path.is_file())

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import random
 import shutil
 
@@ -12,6 +11,7 @@ from command_line import bench, error_of
 from posed_config import configure
 
 import semstab
+from semstab.core.files import write_sealed
 from semstab.data.digests import DIGESTS, require_unchanged
 from semstab.data.events import Events
 from semstab.data.voxels import VoxelTable
@@ -95,6 +95,6 @@ def test_tiles_have_digests_too_and_a_start_that_was_killed_has_none(tmp_path) -
 
 
 def test_digests_that_are_damaged_are_reported(run) -> None:
-    (run / DIGESTS).write_text(json.dumps({"schema": 0}))
+    write_sealed(run / DIGESTS, {"schema": 0})
     with pytest.raises(DataError, match=r"digests\.json: holds no digests of this version; run the same command again"):
         require_unchanged(run / "sums/wall__a__numpy.parquet")

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import json
 import random
+import re
+import shutil
 from collections.abc import Callable
 from io import StringIO
 from pathlib import Path
@@ -12,12 +14,13 @@ from typing import Any
 import numpy as np
 import pytest
 import tiny_scene
+from command_line import error_of
 from posed_config import configure
 from rich.console import Console
 
 import semstab
 from semstab.convert import convert
-from semstab.core.files import read_json
+from semstab.core.files import read_sealed, write_sealed
 from semstab.core.json_form import from_json
 from semstab.data.records import Record
 from semstab.engine import load_result
@@ -86,7 +89,7 @@ def read_again(file: Path) -> None:
 
 
 def read_unit(file: Path) -> None:
-    from_json(Record, read_json(file), file)
+    from_json(Record, read_sealed(file), file)
 
 
 def converted_again(file: Path) -> None:
@@ -126,14 +129,48 @@ def test_a_damaged_file_is_one_line_or_still_whole(folder, pattern, read: Callab
 def test_a_summary_that_lacks_what_its_tables_are_made_of_is_refused(folder, place, value, said) -> None:
     file = folder / "run" / "summary.json"
     whole = file.read_text()
-    content = json.loads(whole)
+    content = read_sealed(file)
     part = content["runs"][0]
     for key in place[:-1]:
         part = part[key]
     part[place[-1]] = value
-    file.write_text(json.dumps(content))
+    write_sealed(file, content)
     try:
         with pytest.raises(SemstabError, match=rf"summary\.json: .*{said}"):
             read_again(file)
     finally:
         file.write_text(whole)
+
+
+@pytest.mark.parametrize("name", ["summary.json", "manifest.json"])
+def test_a_digit_that_was_changed_in_a_file_of_a_run_is_one_line_in_whatever_reads_it(folder, tmp_path, name) -> None:
+    run = shutil.copytree(folder / "run", tmp_path / "run")
+    change_a_digit(run / name)
+    for words in (("show", "run"), ("gate", "run", "--save-baseline", "x.semstab"), ("export", "run", "--to", "x.ply")):
+        assert f"{name}: has changed since the run wrote it; run the same command again" in error_of(
+            *words, cwd=tmp_path
+        )
+    assert [path.name for path in tmp_path.iterdir()] == ["run"]
+
+
+def test_a_digit_that_was_changed_in_a_unit_is_never_carried_into_the_summary(folder, tmp_path, caplog) -> None:
+    run = shutil.copytree(folder / "run", tmp_path / "run")
+    before = read_sealed(run / "summary.json")["runs"]
+    unit = min(run.glob("units/*.json"))
+    change_a_digit(unit)
+    config = configure(folder / "wall", backends=["numpy", "numba"], check=None)
+    again = semstab.run(config, out=run, report=False)
+    assert f"{unit.name}: damaged; the unit is computed again" in caplog.text
+    assert again.manifest["units"]["computed"] == 1
+    alphas = [
+        [row["statistics"]["headline"]["alpha"] for row in rows]
+        for rows in (before, read_sealed(run / "summary.json")["runs"])
+    ]
+    assert alphas[0] == alphas[1]
+
+
+def change_a_digit(file: Path) -> None:
+    """Change the first digit after a point of the file, or of a digest."""
+    text = file.read_text()
+    at = next(match.end() - 1 for match in re.finditer(r'(?<=[0-9]\.)[0-9]|": "[0-9a-f]', text))
+    file.write_text(text[:at] + ("7" if text[at] != "7" else "3") + text[at + 1 :])

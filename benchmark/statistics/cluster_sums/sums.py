@@ -130,9 +130,9 @@ class ClusterSums:
         Cubes of the spots are then at least as large as cubes of the map.
         """
         near, far = (part and part.coarsened(max(edge, part.edge), part.step) for part in (self.near, self.far))
-        return dataclasses.replace(self._map_coarsened(edge, step), near=near, far=far)
+        return dataclasses.replace(self.map_coarsened(edge, step), near=near, far=far)
 
-    def _map_coarsened(self, edge: float, step: int) -> ClusterSums:
+    def map_coarsened(self, edge: float, step: int) -> ClusterSums:
         """Return the sums of the map in larger cubes or groups of frames, with the sums of spots unchanged."""
         cell = _joined(self.cell, edge / self.edge)
         known = step and self.step
@@ -279,7 +279,7 @@ def aligned(*parts: ClusterSums) -> tuple[ClusterSums, ...]:
         raise DataError("the sums do not fit together: their maps differ in classes, or only some have ground truth")
     edge, steps = max(part.edge for part in parts), [part.step for part in parts]
     step = max(steps) if all(steps) else 0
-    same = [part if (part.edge, part.step) == (edge, step) else part._map_coarsened(edge, step) for part in parts]
+    same = [part if (part.edge, part.step) == (edge, step) else part.map_coarsened(edge, step) for part in parts]
     near, far = [part.near for part in same if part.near], [part.far for part in same if part.far]
     if len(near) < len(same) or len(far) < len(same):
         return tuple(same)

@@ -1,0 +1,24 @@
+"""Forged results are refused in one line, or change no rank; `python tests/faults/forgeries.py` has many more."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import forgeries
+import pytest
+
+RESULTS = Path(__file__).parents[2] / "results"
+
+
+@pytest.mark.parametrize(("named", "model"), [
+    ("livingroom@1", "espnetv2-1.0"), ("city@1", "trick-world-locked"), ("apc_shelf@1", "fcn-scores"),
+])  # fmt: skip
+def test_no_forgery_changes_a_rank(named, model) -> None:
+    referee = forgeries.Referee.of(RESULTS, named)
+    outcomes = [
+        (what, outcome)
+        for _, what, outcome in forgeries.judged(referee, RESULTS / f"{named}__{model}.semstab", fields=False)
+    ]
+    assert len(outcomes) >= 100
+    assert [each for each in outcomes if each[1] not in ("refused", "no rank changes")] == []
+    assert sum(outcome == "refused" for _, outcome in outcomes) > len(outcomes) / 2
