@@ -31,10 +31,17 @@ NEIGHBOURS = 1.8
 
 @dataclass(frozen=True)
 class PlaceView:
-    """A frame that sees a place, and the class that it gives most of the place's spots; -1: none of them."""
+    """A frame that sees a place.
+
+    Attributes:
+        frame: Its index.
+        label: The class that it gives most of the spots of the place; -1 where it gives none.
+        spots: Number of the spots that it sees.
+    """
 
     frame: int
     label: int
+    spots: int
 
 
 @dataclass(frozen=True, eq=False)
@@ -141,11 +148,12 @@ def _views(table: VoxelTable, place: Int64, places: int, spots: SpotObservations
     rows = np.flatnonzero(of_spot[spots.spot] >= 0)
     votes = np.zeros((places, len(spots.views), spots.K + 1), np.int64)
     np.add.at(votes, (of_spot[spots.spot[rows]], spots.view[rows], spots.label[rows]), 1)
-    seen = votes.sum(axis=2) > 0
+    count = votes.sum(axis=2)
     named = votes[..., : spots.K].sum(axis=2) > 0
     label = np.where(named, votes[..., : spots.K].argmax(axis=2), -1)
     frame = spots.views.frame
+    order = np.argsort(frame, kind="stable")
     return [
-        tuple(PlaceView(int(frame[v]), int(label[k, v])) for v in np.flatnonzero(seen[k])[np.argsort(frame[seen[k]])])
+        tuple(PlaceView(int(frame[v]), int(label[k, v]), int(count[k, v])) for v in order if count[k, v])
         for k in range(places)
     ]

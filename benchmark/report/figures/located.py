@@ -78,6 +78,12 @@ class Located:
         matrix = np.column_stack([linear @ axes[0], linear @ axes[1], linear @ lower_left + offset])
         return cls(matrix, size, axes, corner, georeference)
 
+    def coordinates(self, point: npt.ArrayLike) -> list[float]:
+        """Return a point (3,) of the scene in the coordinates of the exports, metres."""
+        points = np.asarray(point, np.float64).reshape(1, 3)
+        found: list[float] = (points if self.georeference is None else self.georeference.projected(points))[0].tolist()
+        return found
+
     @property
     def names(self) -> tuple[str, str, str]:
         """Names of the three coordinates."""

@@ -84,6 +84,27 @@ class LoneFrames:
 
 
 @dataclass(frozen=True, eq=False)
+class PlacePictures:
+    """Places where frames disagree, as small images of the frames that see them.
+
+    Attributes:
+        of: (n,) number of the place that an image shows.
+        centre: (n, 3) its centre in the scene, metres.
+        frame: (n,) index of the frame.
+        labels: (n, h, w) rows 0..K-1, and above where a pixel has none.
+        ring: (n, 3) centre x, y and radius of a circle around the place, shares of the image.
+        color: (n, h, w, 3); None where the dataset has no images.
+    """
+
+    of: Int64
+    centre: Float64
+    frame: Int64
+    labels: npt.NDArray[np.integer[Any]]
+    ring: Float64
+    color: Image | None
+
+
+@dataclass(frozen=True, eq=False)
 class Overview:
     """A frame as the camera and the model saw it.
 
@@ -93,6 +114,7 @@ class Overview:
         color: (H, W, 3) the image; None where the dataset has none.
         palette: (K, 3) RGB of the classes.
         lone: Frames that stand out; None where none does.
+        places: Places where frames disagree; None where there are no pictures of any.
     """
 
     frame: int
@@ -100,6 +122,7 @@ class Overview:
     color: Image | None
     palette: Image
     lone: LoneFrames | None = None
+    places: PlacePictures | None = None
 
     @classmethod
     def load(cls, path: Path) -> Overview:
@@ -115,9 +138,12 @@ class Overview:
                 arrays = {name: decode_array(path, data, name[:-4]) for name in archive.namelist()}
             content = {name.removesuffix(".npy"): value for name, value in arrays.items()}
             lone: list[Any] = [content.get(f"lone_{name}") for name in ("frames", "labels", "alone", "color")]
+            names = ("of", "centre", "frame", "labels", "ring", "color")
+            places: list[Any] = [content.get(f"place_{name}") for name in names]
             return cls(
                 int(content["frame"]), content["labels"], content.get("color"), content["palette"],
                 None if lone[0] is None else LoneFrames(*lone),
+                None if places[0] is None else PlacePictures(*places),
             )  # fmt: skip
         except (ValueError, TypeError, KeyError, RuntimeError, zipfile.BadZipFile) as error:
             raise DataError(
