@@ -5,9 +5,13 @@ from __future__ import annotations
 import contextlib
 import os
 from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
+from types import MappingProxyType
 from typing import TYPE_CHECKING, Any
+
+import numpy as np
 
 from semstab.comparison.differences import ComparisonData, Progress, find
 from semstab.comparison.locations import Changes
@@ -17,9 +21,11 @@ from semstab.core.files import TEMPORARY, FolderLock, keep_only, read_json, writ
 from semstab.core.json_form import from_json
 from semstab.core.types import THIS_SCENE
 from semstab.data import parquet
-from semstab.data.contrast import Against, RunComparison, SceneComparison
+from semstab.data.contrast import Against, Area, RunComparison, SceneComparison
+from semstab.data.georeference import Georeference
 from semstab.data.results import slug
 from semstab.data.statistics import Estimate
+from semstab.engine.folder import load_result, run_and_model
 from semstab.errors import ConfigError
 from semstab.report.charts import dot_chart, sample
 from semstab.report.comparison.tables import IN_CLASSES, heading, scopes, sentences, tables
@@ -84,8 +90,8 @@ def _shown(comparison: ComparisonData) -> Iterator[tuple[SceneComparison, Agains
     return (each for each in _changed(comparison) if len(each[2].shown.table))
 
 
-def maps(comparison: ComparisonData) -> Iterator[Figure]:
-    """Yield a map of each scene and run with known changes."""
+def maps(comparison: ComparisonData, known: Mapping[str, Georeference] = MappingProxyType({})) -> Iterator[Figure]:
+    """Yield a map of each scene and run with known changes, in the coordinates of the exports."""
     for scene, against, changes in _shown(comparison):
         if scene.scene in comparison.up:
             yield Figure(
@@ -95,19 +101,21 @@ def maps(comparison: ComparisonData) -> Iterator[Figure]:
                 " between frames and, where there is ground truth, of correctness. Numbers name the areas that got"
                 " worse.",
                 f"Maps of {scene.scene} from above: orange where {against.other} is worse, blue where it is better.",
-                partial(_draw, changes, comparison.up[scene.scene], against),
+                partial(_draw, changes, comparison.up[scene.scene], against, known.get(scene.scene)),
                 unit=slug(scene.scene, against.other),
             )
 
 
-def _draw(changes: Changes, up: tuple[float, float, float], against: Against) -> Canvas:
+def _draw(
+    changes: Changes, up: tuple[float, float, float], against: Against, georeference: Georeference | None
+) -> Canvas:
     shown = changes.shown
     panels = [Panel("agreement", ("lost", "gained"), shown.change, *_numbers(against, "agreement"))]
     if shown.right is not None:
         panels.append(
             Panel("truth", ("wrong now", "right now"), shown.right.astype(float), *_numbers(against, "truth"))
         )
-    return draw_changes(shown.table, up, panels)
+    return draw_changes(shown.table, up, panels, georeference)
 
 
 def _numbers(against: Against, what: str) -> tuple[list[int], list[tuple[float, float, float]]]:
@@ -150,14 +158,39 @@ def compare(
         lock = FolderLock(Path(out))
     try:
         comparison = find(runs, progress, validated(ScopeOption, {"scope": scope}, "compare: ").scope)
+        known = georeferences(runs)
         if out is not None:
-            write(comparison, out)
+            write(comparison, out, known)
     finally:
         if lock is not None:
             lock.release()
             with contextlib.suppress(OSError):
                 lock.path.rmdir()  # where nothing was written
-    return comparison.result
+    return located(comparison.result, known)
+
+
+def georeferences(runs: Sequence[str | os.PathLike[str]]) -> Mapping[str, Georeference]:
+    """Return the georeferences of scenes by name, as the first folder of a run has them: those of all are the same."""
+    folders = (folder for folder, _ in map(run_and_model, runs) if folder.is_dir())
+    return next((load_result(folder).georeference for folder in folders), {})
+
+
+def located(result: RunComparison, known: Mapping[str, Georeference]) -> RunComparison:
+    """Return a comparison whose areas are in the coordinates of the exports."""
+
+    def projected(area: Area, georeference: Georeference) -> Area:
+        x, y, z = georeference.projected(np.array([area.centre]))[0].tolist()
+        return replace(area, centre=(x, y, z))
+
+    def in_scene(scene: SceneComparison) -> SceneComparison:
+        if (own := known.get(scene.scene)) is None:
+            return scene
+        against = tuple(
+            replace(each, areas=tuple(projected(area, own) for area in each.areas)) for each in scene.against
+        )
+        return replace(scene, against=against, crs=own.name)
+
+    return replace(result, scenes=tuple(map(in_scene, result.scenes)))
 
 
 def load_comparison(folder: str | Path) -> RunComparison:
@@ -170,20 +203,23 @@ def load_comparison(folder: str | Path) -> RunComparison:
     return from_json(RunComparison, read_json(path), path)
 
 
-def write(comparison: ComparisonData, out: str | Path) -> None:
-    """Write the folder; nothing of an earlier comparison is left in it."""
-    folder, made, drawn = Path(out), tables(comparison.result), list(maps(comparison))
+def write(
+    comparison: ComparisonData, out: str | Path, known: Mapping[str, Georeference] = MappingProxyType({})
+) -> None:
+    """Write the folder, with the georeferences of scenes; nothing of an earlier comparison is left in it."""
+    result = located(comparison.result, known)
+    folder, made, drawn = Path(out), tables(result), list(maps(comparison, known))
     _require_own(folder)
-    write_json(folder / CONTENT, comparison.result)
-    write_text(folder / PAGE, markdown(comparison.result, made))
+    write_json(folder / CONTENT, result)
+    write_text(folder / PAGE, markdown(result, made))
     save_tables(made, folder)
     keep_only([path for figure in drawn for path in figure.save(folder / "figures")], folder / "figures")
     _write_columns(comparison, folder)
-    write_text(folder / REPORT, page(comparison.result, made, drawn, folder))
+    write_text(folder / REPORT, page(result, made, drawn, folder))
     if recorded := dict(_recorded(comparison)):
         from semstab.recording import record_changes
 
-        record_changes(folder / RECORDING, recorded, comparison.up, sentences(comparison.result))
+        record_changes(folder / RECORDING, recorded, comparison.up, sentences(result))
 
 
 def markdown(comparison: RunComparison, made: Sequence[Table] | None = None) -> str:
