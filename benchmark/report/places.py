@@ -19,6 +19,10 @@ LISTED, NAMED = 10, 12
 """The most places that the page lists, and the most frames of a place that it names."""
 
 
+END = 0.04
+"""The share of an edge next to a corner of the map without ticks, whose text would stand out of the page."""
+
+
 def frame_names(record: Record) -> dict[int, str]:
     """Return the names of a unit's frames by their index, as its time series has them; none where it has no file."""
     file = record.series
@@ -35,8 +39,8 @@ def map_frame(located: Located) -> dict[str, Any]:
     length = scale_length(located.size[0])
     axes = " and ".join(edge.name for edge in (lower, left) if edge.name)
     return {
-        "lower": [(100 * share, metres(value)) for share, value in lower.ticks],
-        "left": [(100 * (1 - share), metres(value)) for share, value in left.ticks],
+        "lower": [(100 * share, metres(value)) for share, value in lower.ticks if END <= share <= 1 - END],
+        "left": [(100 * (1 - share), metres(value)) for share, value in left.ticks if END <= share <= 1 - END],
         "axes": f"{axes}, metres: {located.system}" if axes else "",
         "bar": (100 * length / located.size[0], scale_text(length)),
         "north": located.north,

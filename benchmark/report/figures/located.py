@@ -123,12 +123,12 @@ class Located:
 
 
 def ticks(low: float, high: float, most: int = MOST_TICKS) -> list[float]:
-    """Return at most so many round numbers between two ends: multiples of 1, 2 or 5 times a power of ten."""
+    """Return round numbers between two ends, at most one more than so many: multiples of 1, 2 or 5 times 10^n."""
     least = (high - low) / most
     power = 10.0 ** math.floor(math.log10(least))
     step = next(s * power for s in (1, 2, 5, 10) if s * power >= least * (1 - 1e-9))
     first = math.ceil(low / step - 1e-9)
-    return [k * step for k in range(first, math.floor(high / step + 1e-9) + 1)][:most]
+    return [k * step for k in range(first, math.floor(high / step + 1e-9) + 1)]
 
 
 def metres(value: float) -> str:
