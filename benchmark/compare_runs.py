@@ -19,7 +19,7 @@ from semstab.comparison.quantities import HEADLINES, IOU, by_key
 from semstab.config.groups import ScopeOption, validated
 from semstab.core.files import TEMPORARY, FolderLock, keep_only, read_json, write_json, write_text
 from semstab.core.json_form import from_json
-from semstab.core.types import THIS_SCENE
+from semstab.core.types import THIS_SCENE, Float64
 from semstab.data import parquet
 from semstab.data.contrast import Against, Area, RunComparison, SceneComparison
 from semstab.data.georeference import Georeference
@@ -27,8 +27,10 @@ from semstab.data.results import slug
 from semstab.data.statistics import Estimate
 from semstab.engine.folder import load_result, run_and_model
 from semstab.errors import ConfigError
+from semstab.exports.area_pictures import area_pictures
 from semstab.report.charts import dot_chart, sample
-from semstab.report.comparison.tables import IN_CLASSES, heading, scopes, sentences, tables
+from semstab.report.comparison.tables import IN_CLASSES, heading, scopes, sentences, tables, top_frames
+from semstab.report.figures.located import metres
 from semstab.report.figures.maps import Panel, draw_changes
 from semstab.report.figures.style import Figure
 from semstab.report.html import blocks, filled
@@ -214,7 +216,7 @@ def write(
     save_tables(made, folder)
     keep_only([path for figure in drawn for path in figure.save(folder / "figures")], folder / "figures")
     _write_columns(comparison, folder)
-    write_text(folder / REPORT, page(result, made, drawn, folder))
+    write_text(folder / REPORT, page(result, made, drawn, folder, _described(comparison, result)))
     if recorded := dict(_recorded(comparison)):
         from semstab.recording import record_changes
 
@@ -229,8 +231,14 @@ def markdown(comparison: RunComparison, made: Sequence[Table] | None = None) -> 
     return "\n".join([*head, *map(to_markdown, shown)])
 
 
-def page(comparison: RunComparison, made: Sequence[Table], drawn: Sequence[Figure], folder: Path) -> str:
-    """Return report.html."""
+def page(
+    comparison: RunComparison,
+    made: Sequence[Table],
+    drawn: Sequence[Figure],
+    folder: Path,
+    areas: Sequence[Mapping[str, Any]] = (),
+) -> str:
+    """Return report.html; areas are those of `_described`."""
     shown = [table for table in made if table.name != "comparison_all"]
     return filled(
         "comparison.html.j2",
@@ -240,6 +248,7 @@ def page(comparison: RunComparison, made: Sequence[Table], drawn: Sequence[Figur
         reading=[relations(text) for text in sentences(comparison)],
         models=[(run.name, sample(k)) for k, run in enumerate(comparison.runs[1:])],
         topics=list(_topics(shown, drawn, charts(comparison), folder)),
+        areas=areas,
     )
 
 
@@ -262,6 +271,45 @@ def _topics(
         if named or shown:
             dots = [chart for name in names for chart in made_charts.get(name, ())]
             yield {"id": key, "title": title, "charts": dots, "blocks": list(blocks(named, shown, folder))}
+
+
+def _described(comparison: ComparisonData, result: RunComparison) -> list[dict[str, Any]]:
+    """Return the areas of each scene and run as the page lists them, with pictures where the data is at hand."""
+    base, *others = result.runs
+    listed = []
+    of_told = {(scene.scene, against.other): (scene, against) for scene in result.scenes for against in scene.against}
+    for own, against, changes in _shown(comparison):
+        scene, told = of_told[own.scene, against.other]
+        other = next(run for run in others if run.name == against.other)
+        areas = told.areas[: 2 * MOST_NUMBERS]
+        points = {k: own_points for k, area in enumerate(areas) if len(own_points := _points(area, changes))}
+        pictures = area_pictures(areas, points, (base, other), scene.scene)
+        rows = [_area(area, scene.crs, pictures.get(k)) for k, area in enumerate(areas)]
+        if rows:
+            heading_text = relations(heading(result, scene.scene, against))
+            listed.append({"id": slug(scene.scene, against.other), "title": heading_text, "areas": rows})
+    return listed
+
+
+def _points(area: Area, changes: Changes) -> Float64:
+    """Return the centres (n, 3) of an area's voxels, in the scene's coordinates."""
+    number = changes.area if area.what == "agreement" else changes.wrong_area
+    return np.zeros((0, 3)) if number is None else changes.shown.table.centers[number == area.number]
+
+
+def _area(area: Area, crs: str, picture: Mapping[str, Any] | None) -> dict[str, Any]:
+    names = ("east", "north", "height") if crs else ("x", "y", "z")
+    text = f"{area.voxels:,} voxels, {area.size:.2g} m from end to end"
+    text += f"; frames lost {area.loss:.2f} of their agreement" if area.what == "agreement" else "; wrong now"
+    return {
+        "number": area.number,
+        "what": area.what,
+        "title": f"{area.of}, confused with {area.confused_with}" if area.confused_with else area.of,
+        "where": ", ".join(f"{name} {metres(round(c, 2))}" for name, c in zip(names, area.centre, strict=True)),
+        "text": f"{text}; {area.improved_alike or 'none'} improved by as much",
+        "frames": top_frames(area.frames),
+        "picture": picture,
+    }
 
 
 def _write_columns(comparison: ComparisonData, folder: Path) -> None:

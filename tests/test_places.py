@@ -357,4 +357,23 @@ def test_areas_of_compare_are_in_the_coordinates_of_the_exports(runs) -> None:
     text = (runs / "versus-run" / "comparison.md").read_text()
     assert "Centres are in WGS 84 / UTM zone 15N (EPSG:32615)." in text
     assert "m of WGS 84 / UTM zone 15N (EPSG:32615)" in text
+    page = (runs / "versus-run" / "report.html").read_text()
+    first = scene.against[0].areas[0]
+    assert f'id="area-scene__{scene.against[0].other}-{first.what}-1"' in page
+    assert f"east {metres(round(first.centre[0], 2))}" in page
     assert "Centres are in the coordinates of the scene." in (runs / "versus-nowhere" / "comparison.md").read_text()
+
+
+def test_areas_are_shown_in_the_frames_behind_them_where_the_data_is_at_hand(tmp_path) -> None:
+    tiny_scene.write(tmp_path / "scene", frames=6, noise=0.6)
+    semstab.run(configure(tmp_path / "scene", check=None), out=tmp_path / "run", report=False)
+    compared = semstab.compare(tmp_path / "run", out=tmp_path / "with")
+    assert any(area.frames for area in compared.scenes[0].against[0].areas)
+    page = (tmp_path / "with" / "report.html").read_text()
+    assert 'alt="labels of a"' in page
+    assert 'alt="labels of b"' in page
+    (tmp_path / "scene").rename(tmp_path / "elsewhere")
+    semstab.compare(tmp_path / "run", out=tmp_path / "without")
+    page = (tmp_path / "without" / "report.html").read_text()
+    assert "Top contributing frames" in page
+    assert "labels of a" not in page
