@@ -29,6 +29,7 @@ from semstab.report.figures.maps import Overview, draw_stability
 from semstab.report.figures.topdown import FromAbove
 from semstab.report.html import label_picture
 from semstab.report.page import render
+from semstab.statistics import places
 from semstab.statistics.observations import SpotObservations, Views
 from semstab.statistics.places import Place, PlaceView, connected, places_of, worst_places
 
@@ -93,7 +94,20 @@ def test_places_do_not_depend_on_tiles_and_are_at_most_so_many() -> None:
     whole, parts = (
         [(p.number, p.label, p.voxels, round(p.share, 9), p.centre) for p in each] for each in (whole, parts)
     )
+    assert whole == parts
     assert len(worst_places((a_map(groups),), None, 1)) == 1
+
+
+def test_of_a_large_map_the_voxels_on_which_frames_agree_least_are_looked_at(monkeypatch) -> None:
+    groups = [(row(0, 5), [2, 1, 0]), (row(10, 9), [2, 2, 2]), (row(20, 3), [1, 0, 1])]
+    monkeypatch.setattr(places, "VOXELS", 9)
+    for tables in ((a_map(groups),), [a_map([own]) for own in groups]):
+        (place,) = worst_places(tables, None)
+        assert place.voxels == 6
+    assert place.share == pytest.approx(6 * 0.8 / (5 * 2 / 3 + 9 * 0.8 + 3))
+
+
+def test_a_map_without_disagreement_has_no_places() -> None:
     assert worst_places((a_map([(row(0), [4, 1, 0])]),), None) == []  # six of ten pairs agree
 
 

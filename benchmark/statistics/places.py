@@ -25,6 +25,9 @@ LEAST = 4
 MOST = 20
 """Most places, those with the most disagreement first."""
 
+VOXELS = 1 << 19
+"""Most voxels that are looked at, those on which frames agree least: memory does not grow with the map."""
+
 NEIGHBOURS = 1.8
 """The largest distance of neighbours' centres, voxels: voxels across an edge or a corner are neighbours, too."""
 
@@ -91,8 +94,10 @@ def worst_places(tables: Iterable[VoxelTable], spots: SpotObservations | None, m
     for part in tables:
         lost = 1 - np.nan_to_num(psa(part), nan=1.0)
         whole += float(lost.sum())
-        parts.append(part.rows(lost >= 1 - DISAGREES))
-    table = VoxelTable.joined(parts)
+        parts.append(_least_agreed(part.rows(lost >= 1 - DISAGREES)))
+        if sum(map(len, parts)) > 2 * VOXELS:
+            parts = [_least_agreed(VoxelTable.joined(parts))]
+    table = _least_agreed(VoxelTable.joined(parts))
     if not len(table):
         return []
     evidence, loss = table.evidence[:], 1 - psa(table)
@@ -105,6 +110,11 @@ def worst_places(tables: Iterable[VoxelTable], spots: SpotObservations | None, m
     number[order] = np.arange(len(order))
     views = [()] * len(order) if spots is None else _views(table, number[place], len(order), spots)
     return [_place(k, number[place] == k, table, evidence, loss, whole, views[k]) for k in range(len(order))]
+
+
+def _least_agreed(table: VoxelTable) -> VoxelTable:
+    """Return the voxels on which frames agree least, at most VOXELS."""
+    return table if len(table) <= VOXELS else table.rows(np.sort(np.argsort(psa(table), kind="stable")[:VOXELS]))
 
 
 def connected(index: Int32, classes: npt.NDArray[np.integer[Any]]) -> Int64:
