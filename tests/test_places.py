@@ -225,6 +225,15 @@ def test_a_map_from_the_side_has_heights_and_no_north() -> None:
     assert located.north is None
 
 
+@pytest.mark.parametrize("along", [0, 1])
+def test_a_wall_is_seen_upright_from_either_side(along) -> None:
+    index = [(k, 0, z) if along == 0 else (0, k, z) for k in range(20) for z in range(10)]
+    located = Located.of(FromAbove.of(a_map([(index, [3, 0, 0])]), (0, 0, 1)))
+    lower, left = located.edges
+    assert (lower.name, left.name) == ("xy"[along], "z")
+    assert [value for _, value in sorted(left.ticks)] == [0, 1, 2, 3, 4, 5]
+
+
 def test_a_figure_has_the_coordinates_of_the_exports_and_an_arrow_to_north() -> None:
     axes = draw_stability(plate(), Georeference(WKT, OFFSET)).axes[0]
     assert [label.get_text() for label in axes.get_xticklabels()] == ["576715", "576720", "576725", "576730"]

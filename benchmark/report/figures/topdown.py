@@ -56,7 +56,9 @@ def best_view(table: VoxelTable, up: npt.ArrayLike) -> tuple[Mask, Float64, str]
     column, count = _numbered(_columns(centers, up_axis, table.voxel_size))
     areas = [count, *(_numbered(_columns(centers, axis, table.voxel_size))[1] for axis in (right, ahead))]
     if max(areas[1:]) > SLENDER * areas[0]:
-        return every, -right if areas[1] > areas[2] else -ahead, "from the side"
+        side = right if areas[1] > areas[2] else ahead
+        upright = max((-side, side), key=lambda axis: float(level_axes(axis)[1] @ up_axis))
+        return every, upright, "from the side"
     heights = centers @ up_axis
     low, high = np.quantile(heights, [OUTLIERS, 1 - OUTLIERS])
     cut = high - LID * (high - low)
