@@ -5,9 +5,13 @@ from __future__ import annotations
 import contextlib
 import os
 from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
+from types import MappingProxyType
 from typing import TYPE_CHECKING, Any
+
+import numpy as np
 
 from semstab.comparison.differences import ComparisonData, Progress, find
 from semstab.comparison.locations import Changes
@@ -15,14 +19,18 @@ from semstab.comparison.quantities import HEADLINES, IOU, by_key
 from semstab.config.groups import ScopeOption, validated
 from semstab.core.files import TEMPORARY, FolderLock, keep_only, read_json, write_json, write_text
 from semstab.core.json_form import from_json
-from semstab.core.types import THIS_SCENE
+from semstab.core.types import THIS_SCENE, Float64
 from semstab.data import parquet
-from semstab.data.contrast import Against, RunComparison, SceneComparison
+from semstab.data.contrast import Against, Area, RunComparison, SceneComparison
+from semstab.data.georeference import Georeference
 from semstab.data.results import slug
 from semstab.data.statistics import Estimate
+from semstab.engine.folder import load_result, run_and_model
 from semstab.errors import ConfigError
+from semstab.exports.area_pictures import area_pictures
 from semstab.report.charts import dot_chart, sample
-from semstab.report.comparison.tables import IN_CLASSES, heading, scopes, sentences, tables
+from semstab.report.comparison.tables import IN_CLASSES, heading, scopes, sentences, tables, top_frames
+from semstab.report.figures.located import metres
 from semstab.report.figures.maps import Panel, draw_changes
 from semstab.report.figures.style import Figure
 from semstab.report.html import blocks, filled
@@ -84,8 +92,8 @@ def _shown(comparison: ComparisonData) -> Iterator[tuple[SceneComparison, Agains
     return (each for each in _changed(comparison) if len(each[2].shown.table))
 
 
-def maps(comparison: ComparisonData) -> Iterator[Figure]:
-    """Yield a map of each scene and run with known changes."""
+def maps(comparison: ComparisonData, known: Mapping[str, Georeference] = MappingProxyType({})) -> Iterator[Figure]:
+    """Yield a map of each scene and run with known changes, in the coordinates of the exports."""
     for scene, against, changes in _shown(comparison):
         if scene.scene in comparison.up:
             yield Figure(
@@ -95,19 +103,21 @@ def maps(comparison: ComparisonData) -> Iterator[Figure]:
                 " between frames and, where there is ground truth, of correctness. Numbers name the areas that got"
                 " worse.",
                 f"Maps of {scene.scene} from above: orange where {against.other} is worse, blue where it is better.",
-                partial(_draw, changes, comparison.up[scene.scene], against),
+                partial(_draw, changes, comparison.up[scene.scene], against, known.get(scene.scene)),
                 unit=slug(scene.scene, against.other),
             )
 
 
-def _draw(changes: Changes, up: tuple[float, float, float], against: Against) -> Canvas:
+def _draw(
+    changes: Changes, up: tuple[float, float, float], against: Against, georeference: Georeference | None
+) -> Canvas:
     shown = changes.shown
     panels = [Panel("agreement", ("lost", "gained"), shown.change, *_numbers(against, "agreement"))]
     if shown.right is not None:
         panels.append(
             Panel("truth", ("wrong now", "right now"), shown.right.astype(float), *_numbers(against, "truth"))
         )
-    return draw_changes(shown.table, up, panels)
+    return draw_changes(shown.table, up, panels, georeference)
 
 
 def _numbers(against: Against, what: str) -> tuple[list[int], list[tuple[float, float, float]]]:
@@ -149,14 +159,39 @@ def compare(
         lock = FolderLock(Path(out))
     try:
         comparison = find(runs, progress, validated(ScopeOption, {"scope": scope}, "compare: ").scope)
+        known = georeferences(runs)
         if out is not None:
-            write(comparison, out)
+            write(comparison, out, known)
     finally:
         if lock is not None:
             lock.release()
             with contextlib.suppress(OSError):
                 lock.path.rmdir()  # where nothing was written
-    return comparison.result
+    return located(comparison.result, known)
+
+
+def georeferences(runs: Sequence[str | os.PathLike[str]]) -> Mapping[str, Georeference]:
+    """Return the georeferences of scenes by name, as the first folder of a run has them: those of all are the same."""
+    folders = (folder for folder, _ in map(run_and_model, runs) if folder.is_dir())
+    return next((load_result(folder).georeference for folder in folders), {})
+
+
+def located(result: RunComparison, known: Mapping[str, Georeference]) -> RunComparison:
+    """Return a comparison whose areas are in the coordinates of the exports."""
+
+    def projected(area: Area, georeference: Georeference) -> Area:
+        x, y, z = georeference.projected(np.array([area.centre]))[0].tolist()
+        return replace(area, centre=(x, y, z))
+
+    def in_scene(scene: SceneComparison) -> SceneComparison:
+        if (own := known.get(scene.scene)) is None:
+            return scene
+        against = tuple(
+            replace(each, areas=tuple(projected(area, own) for area in each.areas)) for each in scene.against
+        )
+        return replace(scene, against=against, crs=own.name)
+
+    return replace(result, scenes=tuple(map(in_scene, result.scenes)))
 
 
 def load_comparison(folder: str | Path) -> RunComparison:
@@ -169,20 +204,23 @@ def load_comparison(folder: str | Path) -> RunComparison:
     return from_json(RunComparison, read_json(path), path)
 
 
-def write(comparison: ComparisonData, out: str | Path) -> None:
-    """Write the folder; nothing of an earlier comparison is left in it."""
-    folder, made, drawn = Path(out), tables(comparison.result), list(maps(comparison))
+def write(
+    comparison: ComparisonData, out: str | Path, known: Mapping[str, Georeference] = MappingProxyType({})
+) -> None:
+    """Write the folder, with the georeferences of scenes; nothing of an earlier comparison is left in it."""
+    result = located(comparison.result, known)
+    folder, made, drawn = Path(out), tables(result), list(maps(comparison, known))
     _require_own(folder)
-    write_json(folder / CONTENT, comparison.result)
-    write_text(folder / PAGE, markdown(comparison.result, made))
+    write_json(folder / CONTENT, result)
+    write_text(folder / PAGE, markdown(result, made))
     save_tables(made, folder)
     keep_only([path for figure in drawn for path in figure.save(folder / "figures")], folder / "figures")
     _write_columns(comparison, folder)
-    write_text(folder / REPORT, page(comparison.result, made, drawn, folder))
+    write_text(folder / REPORT, page(result, made, drawn, folder, _described(comparison, result)))
     if recorded := dict(_recorded(comparison)):
         from semstab.recording import record_changes
 
-        record_changes(folder / RECORDING, recorded, comparison.up, sentences(comparison.result))
+        record_changes(folder / RECORDING, recorded, comparison.up, sentences(result))
 
 
 def markdown(comparison: RunComparison, made: Sequence[Table] | None = None) -> str:
@@ -193,8 +231,14 @@ def markdown(comparison: RunComparison, made: Sequence[Table] | None = None) -> 
     return "\n".join([*head, *map(to_markdown, shown)])
 
 
-def page(comparison: RunComparison, made: Sequence[Table], drawn: Sequence[Figure], folder: Path) -> str:
-    """Return report.html."""
+def page(
+    comparison: RunComparison,
+    made: Sequence[Table],
+    drawn: Sequence[Figure],
+    folder: Path,
+    areas: Sequence[Mapping[str, Any]] = (),
+) -> str:
+    """Return report.html; areas are those of `_described`."""
     shown = [table for table in made if table.name != "comparison_all"]
     return filled(
         "comparison.html.j2",
@@ -204,6 +248,7 @@ def page(comparison: RunComparison, made: Sequence[Table], drawn: Sequence[Figur
         reading=[relations(text) for text in sentences(comparison)],
         models=[(run.name, sample(k)) for k, run in enumerate(comparison.runs[1:])],
         topics=list(_topics(shown, drawn, charts(comparison), folder)),
+        areas=areas,
     )
 
 
@@ -226,6 +271,45 @@ def _topics(
         if named or shown:
             dots = [chart for name in names for chart in made_charts.get(name, ())]
             yield {"id": key, "title": title, "charts": dots, "blocks": list(blocks(named, shown, folder))}
+
+
+def _described(comparison: ComparisonData, result: RunComparison) -> list[dict[str, Any]]:
+    """Return the areas of each scene and run as the page lists them, with pictures where the data is at hand."""
+    base, *others = result.runs
+    listed = []
+    of_told = {(scene.scene, against.other): (scene, against) for scene in result.scenes for against in scene.against}
+    for own, against, changes in _shown(comparison):
+        scene, told = of_told[own.scene, against.other]
+        other = next(run for run in others if run.name == against.other)
+        areas = told.areas[: 2 * MOST_NUMBERS]
+        points = {k: own_points for k, area in enumerate(areas) if len(own_points := _points(area, changes))}
+        pictures = area_pictures(areas, points, (base, other), scene.scene)
+        rows = [_area(area, scene.crs, pictures.get(k)) for k, area in enumerate(areas)]
+        if rows:
+            heading_text = relations(heading(result, scene.scene, against))
+            listed.append({"id": slug(scene.scene, against.other), "title": heading_text, "areas": rows})
+    return listed
+
+
+def _points(area: Area, changes: Changes) -> Float64:
+    """Return the centres (n, 3) of an area's voxels, in the scene's coordinates."""
+    number = changes.area if area.what == "agreement" else changes.wrong_area
+    return np.zeros((0, 3)) if number is None else changes.shown.table.centers[number == area.number]
+
+
+def _area(area: Area, crs: str, picture: Mapping[str, Any] | None) -> dict[str, Any]:
+    names = ("east", "north", "height") if crs else ("x", "y", "z")
+    text = f"{area.voxels:,} voxels, {area.size:.2g} m from end to end"
+    text += f"; frames lost {area.loss:.2f} of their agreement" if area.what == "agreement" else "; wrong now"
+    return {
+        "number": area.number,
+        "what": area.what,
+        "title": f"{area.of}, confused with {area.confused_with}" if area.confused_with else area.of,
+        "where": ", ".join(f"{name} {metres(round(c, 2))}" for name, c in zip(names, area.centre, strict=True)),
+        "text": f"{text}; {area.improved_alike or 'none'} improved by as much",
+        "frames": top_frames(area.frames),
+        "picture": picture,
+    }
 
 
 def _write_columns(comparison: ComparisonData, folder: Path) -> None:

@@ -41,11 +41,13 @@ Numbers. results/real-networks.csv has a row for each network in each condition:
     effective_classes      1 / probability that two observations from anywhere agree (Hill number of order 2)
     largest_class, _share  the class with most observations
     voxels, mean_op, recurrent_share     of the map; recurrent: OP >= 3
-    spots, views           what alpha rests on; cells of rows that were measured before alpha was estimated from spots
+    spots, views           what alpha rests on
 results/real-networks.json has versions, commands, digests (SHA-256) of weights and sequences, and for each condition
 Spearman's rank correlation of a measure with the published mIoU, and with the effective number of classes, over
 `networks` networks. Its 95 % interval comes from 9,999 bootstrap samples of networks (scipy.stats.bootstrap, percentile
-method). The digest of a folder is that of the lines that `sha256sum` prints for its files, sorted by name.
+method). The digest of a folder is that of the lines that `sha256sum` prints for its files, sorted by name. `wrapper`
+has the digest of the nets.py that was run, and under `same_scores` that of scripts/nets.py where it is another text: it
+gave the same scores and labels, bit for bit, in two frames of each sequence for each network.
 """
 
 from __future__ import annotations
@@ -172,10 +174,8 @@ class Row:
     voxels: int
     mean_op: float
     recurrent_share: float
-    spots: int = 0
-    views: int = 0
-    cells: int = 0
-    """Instead of spots, in rows that were measured before alpha was estimated from spots."""
+    spots: int
+    views: int
 
 
 MEASURES = ("alpha", "vss", "agree", "flicker")

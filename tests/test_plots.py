@@ -52,7 +52,7 @@ def walls(tmp_path_factory):
 
 
 def of_table(table, up):
-    return top_down(table.centers, table.voxel_size, up)
+    return top_down(table.centers, table.voxel_size, up)[:2]
 
 
 def at(index, r=1.0, **columns):
@@ -180,7 +180,8 @@ def test_a_tilted_floor_has_no_holes(up):
 
 def test_large_maps_have_large_cells_and_lone_voxels_far_away_are_cut_off():
     table = at([(x, 0, x % 7) for x in range(40)])
-    image, cell = top_down(table.centers, 1.0, (0, 0, 1), largest=10)
+    image, cell, corner = top_down(table.centers, 1.0, (0, 0, 1), largest=10)
+    assert corner == (0.0, 0.0)
     assert cell == 4.0
     assert image.shape == (1, 10)
     assert [table.iz[row] for row in image[0][:3]] == [3, 6, 4]

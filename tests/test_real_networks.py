@@ -245,7 +245,7 @@ def test_every_condition_has_its_networks_commands_and_digests(rows, stated) -> 
         assert stated["conditions"][condition.name]["command"].startswith("semstab-bench run --data DATA/")
         assert set(stated["sequences"][condition.scene]) >= {"color", "depth", "pose"}
     assert len(stated["weights"]) == 20
-    assert stated["wrapper"]["nets.py"] == real_networks.digest(ROOT / "scripts" / "nets.py")
+    assert real_networks.digest(ROOT / "scripts" / "nets.py") in stated["wrapper"].values()
 
 
 def test_the_page_has_the_table_of_the_results(rows) -> None:

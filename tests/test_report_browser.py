@@ -99,3 +99,14 @@ def test_without_script_the_map_and_all_numbers_are_there(browser, report) -> No
     assert not page.locator(".controls").first.is_visible()
     assert page.locator(".scene").count() == page.locator(".scene:visible").count() == 2
     page.close()
+
+
+def test_a_number_on_the_map_opens_its_place_and_the_hover_tells_coordinates(page) -> None:
+    page.locator("canvas").first.hover()
+    assert "x " in page.locator(".readout").first.text_content()
+    pin = page.locator("a.pin:visible").first
+    place = page.locator(f"details{pin.get_attribute('href')}")
+    assert not place.evaluate("place => place.open")
+    pin.click()
+    assert place.evaluate("place => place.open")
+    page.wait_for_function("pin => pin.classList.contains('open')", arg=pin.element_handle())

@@ -188,7 +188,8 @@ Backend = Annotated[
 def export(
     run: Run,
     to: Annotated[list[Path], typer.Option(
-        "--to", metavar="FILE", help=".ply .las .laz .tif .glb .parquet .csv; or tasks, see --format; repeatable.")],
+        "--to", metavar="FILE",
+        help=".ply .las .laz .tif .glb .parquet .csv; places.csv, .geojson; tasks: --format; repeatable.")],
     scene: Scene = None,
     model: Model = None,
     backend: Backend = None,
@@ -208,11 +209,11 @@ def export(
     task_format: Annotated[str | None, typer.Option(
         "--format", metavar="coco",
         help="Annotation tasks instead of the map: locations where frames disagree.")] = None,
-    most: Annotated[int, typer.Option("--most", "-n", min=1, help="Largest number of annotation tasks.")] = 50,
+    most: Annotated[int, typer.Option("--most", "-n", min=1, help="Largest number of tasks or places.")] = 50,
     code: OwnCode = None,
     quiet: Quiet = False,
 ) -> None:  # fmt: skip
-    """Write the fused map as a point cloud, raster, mesh or table, with the stability of each voxel."""
+    """Write the fused map as a point cloud, raster, mesh or table, or the places where frames disagree most."""
     from semstab.exports import export as write
 
     for file in write(

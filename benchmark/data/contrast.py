@@ -112,7 +112,7 @@ class Area:
         confused_with: The class that the top contributing frames give.
         voxels: Number of voxels.
         loss: Mean over them: of agreement between frames, or 1.
-        centre: Metres, as the run has coordinates.
+        centre: Metres in the coordinates of the exports, see `SceneComparison.crs`.
         size: Metres from end to end.
         improved_alike: Areas that improved by as much or more, in all: what chance gives if nothing got worse.
         frames: The top contributing ones, the worst first; empty where the observations were not stored.
@@ -175,6 +175,7 @@ class SceneComparison:
         notes: Notes on the parts that cannot be compared here, with the reason.
         voxels: Number of voxels that all saw twice or more; 0 where they are not known.
         frames: Number of frames that they come from, about.
+        crs: Name of the reference system that centres of areas are in; '' for the scene's own coordinates.
     """
 
     scene: str
@@ -185,6 +186,7 @@ class SceneComparison:
     coverage: tuple[MapCoverage, ...]
     observations: ComparedObservations | None
     against: tuple[Against, ...]
+    crs: str = ""
 
     def __repr__(self) -> str:
         lines = [f"<SceneComparison of {self.scene}: {self.voxels:,} voxels that all saw twice, {self.frames} frames>"]

@@ -30,7 +30,7 @@ def from_above(index: Int32, vss: Float64, up: npt.ArrayLike | None = None) -> U
 
     shortest = np.diag([1.0, -1.0, 1.0])[int(np.argmin(np.ptp(index, axis=0)))]  # so that z is up before a wall
     away = shortest if up is None else np.asarray(up, dtype=np.float64)
-    rows, _ = top_down(index.astype(np.float64) + 0.5, 1.0, away, largest=WIDTH)
+    rows = top_down(index.astype(np.float64) + 0.5, 1.0, away, largest=WIDTH).rows
     colors = cv2.applyColorMap(np.nan_to_num(255 * vss).astype(np.uint8)[:, None], cv2.COLORMAP_VIRIDIS)[:, 0, ::-1]
     colors = np.where(np.isnan(vss)[:, None], np.array(ONCE, np.uint8), colors)
     picture = np.where((rows == EMPTY)[..., None], np.array(NOWHERE, np.uint8), colors[rows])

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import dataclass
 
 import numpy as np
@@ -52,6 +53,13 @@ class Georeference:
         if linear is not None and not abs(np.linalg.det(np.array(linear))) > SINGULAR:
             raise ConfigError(f"{where}: the matrix from the scene to the projection cannot be inverted; write it anew")
         return cls(wkt(crs, where), offset, IDENTITY if linear is None else linear)
+
+    @property
+    def name(self) -> str:
+        """Name of the reference system, with its number where it has one: 'WGS 84 / UTM zone 15N (EPSG:32615)'."""
+        name = re.search(r'"([^"]*)"', self.crs)
+        number = re.search(r'ID\["EPSG",\s*(\d+)\]\s*\]\s*$', self.crs)
+        return f"{name[1] if name else 'a projection'}{f' (EPSG:{number[1]})' if number else ''}"
 
     @property
     def turned(self) -> bool:

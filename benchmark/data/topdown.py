@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import numpy as np
 import numpy.typing as npt
 
@@ -30,10 +32,24 @@ def level_axes(up: npt.ArrayLike) -> tuple[Float64, Float64, Float64]:
     return right, np.cross(up_axis, right), up_axis
 
 
+class TopDown(NamedTuple):
+    """A map seen along an axis.
+
+    Attributes:
+        rows: (H, W) row of the voxel that each cell shows, or EMPTY; the first row of cells is the farthest ahead.
+        cell: Edge of a cell, metres.
+        corner: Metres to the right and ahead of the origin at which the lower left corner of the picture lies.
+    """
+
+    rows: Int64
+    cell: float
+    corner: tuple[float, float]
+
+
 def top_down(
     centers: Float64, voxel_size: float, up: npt.ArrayLike, rank: Float64 | None = None, largest: int = LARGEST
-) -> tuple[Int64, float]:
-    """Return the row of the topmost voxel in each cell (H, W), or EMPTY, and the edge of a cell in metres.
+) -> TopDown:
+    """Return the topmost voxel in each cell.
 
     Args:
         centers: (n, 3) of voxels, metres.
@@ -42,7 +58,7 @@ def top_down(
         rank: (n,) the voxel of a cell with the highest rank is shown, instead of the topmost one.
         largest: Most cells of the longer side.
 
-    The first row of cells is the farthest ahead. Where up is an axis of the world a cell is a column of voxels; else
+    Where up is an axis of the world a cell is a column of voxels; else
     each voxel covers the cells that a level square of its size touches.
     """
     from semstab.data.kernels import put_topmost
@@ -59,7 +75,8 @@ def top_down(
     height = centers @ up_axis if rank is None else rank
     image = np.full(last - first + 1, EMPTY, dtype=np.int64)
     put_topmost(cells, rows, height, image)
-    return image[::-1], cell
+    ahead_of, right_of = (first * cell).tolist()
+    return TopDown(image[::-1], cell, (right_of, ahead_of))
 
 
 def covered(plane: Float64, up: Float64, voxel_size: float, cell: float) -> tuple[Int64, Int64]:

@@ -30,6 +30,8 @@ from semstab.data.videos import LonePicture
 from semstab.data.voxels import VoxelTable
 from semstab.datasets import Scene
 from semstab.engine.live_maps import LiveMap, Stream
+from semstab.engine.place_pictures import PICTURED as PICTURED_PLACES
+from semstab.engine.place_pictures import pictures_of_places
 from semstab.engine.series import Series
 from semstab.engine.tiles import TILE_OBSERVATIONS, TileResult
 from semstab.engine.units import Unit, unit_key
@@ -42,6 +44,7 @@ from semstab.metrics.summary import TableSums
 from semstab.metrics.up_axis import estimate_up
 from semstab.statistics import Analysis, MapSample, SpotObservations, analyse
 from semstab.statistics.agreement import alpha_of, alpha_sums, ratio_of
+from semstab.statistics.places import worst_places
 from semstab.statistics.verdict import Limits
 from semstab.task import Task, read
 
@@ -283,6 +286,9 @@ def _savers(
     unit = work.unit
     if unit.image_space and stream.overview:
         pictures = pictures_of_outlying(live.task, config, analysis)
+        if fused is not None and tile is None and observations is not None and not live.task.scene.of_scans:
+            places = worst_places((fused.table,), observations, PICTURED_PLACES)
+            pictures |= pictures_of_places(live.task, places, config.pixel_stride)
         savers[overview_file(live.task)] = partial(save_overview, stream.overview | pictures)
     if tile is not None and observations is not None:
         savers[f"{tile.folder}/{tile.size}_{TILE_OBSERVATIONS}"] = observations.save

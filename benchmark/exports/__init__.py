@@ -1,4 +1,4 @@
-"""Export a finished run for other programs: point clouds, rasters, meshes and tables, in global coordinates."""
+"""Export a finished run for other programs: point clouds, rasters, meshes, tables and places, in global coordinates."""
 
 from __future__ import annotations
 
@@ -11,6 +11,7 @@ from pathlib import Path
 
 from semstab.config import nearest
 from semstab.core.files import only_writer, remove_abandoned
+from semstab.data.records import Record
 from semstab.engine.folder import load_result, model_of, require_output
 from semstab.errors import ConfigError
 from semstab.exports import clouds, coco, maps
@@ -18,8 +19,9 @@ from semstab.exports import join as joining
 from semstab.exports import voxels as tabular
 from semstab.exports.annotation import annotation_tasks
 from semstab.exports.coco import MOST, TaskFile, write_tasks
+from semstab.exports.places import GEOJSON, holds_places, write_places
 from semstab.exports.relabel import task_of
-from semstab.exports.voxels import Chosen, Voxels, crs_name
+from semstab.exports.voxels import Chosen, Voxels
 from semstab.statistics.acceptance import AcceptanceThresholds
 from semstab.task import Task
 
@@ -65,7 +67,7 @@ WRITERS: Mapping[str, Writer] = {
 }
 """The writers by suffix; each takes a map tile by tile and returns the number of voxels."""
 
-SUFFIXES = tuple(WRITERS)
+SUFFIXES = (*WRITERS, GEOJSON)
 
 
 def export(
@@ -90,6 +92,8 @@ def export(
 ) -> list[Exported]:
     """Write a unit of the run in a folder to files, in the format that each one's suffix names (`SUFFIXES`).
 
+    A .geojson file, or one that is called places.csv, gets the worst places instead: where frames disagree most.
+
     Args:
         run: Folder of the run, or FOLDER:MODEL.
         to: Files to write, one or several.
@@ -107,7 +111,7 @@ def export(
         radius: Metres, a voxel's edge where not given.
         join: A Parquet file with further columns of the same voxels, such as `compare` writes.
         task_format: 'coco': write annotation tasks, the locations where frames disagree, instead of the map.
-        most: The largest number of annotation tasks.
+        most: The largest number of annotation tasks, or of places.
         code: Code that the run's settings name and that may run for annotation tasks, FILE.py:NAME each; other code is
             refused.
 
@@ -148,7 +152,12 @@ def export(
         if classify is not None:
             return [_classified(chosen(joining.MEASURES), Path(classify), file, radius, settings) for file in files]
         usual = {".tif": maps.RASTER_MEASURES}
-        return [_written(chosen(usual.get(file.suffix.lower())), file, settings) for file in files]
+        return [
+            _places_written(chosen(("op",)), record, file, most)
+            if holds_places(file)
+            else _written(chosen(usual.get(file.suffix.lower())), file, settings)
+            for file in files
+        ]
 
 
 def _require_writable(files: Sequence[Path], inputs: Sequence[str | Path | None], task_format: str | None) -> None:
@@ -165,9 +174,26 @@ def _require_writable(files: Sequence[Path], inputs: Sequence[str | Path | None]
 
 def _written(chosen: Chosen, file: Path, settings: Settings) -> Exported:
     voxels, part = WRITERS[file.suffix.lower()](chosen, file, settings), chosen.first
-    where = "coordinates of the scene, which has no georeference"
-    where = where if part.georeference is None else crs_name(part.georeference)
-    return Exported(file, f"{voxels:,} voxels, {where}", tuple(_notes(part, file, settings)))
+    return Exported(file, f"{voxels:,} voxels, {_where(part)}", tuple(_notes(part, file, settings)))
+
+
+def _where(part: Voxels) -> str:
+    """Return what coordinates are in, in words."""
+    if part.georeference is None:
+        return "coordinates of the scene, which has no georeference"
+    return part.georeference.name
+
+
+def _places_written(chosen: Chosen, record: Record, file: Path, most: int) -> Exported:
+    places, part = write_places(chosen, record, file, most)
+    content = f"{places} place{'' if places == 1 else 's'} where frames disagree, {_where(part)}"
+    notes = []
+    if file.suffix.lower() == GEOJSON:
+        degrees = "longitude and latitude, WGS 84; x, y, z of its properties are in the projection"
+        notes.append("local metres, no degrees: lay no map under it" if part.georeference is None else degrees)
+    if record.observations_file is None or not record.observations_file.exists():
+        notes.append("the frames that see them are not known: the run stored no sampled observations")
+    return Exported(file, content, tuple(notes))
 
 
 def _tasks_written(file: TaskFile, task: Task) -> Exported:

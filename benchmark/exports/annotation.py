@@ -4,19 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any
 
 import cv2
 import numpy as np
-import numpy.typing as npt
 from scipy.ndimage import find_objects
-from scipy.sparse import coo_array
-from scipy.sparse.csgraph import connected_components
-from scipy.spatial import cKDTree
 
 from semstab.backends.shared.association import back_project
 from semstab.core.prefetch import prefetch
-from semstab.core.types import Float64, Int64, Mask
+from semstab.core.types import Float64, Int32, Int64, Mask
 from semstab.data.frames import Frame
 from semstab.data.measures import bits, dominant
 from semstab.data.voxels import VoxelTable
@@ -25,6 +20,7 @@ from semstab.exports.join import NONE, VoxelLookup
 from semstab.exports.voxels import Chosen
 from semstab.metrics import CATEGORIES, categories
 from semstab.statistics import psa
+from semstab.statistics.places import connected
 from semstab.task import Task
 
 MIN_PSA = 0.8
@@ -33,9 +29,6 @@ is uncertain."""
 
 BLOCK = 16
 """The largest edge of a location, voxels, that a person can assess at once."""
-
-NEIGHBOURS = 1.8
-"""The largest distance of neighbours' centres, voxels: voxels across an edge or a corner are neighbours, too."""
 
 SMALLEST = 1 / 5000
 """The least share of an image that an outline encloses, 8 x 8 pixels of 640 x 480; a person cannot assess less."""
@@ -164,19 +157,12 @@ def _disagreed(table: VoxelTable) -> Int64:
     return np.flatnonzero(wanted & (table.op >= 2))
 
 
-def _connected(index: npt.NDArray[np.integer[Any]], classes: Int64) -> Int64:
+def _connected(index: Int32, classes: Int64) -> Int64:
     """Return the connected set (n,) of each voxel (n, 3) with others of its classes (n, 2); blocks cut large ones."""
-    pairs, n = cKDTree(index).query_pairs(NEIGHBOURS, output_type="ndarray"), len(index)
-
-    def sets(alike: npt.NDArray[np.integer[Any]]) -> Int64:
-        a, b = pairs[(alike[pairs[:, 0]] == alike[pairs[:, 1]]).all(axis=1)].T
-        _, own = connected_components(coo_array((np.ones(len(a), np.bool_), (a, b)), shape=(n, n)), directed=False)
-        return np.asarray(own, np.int64)
-
-    whole = sets(classes)
+    whole = connected(index, classes)
     corner = np.full((whole.max() + 1, 3), np.iinfo(index.dtype).max)
     np.minimum.at(corner, whole, index)
-    return sets(np.column_stack([whole, (index - corner[whole]) // BLOCK]))
+    return connected(index, np.column_stack([whole, (index - corner[whole]) // BLOCK]))
 
 
 # Locations in the images.

@@ -21,7 +21,7 @@ from semstab.data.labels import name_key
 from semstab.datasets.files.surfaces import open_las
 from semstab.datasets.formats.ply import Header
 from semstab.errors import ConfigError, DataError, MissingDependencyError
-from semstab.exports.voxels import Voxels, crs_name
+from semstab.exports.voxels import Voxels
 
 if TYPE_CHECKING:
     import laspy
@@ -49,7 +49,7 @@ def write_ply(parts: Iterable[Voxels], path: Path, count: int) -> int:
 
 def legend(voxels: Voxels) -> Iterable[str]:
     """Yield the lines that explain a file: the voxel size, the coordinates, the classes, the columns."""
-    where = "coordinates of the scene" if voxels.georeference is None else crs_name(voxels.georeference)
+    where = "coordinates of the scene" if voxels.georeference is None else voxels.georeference.name
     yield f"semstab: voxels of {voxels.table.voxel_size:g} m, {where}"
     if voxels.benchmark:
         yield f"benchmark {voxels.benchmark}"

@@ -21,7 +21,7 @@ from semstab.data.information import normalise
 from semstab.data.tiles import TileIndex
 from semstab.data.topdown import covered, level_axes
 from semstab.errors import ConfigError, MissingDependencyError
-from semstab.exports.voxels import Chosen, Column, Voxels, crs_name, together
+from semstab.exports.voxels import Chosen, Column, Voxels, together
 from semstab.metrics import CATEGORIES, categories
 
 RASTER_MEASURES = ("vss", "entropy", "op")
@@ -362,7 +362,7 @@ def write_mesh(chosen: Chosen, path: Path) -> int:
     first, low = chosen.first, np.min([*corners.values()], axis=0)
     extras = {
         "origin": (first.linear @ (low * first.table.voxel_size) + first.offset).tolist(),
-        "coordinates": "the scene" if first.georeference is None else crs_name(first.georeference),
+        "coordinates": "the scene" if first.georeference is None else first.georeference.name,
         "voxel_size": first.table.voxel_size,
         "classes": list(first.classes),
         "benchmark": first.benchmark,

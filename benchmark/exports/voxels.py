@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import re
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass, replace
@@ -249,13 +248,6 @@ def joined_columns(table: VoxelTable, file: Path) -> dict[str, Column]:
         values[at[joined]] = content[name][joined]
         columns[name] = Column(values)
     return columns
-
-
-def crs_name(georeference: Georeference) -> str:
-    """Return the name of a reference system, with its number where it has one: 'WGS 84 / UTM zone 15N (EPSG:32615)'."""
-    name = re.search(r'"([^"]*)"', georeference.crs)
-    number = re.search(r'ID\["EPSG",\s*(\d+)\]\s*\]\s*$', georeference.crs)
-    return f"{name[1] if name else 'a projection'}{f' (EPSG:{number[1]})' if number else ''}"
 
 
 def usual() -> tuple[str, ...]:

@@ -148,6 +148,12 @@ def lone_pictures(
     ]  # fmt: skip
 
 
+def label_picture(labels: npt.NDArray[Any], palette: npt.ArrayLike) -> str:
+    """Return labels (h, w) as a PNG: rows of the palette (K, 3), grey where there is none."""
+    shades = np.vstack([np.asarray(palette, np.uint8).reshape(-1, 3), np.full((1, 3), 128, np.uint8)])
+    return _indexed(np.minimum(labels.astype(np.int64), len(shades) - 1), shades)
+
+
 def _indexed(index: Int64, palette: UInt8) -> str:
     """Return a PNG of indices (H, W) into colours."""
     return png(index.astype(np.uint8), palette) if len(palette) <= 256 else png(palette[index])

@@ -117,16 +117,25 @@ const key = (own, layer) => {
     + (counts.size > 16 ? `<span>and ${counts.size - 16} more</span>` : "");
 };
 
+// The two coordinates that run along the map, those of the exports; shares count from its lower left corner.
+const coordinates = (unit, across, up) => {
+  const {matrix, size, names} = unit.located;
+  const axes = [0, 1, 2].sort((a, b) => Math.max(...matrix[b].slice(0, 2).map(Math.abs)) - Math.max(...matrix[a].slice(0, 2).map(Math.abs)));
+  const digits = Math.max(0, Math.min(2, Math.ceil(-Math.log10(unit.cell))));
+  return axes.slice(0, 2).sort().map(k =>
+    `${names[k]} ${(matrix[k][0] * across * size[0] + matrix[k][1] * up * size[1] + matrix[k][2]).toFixed(digits)}`).join(", ") + " m";
+};
+
 const read = (unit, event) => {
   const box = unit.canvas.getBoundingClientRect(), [width, height] = unit.size;
   const x = Math.floor((event.clientX - box.left) / box.width * width);
   const y = Math.floor((event.clientY - box.top) / box.height * height);
-  const k = 4 * (y * width + x);
+  const k = 4 * (y * width + x), at = coordinates(unit, (x + 0.5) / width, 1 - (y + 0.5) / height);
   if (x < 0 || y < 0 || x >= width || y >= height || unit.first[k + 2] === EMPTY) return unit.text;
   const op = unit.second[k + 1], label = unit.first[k] + 256 * unit.first[k + 1];
   const drift = unit.second[k + 2] === EMPTY ? "" : ` \u00b7 SBD ${(unit.second[k + 2] / 254 * layers.sbd).toFixed(3)} bits`;
   return `${unit.names[label]} \u00b7 ${NAMES[unit.first[k + 2]]} \u00b7 VSS ${(unit.second[k] / 255).toFixed(2)}`
-    + ` \u00b7 OP ${op === 255 ? "255 or more" : op}${drift}`;
+    + ` \u00b7 OP ${op === 255 ? "255 or more" : op}${drift} \u00b7 ${at}`;
 };
 
 const pressed = (group, button) => {
@@ -143,7 +152,6 @@ const start = async scene => {
     [unit.first, unit.second] = await Promise.all(unit.numbers.map(pixels));
     unit.canvas = document.createElement("canvas");
     [unit.canvas.width, unit.canvas.height] = unit.size;
-    unit.canvas.style.maxWidth = `min(100%, ${75 * unit.size[0] / unit.size[1]}vh)`;
     unit.photo = new Image();
     unit.photo.src = unit.image || "data:,";
     unit.photo.alt = unit.frame;
@@ -176,6 +184,13 @@ const start = async scene => {
   for (const button of models.querySelectorAll("button")) button.addEventListener("click", () => pick(button));
   pick(models.querySelectorAll("button")[own.length > 2 ? 1 : 0]);
 };
+
+// Places: a number on the map opens what is known of the place, and an open one is marked on the map.
+for (const place of document.querySelectorAll("details.place")) {
+  const pin = document.querySelector(`a.pin[href="#${place.id}"]`);
+  pin?.addEventListener("click", () => { place.open = true; });
+  place.addEventListener("toggle", () => pin?.classList.toggle("open", place.open));
+}
 
 const scenes = [...document.querySelectorAll(".scene")];
 {

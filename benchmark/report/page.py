@@ -13,6 +13,7 @@ import numpy as np
 
 from semstab.core.palette import KINDS
 from semstab.core.types import UInt8
+from semstab.data.georeference import Georeference
 from semstab.data.measures import SBD, VSS, dominant, headlines, measures
 from semstab.data.records import OVERVIEW, Failure, Record, Result
 from semstab.data.results import slug
@@ -20,12 +21,14 @@ from semstab.data.statistics import CONFIDENCE, Estimate, MapStatistics, short
 from semstab.data.topdown import EMPTY
 from semstab.metrics import CATEGORIES, CATEGORY_COLORS, NOT_ASSESSED, categories, macro_mean
 from semstab.report.charts import Line, dot_chart, line_chart, sample
+from semstab.report.figures.located import Located
 from semstab.report.figures.maps import Overview, Views
 from semstab.report.figures.topdown import FromAbove
 from semstab.report.filter_study import advice, filter_studies, of_interest
 from semstab.report.html import filled, jpeg, lone_pictures, png, table_block
 from semstab.report.means import ENOUGH, by_model, describe, levels, over_recurrent, pooled, swept
 from semstab.report.narrative import not_assessed, noted, notes, outlying_line, warnings
+from semstab.report.places import described_places, map_frame
 from semstab.report.ranking import answers
 from semstab.report.saved_run import read_series
 from semstab.report.tables import tables
@@ -76,7 +79,7 @@ def render(
         warnings=[relations(text) for text in warnings(result)],
         notes=[relations(text) for text in notes(result)],
         scenes=shown,
-        maps=_script([unit for scene in shown for unit in scene["maps"]]),
+        maps=_script([_for_script(unit) for scene in shown for unit in scene["maps"]]),
         layers=_script({"categories": CATEGORIES, "colors": CATEGORY_COLORS, "sbd": SBD_END}),
         charts_all=[*_by_op(result), *_sweeps(result)],
         tables=views,
@@ -84,6 +87,11 @@ def render(
         facts=list(_facts(result.manifest)),
         manifest=json.dumps(result.manifest, indent=2, default=str),
     )
+
+
+def _for_script(unit: Mapping[str, Any]) -> dict[str, Any]:
+    """Return what the script paints of a map: the rest stands in the page already."""
+    return {name: value for name, value in unit.items() if name not in ("around", "places", "plain")}
 
 
 def _script(content: Any) -> str:
@@ -185,6 +193,7 @@ def _scenes(result: Result, folder: Path, above: Mapping[str, FromAbove]) -> Ite
                     record,
                     above.get(record.unit.slug) or views.above(record, result.up[scene]),
                     overviews.get(record.unit.model),
+                    result.georeference.get(scene),
                     share,
                 )
                 for record in drawn
@@ -199,7 +208,9 @@ def _scenes(result: Result, folder: Path, above: Mapping[str, FromAbove]) -> Ite
         }
 
 
-def _map(record: Record, above: FromAbove, overview: Overview | None, most: int) -> dict[str, Any]:
+def _map(
+    record: Record, above: FromAbove, overview: Overview | None, georeference: Georeference | None, most: int
+) -> dict[str, Any]:
     """Return the map as the page's script paints it.
 
     It has images of numbers for the script, and an image of the stability for a page without script.
@@ -223,7 +234,7 @@ def _map(record: Record, above: FromAbove, overview: Overview | None, most: int)
     shades = [NOT_ASSESSED] * len(CATEGORIES) if silent else CATEGORY_COLORS
     palette = np.array([(k * 67 % 256, k * 131 % 256, k * 29 % 256) for k in range(table.K)], dtype=np.uint8)
     palette = palette if overview is None else overview.palette
-    cell = step * above.cell
+    cell, located = step * above.cell, Located.of(above, georeference)
     size = rows.shape[1] * cell, rows.shape[0] * cell
     cut = any(all_of_it > 1.02 * own + 2 * cell for all_of_it, own in zip(above.whole, size, strict=True))
     of = f" of {above.whole[0]:.3g} m by {above.whole[1]:.3g} m (without outlying voxels)" if cut else ""
@@ -232,6 +243,9 @@ def _map(record: Record, above: FromAbove, overview: Overview | None, most: int)
         "scene": record.unit.scene,
         "size": [rows.shape[1], rows.shape[0]],
         "text": f"{size[0]:.3g} m by {size[1]:.3g} m{of}, seen {above.view}",
+        "around": map_frame(located),
+        "located": {"matrix": located.matrix.tolist(), "size": located.size, "names": located.names},
+        "places": described_places(record, located, overview, names),
         "cell": cell,
         "names": names,
         "palette": palette.tolist(),

@@ -172,6 +172,8 @@ def _areas(comparison: RunComparison) -> Table:
         " by as much; where nothing changed there are as many. Top contributing frames are those whose observations"
         " turned away from the class, with their share."
     )
+    systems = {scene.crs for scene in comparison.scenes if scene.crs}
+    caption += f" Centres are in {' and '.join(sorted(systems)) if systems else 'the coordinates of the scene'}."
     return Table("comparison_areas", "Areas that got worse", caption, columns, groups, "scope")
 
 
@@ -345,7 +347,7 @@ def _of_run(comparison: RunComparison, against: Against) -> Iterator[str]:
         mine = next(each for each in scene.against if each.other == against.other)
         for what in ("agreement", "truth"):
             if areas := [area for area in mine.areas if area.what == what]:
-                yield f"{against.other} in {scene.scene}: {_of_areas(areas)}."
+                yield f"{against.other} in {scene.scene}: {_of_areas(areas, scene.crs)}."
 
 
 def _stability(comparison: RunComparison, against: Against) -> str:
@@ -394,17 +396,18 @@ def _changes(rows: Sequence[Contrast], known: Mapping[str, Quantity]) -> str:
     return "; ".join(f"{change} in {', '.join(names)}" for change, names in listed.items() if names)
 
 
-def _of_areas(areas: Sequence[Area]) -> str:
+def _of_areas(areas: Sequence[Area], crs: str) -> str:
     first = areas[0]
     lost = "whose frames agree less" if first.what == "agreement" else "that are wrong now"
     count = f"{MOST} or more areas" if len(areas) == MOST else f"{len(areas)} area{'s' if len(areas) > 1 else ''}"
     alike = f"{first.improved_alike or 'none'} improved by as much as the largest"
     confused_with = f", confused with {first.confused_with}" if first.confused_with else ""
     x, y, z = first.centre
+    system = f" of {crs}" if crs else ""
     frames = f"; the top contributing frames are {top_frames(first.frames)}" if first.frames else ""
     return (
         f"{count} {lost} ({alike}); the largest is {first.voxels:,} voxels of"
-        f" {first.of}{confused_with}, at ({x:.2f}, {y:.2f}, {z:.2f}) m{frames}"
+        f" {first.of}{confused_with}, at ({x:.2f}, {y:.2f}, {z:.2f}) m{system}{frames}"
     )
 
 

@@ -65,12 +65,13 @@ def _overviews(result: Result, with_voxels: list[Record], views: Views, folder: 
         for record in records:
             path = folder / f"{slug(record.unit.scene, model)}.npz"
             if record.unit.scene in result.up and path.exists():
-                yield _overview(record, result.up[record.unit.scene], views, path)
+                yield _overview(record, result, views, path)
                 break
 
 
-def _overview(record: Record, up: tuple[float, float, float], views: Views, path: Path) -> Figure:
+def _overview(record: Record, result: Result, views: Views, path: Path) -> Figure:
     scene, model = record.unit.scene, record.unit.model
+    up, georeference = result.up[scene], result.georeference.get(scene)
     return Figure(
         slug("overview", scene, model),
         f"Overview: {scene}, {model}",
@@ -79,7 +80,7 @@ def _overview(record: Record, up: tuple[float, float, float], views: Views, path
         " the colours of the prediction.",
         f"A camera image of {scene}, the classes that {model} predicts for it, and the fused map from above in the"
         " same colours.",
-        lambda: draw_overview(views.above(record, up), Overview.load(path)),
+        lambda: draw_overview(views.above(record, up), Overview.load(path), georeference),
         unit=record.unit.slug,
     )
 
@@ -134,13 +135,14 @@ def _maps(result: Result, with_voxels: list[Record], views: Views) -> Iterator[F
                 f" foremost voxel. (a) shows its stability category, the other panels show {panels}. A grey voxel was"
                 " seen once and has no category. An arrow on a scale marks values beyond its end.",
                 f"Maps of {scene} from above with the stability category, {panels} of {model}'s voxels.",
-                partial(_draw_map, record, result.up[scene], views),
+                partial(_draw_map, record, result, views),
                 unit=record.unit.slug,
             )
 
 
-def _draw_map(record: Record, up: tuple[float, float, float], views: Views) -> Canvas:
-    return draw_stability(views.above(record, up))
+def _draw_map(record: Record, result: Result, views: Views) -> Canvas:
+    scene = record.unit.scene
+    return draw_stability(views.above(record, result.up[scene]), result.georeference.get(scene))
 
 
 def _sweeps(result: Result) -> Iterator[Figure]:

@@ -15,14 +15,16 @@ import numpy.typing as npt
 
 from semstab.core.types import Float64, Int64, Mask, UInt8
 from semstab.data.digests import require_unchanged
+from semstab.data.georeference import Georeference
 from semstab.data.measures import dominant, measures
 from semstab.data.records import Record, Tables
-from semstab.data.topdown import EMPTY, OUTLIERS, level_axes, top_down
+from semstab.data.topdown import EMPTY, top_down
 from semstab.data.voxels import VoxelTable
 from semstab.datasets.formats.disk import decode_array, read_bytes
 from semstab.errors import DataError, summarize_error
 from semstab.metrics import CATEGORIES, CATEGORY_COLORS, categories
 from semstab.report.figures.distributions import Histograms, histograms, together
+from semstab.report.figures.located import Located, metres
 from semstab.report.figures.style import COLORS, COLUMN, FAINT, INK, LETTERS, PAGE, canvas, mark_panel
 from semstab.report.figures.topdown import MOST, FromAbove, best_view, topmost
 
@@ -46,9 +48,9 @@ WIDE = 1.4
 """The panels of a map that is this many times as wide as high, or more, are drawn one below the other."""
 
 
-def draw_stability(above: FromAbove) -> Figure:
-    """Return the stability category of the topmost voxels and the measures that have a panel, with a scale bar."""
-    table, rows = above.table, above.rows
+def draw_stability(above: FromAbove, georeference: Georeference | None = None) -> Figure:
+    """Return the stability category of the topmost voxels and the measures that have a panel, with coordinates."""
+    table, rows, located = above.table, above.rows, Located.of(above, georeference)
     shown = [measure for measure in measures() if measure.panel]
     figure, (kind, *panels) = map_panels(rows, 1 + len(shown))
     _draw_categories(figure, kind, rows, categories(table))
@@ -60,7 +62,7 @@ def draw_stability(above: FromAbove) -> Figure:
     for axes, letter, title in zip((kind, *panels), LETTERS, titles, strict=False):
         mark_panel(axes, letter, title)
         framed(axes)
-        scale_bar(axes, rows.shape[1], above.cell)
+        locate(axes, located, rows.shape, named=axes is kind)
     return figure
 
 
@@ -82,6 +84,27 @@ class LoneFrames:
 
 
 @dataclass(frozen=True, eq=False)
+class PlacePictures:
+    """Places where frames disagree, as small images of the frames that see them.
+
+    Attributes:
+        of: (n,) number of the place that an image shows.
+        centre: (n, 3) its centre in the scene, metres.
+        frame: (n,) index of the frame.
+        labels: (n, h, w) rows 0..K-1, and above where a pixel has none.
+        ring: (n, 3) centre x, y and radius of a circle around the place, shares of the image.
+        color: (n, h, w, 3); None where the dataset has no images.
+    """
+
+    of: Int64
+    centre: Float64
+    frame: Int64
+    labels: npt.NDArray[np.integer[Any]]
+    ring: Float64
+    color: Image | None
+
+
+@dataclass(frozen=True, eq=False)
 class Overview:
     """A frame as the camera and the model saw it.
 
@@ -91,6 +114,7 @@ class Overview:
         color: (H, W, 3) the image; None where the dataset has none.
         palette: (K, 3) RGB of the classes.
         lone: Frames that stand out; None where none does.
+        places: Places where frames disagree; None where there are no pictures of any.
     """
 
     frame: int
@@ -98,6 +122,7 @@ class Overview:
     color: Image | None
     palette: Image
     lone: LoneFrames | None = None
+    places: PlacePictures | None = None
 
     @classmethod
     def load(cls, path: Path) -> Overview:
@@ -113,9 +138,12 @@ class Overview:
                 arrays = {name: decode_array(path, data, name[:-4]) for name in archive.namelist()}
             content = {name.removesuffix(".npy"): value for name, value in arrays.items()}
             lone: list[Any] = [content.get(f"lone_{name}") for name in ("frames", "labels", "alone", "color")]
+            names = ("of", "centre", "frame", "labels", "ring", "color")
+            places: list[Any] = [content.get(f"place_{name}") for name in names]
             return cls(
                 int(content["frame"]), content["labels"], content.get("color"), content["palette"],
                 None if lone[0] is None else LoneFrames(*lone),
+                None if places[0] is None else PlacePictures(*places),
             )  # fmt: skip
         except (ValueError, TypeError, KeyError, RuntimeError, zipfile.BadZipFile) as error:
             raise DataError(
@@ -123,7 +151,7 @@ class Overview:
             ) from error
 
 
-def draw_overview(above: FromAbove, overview: Overview) -> Figure:
+def draw_overview(above: FromAbove, overview: Overview, georeference: Georeference | None = None) -> Figure:
     """Return image, prediction and the fused map from above, in one palette."""
     table, rows = above.table, above.rows
     palette: Colors = [(int(r), int(g), int(b)) for r, g, b in overview.palette]
@@ -142,7 +170,7 @@ def draw_overview(above: FromAbove, overview: Overview) -> Figure:
     mark_panel(axes[-1], "abc"[len(images)], f"fused, {above.view}")
     for panel in axes:
         framed(panel)
-    scale_bar(axes[-1], rows.shape[1], above.cell)
+    locate(axes[-1], Located.of(above, georeference), rows.shape)
     names = table.classes or tuple(str(k) for k in range(table.K))
     shown = sorted({int(k) for k in np.unique(label)} | {int(k) for k in np.unique(overview.labels) if k < table.K})
     entries = [(names[k], tuple(channel / 255 for channel in palette[k])) for k in shown]
@@ -244,16 +272,63 @@ def scale_length(width: float) -> float:
     return max(step * power for step in (1, 2, 5) if step * power <= width / 4)
 
 
-def scale_bar(axes: Axes, cells: int, cell: float) -> None:
-    """Draw a bar of round length in the lower left corner."""
+def scale_text(length: float) -> str:
+    """Return the length of a scale bar in words."""
+    return f"{length:g} m" if length >= 0.1 else f"{length * 100:g} cm"
+
+
+def locate(axes: Axes, located: Located, cells: tuple[int, ...], *, named: bool = True) -> None:
+    """Draw a bar of round length, an arrow to grid north where it is known, and coordinates along two edges.
+
+    Args:
+        axes: The panel that shows the map.
+        located: Where the map lies.
+        cells: Its height and width in cells.
+        named: Whether the coordinates have their numbers; else they have ticks alone, as those of the panel beside it.
+    """
     from matplotlib.patheffects import withStroke
 
-    length = scale_length(cells * cell)
     halo = [withStroke(linewidth=2.5, foreground="white")]
-    end = 0.03 + length / (cells * cell)
-    axes.plot([0.03, end], [0.05, 0.05], transform=axes.transAxes, color=INK, linewidth=1.8, path_effects=halo)
-    text = f"{length:g} m" if length >= 0.1 else f"{length * 100:g} cm"
-    axes.text(0.03, 0.08, text, transform=axes.transAxes, fontsize=6.5, va="bottom", path_effects=halo)
+    length = scale_length(located.size[0])
+    end = 0.03 + length / located.size[0]
+    axes.plot(
+        [0.03, end],
+        [0.05, 0.05],
+        transform=axes.transAxes,
+        color=INK,
+        linewidth=1.8,
+        path_effects=halo,
+        solid_capstyle="butt",
+    )
+    axes.text(
+        0.03, 0.08, scale_text(length), transform=axes.transAxes, fontsize=6.5, va="bottom", path_effects=halo
+    )  # fmt: skip
+    H, W = cells[:2]
+    lower, left = located.edges
+    axes.set_xticks([share * W - 0.5 for share, _ in lower.ticks], [metres(value) for _, value in lower.ticks])
+    axes.set_yticks([(1 - share) * H - 0.5 for share, _ in left.ticks], [metres(value) for _, value in left.ticks])
+    axes.tick_params(labelsize=5, length=2, width=0.4, color=FAINT, pad=1.5, labelbottom=named, labelleft=named)
+    axes.tick_params(axis="y", labelrotation=90)
+    for label in axes.get_yticklabels():
+        label.set_verticalalignment("center")
+    if named:
+        axes.set_xlabel(f"{lower.name}, m ({located.system})" if lower.name else "", fontsize=5, labelpad=1)
+        axes.set_ylabel(f"{left.name}, m" if left.name else "", fontsize=5, labelpad=1)
+    if located.north is not None:
+        _north(axes, located.north)
+
+
+def _north(axes: Axes, degrees: float) -> None:
+    """Draw an arrow to north in the upper right corner, so many degrees clockwise from the top."""
+    from matplotlib.patheffects import withStroke
+
+    along = np.array([math.sin(math.radians(degrees)), math.cos(math.radians(degrees))])
+    halo = [withStroke(linewidth=2.5, foreground="white")]
+    axes.annotate(
+        "N", xy=(0.94, 0.94), xycoords="axes fraction", xytext=(-14 * along).tolist(), textcoords="offset points",
+        fontsize=6.5, color=INK, ha="center", va="center", path_effects=halo,
+        arrowprops={"arrowstyle": "-|>,head_width=0.2,head_length=0.4", "color": INK, "linewidth": 0.9, "shrinkA": 0},
+    )  # fmt: skip
 
 
 def _handles(entries: Sequence[tuple[str, Any]]) -> list[Any]:
@@ -308,17 +383,21 @@ class Panel:
     centres: Sequence[tuple[float, float, float]]
 
 
-def draw_changes(table: VoxelTable, up: npt.ArrayLike, panels: Sequence[Panel]) -> Figure:
+def draw_changes(
+    table: VoxelTable, up: npt.ArrayLike, panels: Sequence[Panel], georeference: Georeference | None = None
+) -> Figure:
     """Return the largest change in each column of voxels, worse in orange, better in blue."""
     axis, view = best_view(table, up)[1:]
     seen = [top_down(table.centers, table.voxel_size, axis, np.abs(panel.values)) for panel in panels]
-    figure, axes = map_panels(seen[0][0], len(panels))
-    for own, letter, panel, (rows, cell) in zip(axes, LETTERS, panels, seen, strict=False):
+    figure, axes = map_panels(seen[0].rows, len(panels))
+    for own, letter, panel, (rows, cell, corner) in zip(axes, LETTERS, panels, seen, strict=False):
+        size = rows.shape[1] * cell, rows.shape[0] * cell
+        located = Located.seen_along(axis, corner, size, table.centers, georeference)
         _draw(figure, own, panel, rows)
         mark_panel(own, letter, f"{panel.title}, {view.partition(',')[0]}")
         framed(own)
-        scale_bar(own, rows.shape[1], cell)
-        _number(own, panel, table, axis, rows.shape[0], cell)
+        locate(own, located, rows.shape, named=own is axes[0])
+        _number(own, panel, located, rows.shape)
     return figure
 
 
@@ -337,16 +416,13 @@ def _draw(figure: Figure, axes: Axes, panel: Panel, rows: Int64) -> None:
     last.set_horizontalalignment("right")
 
 
-def _number(axes: Axes, panel: Panel, table: VoxelTable, axis: Float64, height: int, cell: float) -> None:
-    """Draw the numbers of the areas at their centres."""
+def _number(axes: Axes, panel: Panel, located: Located, cells: tuple[int, ...]) -> None:
+    """Draw the numbers of the areas at their centres, in a picture of so many rows and columns of cells."""
     from matplotlib.patheffects import withStroke
 
-    right, ahead, _ = level_axes(axis)
-    plane = np.stack([table.centers @ ahead, table.centers @ right], axis=1)
-    first = np.floor(np.quantile(plane, OUTLIERS, axis=0) / cell)
     for number, centre in zip(panel.numbers, panel.centres, strict=True):
-        row, column = np.floor(np.array([ahead @ np.array(centre), right @ np.array(centre)]) / cell) - first
+        x, y = located.share(centre)
         axes.annotate(
-            str(number), (column, height - 1 - row), fontsize=6.5, color=INK, ha="center", va="center",
+            str(number), (x * cells[1] - 0.5, y * cells[0] - 0.5), fontsize=6.5, color=INK, ha="center", va="center",
             path_effects=[withStroke(linewidth=2, foreground="white")], annotation_clip=True,
         )  # fmt: skip

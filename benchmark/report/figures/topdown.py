@@ -56,7 +56,9 @@ def best_view(table: VoxelTable, up: npt.ArrayLike) -> tuple[Mask, Float64, str]
     column, count = _numbered(_columns(centers, up_axis, table.voxel_size))
     areas = [count, *(_numbered(_columns(centers, axis, table.voxel_size))[1] for axis in (right, ahead))]
     if max(areas[1:]) > SLENDER * areas[0]:
-        return every, -right if areas[1] > areas[2] else -ahead, "from the side"
+        side = right if areas[1] > areas[2] else ahead
+        upright = max((-side, side), key=lambda axis: float(level_axes(axis)[1] @ up_axis))
+        return every, upright, "from the side"
     heights = centers @ up_axis
     low, high = np.quantile(heights, [OUTLIERS, 1 - OUTLIERS])
     cut = high - LID * (high - low)
@@ -99,6 +101,8 @@ class FromAbove:
         cell: The edge of a cell in metres.
         view: The name of the view.
         whole: Width and height of all voxels that the view has, metres: the outermost ones are not in the picture.
+        axis: Unit vector towards the viewer, in the scene's axes.
+        corner: Metres to the right and ahead of the origin at which the lower left corner of the picture lies.
     """
 
     table: VoxelTable
@@ -107,16 +111,19 @@ class FromAbove:
     cell: float
     view: str = "from above"
     whole: tuple[float, float] = (0.0, 0.0)
+    axis: tuple[float, float, float] = (0.0, 0.0, 1.0)
+    corner: tuple[float, float] = (0.0, 0.0)
 
     @classmethod
     def of(cls, table: VoxelTable, up: npt.ArrayLike) -> FromAbove:
         """Return the voxels of a map that are seen; see `best_view` and `top_down`."""
         selected, axis, view = best_view(table, up)
         centers = table.centers[selected]
-        rows, cell = top_down(centers, table.voxel_size, axis)
+        rows, cell, corner = top_down(centers, table.voxel_size, axis)
         width, height = (float(np.ptp(centers @ along)) + table.voxel_size for along in level_axes(axis)[:2])
         rows = np.where(rows == EMPTY, EMPTY, np.flatnonzero(selected)[rows])
         shown = np.zeros(len(table), dtype=np.bool_)
         shown[rows[rows != EMPTY]] = True
         renumbered: npt.NDArray[Any] = np.where(rows == EMPTY, EMPTY, (np.cumsum(shown) - 1)[rows])
-        return cls(rows_of(table, shown), shown, renumbered, cell, view, (width, height))
+        x, y, z = axis.tolist()
+        return cls(rows_of(table, shown), shown, renumbered, cell, view, (width, height), (x, y, z), corner)
