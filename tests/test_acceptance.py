@@ -128,6 +128,3 @@ def test_export_and_relabel_take_the_file(tmp_path):
     cli("relabel", tmp_path / "run", "--out", tmp_path / "wall", "--thresholds", file)
     assert re.search(r'"op"|"belief"|"margin"', (tmp_path / "wall/labels/a-fused/relabelled.json").read_text())
     assert vss(table).max() <= 1
-    done = CliRunner().invoke(app, ["commit", str(tmp_path / "run") + ":b", "--out", str(file)])
-    assert "commit is now called calibrate" in done.stderr  # the name of version 0.3
-    assert done.exit_code == 2

@@ -347,13 +347,6 @@ def test_clouds_that_cannot_be_classified(fused, points):
     assert not list(fused.glob("never*"))
 
 
-def test_an_option_by_its_old_name_is_taken_with_a_warning(fused, points):
-    cloud = ply_cloud(fused / "cloud.ply", points)
-    done = bench("export", fused / "run", "--to", "old.ply", "-m", "a", "--onto", cloud, cwd=fused)
-    assert "--onto is now called --classify" in done.stderr
-    assert f"{len(points)} points" in done.stdout
-
-
 def test_the_command(fused):
     done = bench("export", fused / "run", "--to", "a.ply", "--to", "a.las", "-m", "a", "--class", "door", cwd=fused)
     assert "a.ply: " in done.stdout

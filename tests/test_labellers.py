@@ -16,7 +16,7 @@ NAMES = [f"trick-{name}" for name in LABELLERS]
 @pytest.fixture(scope="module")
 def result(tmp_path_factory):
     """The labellers over a small city, without ground truth."""
-    return labelled(tmp_path_factory.mktemp("labellers"), ["sim-steady", *NAMES])
+    return labelled(tmp_path_factory.mktemp("labellers"), ["sim-steady", *NAMES], truth=False)
 
 
 def labelled(folder, models, **settings):

@@ -107,17 +107,17 @@ def test_the_report_draws_it_by_op_and_cards_and_rows_of_models_have_it(run, stu
     result, _ = run
     record = result.select()[0]
     assert [head for head, _ in columns()[5:-1]] == ["VSS", "SBD", "Rival"]
-    assert ("Rival", "parts") in columns()
+    assert ("Rival", "OP>=3") in columns()
     assert len(row_of(record)) == len(columns())
     titles = [chart["title"] for chart in page._by_op(result)]
     assert titles == [f"{title} by observation persistence" for title in ("VSS", "SBD", "Rival")]
     numbers = {name: note for name, _, note in page._numbers([record], [record.statistics], record.statistics)}
     few = "fewer than 1,000 voxels with OP ≥ 3"
-    assert [numbers[name] for name in ("VSS", "SBD", "Rival")] == [few] * 3
+    assert [numbers[f"{name} (OP>=3)"] for name in ("VSS", "SBD", "Rival")] == [few] * 3
     text = io.StringIO()
     print_answer(study[0], Console(file=text, width=120))
     assert "VSS, SBD, Rival -: fewer than 1,000 voxels were seen 3 times or more" in text.getvalue()
-    assert [chart["title"] for chart in page._sweeps(study[0])] == ["alpha by voxel size", "VSS, OP ≥ 3 by voxel size"]
+    assert [chart["title"] for chart in page._sweeps(study[0])] == ["alpha by voxel size", "VSS (OP>=3) by voxel size"]
 
 
 def test_tables_and_the_comparison_have_it(study) -> None:

@@ -197,7 +197,7 @@ def test_the_page_is_the_same_again(walls):
 def test_a_study_of_sweeps_has_their_charts_and_one_in_which_everything_failed_has_a_report(tmp_path):
     result = study(*(record(voxels((5, 4, SURE)), "frame_count", n) for n in (5, 9)), record(voxels((5, 2, SURE))))
     page = page_of(result, tmp_path)
-    assert "VSS, OP ≥ 3 by temporal sampling, frames" in {attributes["aria-label"] for attributes in page.all("svg")}
+    assert "VSS (OP>=3) by temporal sampling, frames" in {attributes["aria-label"] for attributes in page.all("svg")}
     failure = Failure(UnitName("s", "m", "numpy"), Variation(BASE), "no depth")
     page = page_of(study(failures=(failure,)), tmp_path)
     assert "there are no results yet" in page.text

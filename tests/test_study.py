@@ -7,6 +7,7 @@ import dataclasses
 import itertools
 import json
 import shutil
+from collections import Counter
 from pathlib import Path
 
 import cv2
@@ -126,8 +127,12 @@ def test_frames_are_decoded_once_for_all_units_of_a_model(root, tmp_path, decode
     run_study(configure(root), tmp_path / "out", report=False)
     predicted = [pair for pair in decoded if pair[1] != "gt"]
     # a's ten frames for the sweep of frame_count, b's five
-    assert sorted(predicted) == sorted([(i, "a") for i in range(10)] + [(i, "b") for i in (0, 2, 4, 7, 9)])
-    assert len(decoded) - len(predicted) == 2 * 5  # the truth of the base frames, for video consistency
+    once = Counter([(i, "a") for i in range(10)] + [(i, "b") for i in (0, 2, 4, 7, 9)])
+    assert set(predicted) == set(once)
+    again = Counter(predicted) - once
+    assert max(again.values(), default=0) == 1  # frames that see the worst places, for their pictures in the report
+    assert sum(again.values()) <= 2 * 4
+    assert len(decoded) - len(predicted) == 10 + 5  # the truth of the same frames, once
 
 
 def test_maps_that_exceed_the_memory_bound_are_put_off_and_the_numbers_are_the_same(
@@ -326,7 +331,9 @@ def test_statistics_come_with_every_unit_and_all_of_them_where_they_are_wanted(r
     one, other = before[0].statistics.agreement, base.statistics.agreement
     assert (one.kappa, one.within, one.classes) == (other.kappa, other.within, other.classes)
     assert one.psa.value == pytest.approx(other.psa.value)  # whose interval needs the log
-    assert before[0].statistics.drift.flips is before[0].statistics.correctness is None
+    assert before[0].statistics.drift.flips is None
+    right = before[0].statistics.correctness.miou.value, base.statistics.correctness.miou.value
+    assert right[0] == pytest.approx(right[1])  # whose interval needs the log
     again = run_study(config, tmp_path / "out", report=False).records
     assert to_json([record.statistics for record in again]) == to_json([record.statistics for record in before])
 

@@ -64,7 +64,8 @@ def test_the_walls_tables_are_as_in_the_golden_file(tables_of_walls, suffix):
 def test_a_study_of_everything_has_every_table(tables_of_walls):
     assert [table.name for table in tables_of_walls] == [
         "overview", "verdicts", "flicker", "flicker_by_scene", "scenes", "persistence", "classes", "temporal_agreement",
-        "correlogram", "class_agreement", "drift", "frames", "uncertainty", "cross_model", "sensitivity_voxel_size",
+        "correlogram", "class_agreement", "drift", "frames", "uncertainty", "ceiling", "correctness", "quadrants",
+        "cross_model", "sensitivity_voxel_size",
         "sensitivity_agreement_voxel_size", "sensitivity_depth_noise", "sensitivity_agreement_depth_noise",
         "sensitivity_frame_count", "sensitivity_agreement_frame_count", "voxel_sizes", "fusion", "agreement",
     ]  # fmt: skip

@@ -265,7 +265,8 @@ MARGIN = Measure(key="margin", title="Margin", short="M", better="higher", of=ma
 
 RESERVED = frozenset((
     "K", "accuracy", "advice", "alpha", "backend", "categories", "checked", "classes",
-    "compensated_flicker_percent", "confused_with", "coverage", "ece", "entropy_between", "entropy_within",
+    "compensated_flicker_percent", "confused_with", "coverage", "ece", "entropy_between", "entropy_op2",
+    "entropy_within",
     "evidence", "files", "flicker_percent", "frames", "frames_empty", "frames_left_out", "fuse_ms_per_frame",
     "image_space", "input", "iou", "key", "label", "left_out", "mean_op", "means", "miou", "model", "name", "notes",
     "observation_accuracy", "observations", "op", "points", "precision", "psa", "quality", "recurrent", "reduced",

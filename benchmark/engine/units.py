@@ -108,7 +108,7 @@ class Unit:
     @property
     def compares_truth(self) -> bool:
         """Return whether the ground truth of the scene is fused, if there is one, and the labels compared with it."""
-        return self.config.truth and (self.image_space or self.config.statistics)
+        return self.config.truth and self.assessed
 
     @property
     def regions(self) -> bool:

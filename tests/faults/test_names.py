@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import csv
 import shutil
-from xml.etree import ElementTree
 
 import pyarrow.parquet as pq
 import pytest
@@ -22,7 +21,6 @@ from semstab.data.results import UnitName, slug
 from semstab.engine.folder import require_file_names
 from semstab.errors import ConfigError
 from semstab.exports import export
-from semstab.exports.annotation_formats import _node, _xml
 
 HORRORS = (
     "a b", "a-b", "x", "x__y", "-rf", "[/bold]", "$x^{", "<b>&amp;", "ä" * 100, "new\nline", "\u202e",
@@ -97,9 +95,3 @@ def test_a_spreadsheet_sees_no_formula_in_an_exported_table(tmp_path) -> None:
     rows = list(csv.DictReader((tmp_path / "m.csv").read_text(encoding="utf-8").splitlines()))
     assert {row["class"] for row in rows} <= {"'=cmd|' /C calc'!A0", "'+door", "'@window"}
     assert set(pq.read_table(tmp_path / "m.parquet")["class"].to_pylist()) <= {"=cmd|' /C calc'!A0", "+door", "@window"}
-
-
-def test_xml_is_valid_whatever_a_scene_is_called() -> None:
-    text = _xml(_node("task", _node("name", "a\x1b[31m\x00b\nc"), source="\ufffe\x07"))
-    (name,) = ElementTree.fromstring(text)
-    assert name.text == "a\ufffd[31m\ufffdb\ufffdc"
