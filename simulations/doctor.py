@@ -18,9 +18,8 @@ from dataclasses import dataclass, replace
 import cv2
 import numpy as np
 
-from semstab.check.labels import check_labels
 from semstab.check.reprojection import clusters
-from semstab.check.scene_check import CLUSTERS, POINTS, Inspection
+from semstab.check.scene_check import CLUSTERS, POINTS, Inspection, label_findings
 from semstab.data.frames import Frame, Intrinsics
 from semstab.data.labels import LabelSpace
 from semstab.datasets import Scene
@@ -255,8 +254,8 @@ def said(frames: Frames) -> Iterator[str]:
     if verdict.state == "unsound":
         yield verdict.text
         return
-    found = check_labels(made, indices, "net", SPACE, 6)
-    yield from (*found.wrong, *found.remarks)
+    for found in label_findings(made, indices, ["net"], thorough=True):
+        yield from (*found.wrong, *found.remarks)
 
 
 def main() -> None:

@@ -12,7 +12,7 @@ from semstab.check.scene_check import (
     refuse_unsound,
     require_sound,
 )
-from semstab.check.voxel_size import advise, with_voxel_size
+from semstab.check.voxel_size import advise, faces_in_surface, with_voxel_size
 
 __all__ = [
     "SCHEMA",
@@ -21,6 +21,7 @@ __all__ = [
     "advise",
     "check",
     "check_scene",
+    "faces_in_surface",
     "quick_check",
     "quick_sample",
     "refuse_unsound",

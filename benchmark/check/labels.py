@@ -7,6 +7,7 @@ the agreement of labels that are reprojected from frame to frame, pair by pair.
 
 from __future__ import annotations
 
+import dataclasses
 import itertools
 import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -22,7 +23,7 @@ from semstab.check.geometry import shifts_and_turns
 from semstab.check.registration import grey_levels
 from semstab.check.reprojection import Pair, Sample, View
 from semstab.core.arrays import evenly
-from semstab.core.types import Float64, Mask
+from semstab.core.types import Float64, Int64, Mask
 from semstab.data.labels import LabelSpace
 from semstab.datasets import Scene
 from semstab.errors import DataError
@@ -53,6 +54,16 @@ WON = 0.8
 
 LEAST_FRAMES = 4
 LEAST_POINTS = 50
+
+FIRST_RUNS = 2
+"""Runs of frames that are read first."""
+
+MOST_ORDERED, ORDER_COLUMNS, ORDER_PIXELS = 200, 64, 200 * 640 * 480
+"""Frames whose maps are looked for among those of all others, their edges on a grid of so many columns; the pixels of
+all of them."""
+
+SAME_ORDER = 0.8
+"""Share of the maps that an order explains."""
 
 TELLING = 0.9
 """An alternative whose edges fit this part as well as the given ones cannot be told from them."""
@@ -118,6 +129,8 @@ def alternatives(width: int, height: int) -> tuple[Alternative, ...]:
     mistakes = [
         Alternative("are one frame late", "give frame k the file of frame k + 1", step=1),
         Alternative("are one frame early", "give frame k the file of frame k - 1", step=-1),
+        Alternative("are two frames late", "give frame k the file of frame k + 2", step=2),
+        Alternative("are two frames early", "give frame k the file of frame k - 2", step=-2),
         Alternative("are mirrored left to right", "mirror the files", change=lambda L, _: L[:, ::-1]),
         Alternative("are upside down", "mirror the files", change=lambda L, _: L[::-1]),
         Alternative("are turned by 180 degrees", "turn the files", change=lambda L, _: L[::-1, ::-1]),
@@ -322,10 +335,13 @@ def _fit(seen: Seen, labels: Ids) -> float:
 
 
 def _agreements(
-    views: Mapping[int, View], given: Mapping[int, Ids], other: Mapping[int, Ids]
+    views: Mapping[int, View],
+    given: Mapping[int, Ids],
+    other: Mapping[int, Ids],
+    among: Sequence[Pair] | None = None,
 ) -> list[tuple[float, float]]:
     """Return for each pair of frames the share of common points whose labels agree, as given and otherwise."""
-    pairs: list[Pair] = [(a, b) for a, b in itertools.combinations(views, 2)]
+    pairs: list[Pair] = [*itertools.combinations(views, 2)] if among is None else [*among]
     sample, one = Sample(dict(views), pairs, Convention()), np.array([1.0])
     rows = []
     for a, b in pairs:
@@ -344,31 +360,214 @@ def _agreement(first: Ids, second: Ids, ignore: int) -> float:
     return float(np.mean(first[told] == second[told])) if told.sum() >= LEAST_POINTS else math.nan
 
 
+# --- from a frame on -------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class Turn:
+    """A frame from which on maps are otherwise: of their fits as given and otherwise the better one changes there."""
+
+    at: int
+    before: Contrast
+    after: Contrast
+
+    @classmethod
+    def of(cls, given: Sequence[float], other: Sequence[float]) -> Turn:
+        """Find the place at which the sum of the better fits is largest."""
+        gain = np.nan_to_num(np.subtract(other, given))
+        sums = [gain[k:].sum() - gain[:k].sum() for k in range(len(gain), -1, -1)]
+        at = len(gain) - int(np.argmax(sums))  # the last one of several
+        return cls(at, Contrast.of(other[:at], given[:at]), Contrast.of(given[at:], other[at:]))
+
+    @property
+    def is_one(self) -> bool:
+        """Return whether maps fit clearly better as given before it, and otherwise after it."""
+        return all(
+            side.is_clear and side.other >= max(LEAST_FIT, BETTER * side.given) for side in (self.before, self.after)
+        )
+
+
+def from_a_frame_on(scene: Scene, model: str, runs: Sequence[Sequence[Seen]]) -> str | None:
+    """Return the finding where maps fit as they are up to a frame, and otherwise from it on."""
+    H, W = runs[0][0].labels.shape
+    for alternative in alternatives(W, H):
+        rows = [row for run in runs for row in _fits_of(alternative, run)]
+        if len(rows) < 2 * LEAST_FRAMES:
+            continue
+        turn = Turn.of(*zip(*(row[1:] for row in rows), strict=True))  # type: ignore[arg-type]
+        if turn.is_one:
+            last, first = rows[turn.at - 1][0], rows[turn.at][0]
+            index = _located(scene, model, alternative, last, first)
+            before, after = turn.before, turn.after
+            return (
+                f"{alternative.says} from frame {scene.frame_name(index)} on (their edges correlate {after.other:.2f}"
+                f" with those of depth and colour there, {after.given:.2f} now; before it {before.other:.2f} as they"
+                f" are): {alternative.mend}"
+            )
+    return None
+
+
+def _fits_of(alternative: Alternative, run: Sequence[Seen]) -> list[tuple[int, float, float]]:
+    """Return for each frame of a run its index, and the fit of its map as given and otherwise."""
+    rows = []
+    for k, seen in enumerate(run):
+        if not 0 <= k + alternative.step < len(run):
+            continue
+        other = alternative.change(run[k + alternative.step].labels, seen.view.ignore_id)
+        if other.shape == seen.labels.shape:
+            rows.append((seen.view.index, _fit(seen, seen.labels), _fit(seen, other)))
+    return rows
+
+
+def _located(scene: Scene, model: str, alternative: Alternative, last: int, first: int) -> int:
+    """Return the index of the frame from which on maps are otherwise, between two that are known."""
+    while first - last > 2 * RUN:
+        middle = (last + first) // 2
+        run = [*_readable(scene, range(middle - RUN // 2, middle + RUN // 2 + 1), model)]
+        gains = [other - given for _, given, other in _fits_of(alternative, run)]
+        if not np.isfinite(gains).any():
+            return first
+        if float(np.nansum(gains)) > 0:
+            first = middle
+        else:
+            last = middle
+    span = range(max(0, last - RUN), min(len(scene), first + RUN + 1))
+    rows = _fits_of(alternative, [*_readable(scene, span, model)])
+    if not rows:
+        return first
+    at = Turn.of([given for _, given, _ in rows], [other for *_, other in rows]).at
+    return rows[min(at, len(rows) - 1)][0]
+
+
+# --- another order ---------------------------------------------------------------------------------------------------
+
+
+def in_another_order(scene: Scene, indices: Sequence[int], model: str, pixels: int) -> str | None:
+    """Return the finding where the maps are those of these frames, but in another order: reversed, late, shuffled.
+
+    Each frame gets the map whose edges fit its depth and colour best, each map once. That is right where labels then
+    agree clearly better between frames, which the edges do not know.
+    """
+    from scipy.optimize import linear_sum_assignment
+
+    first = next(_readable(scene, indices[:1], model), None)
+    if first is None:
+        return None
+    count = min(MOST_ORDERED, max(RUN, pixels // math.prod(first.view.size)))
+    chosen = [indices[k] for k in evenly(len(indices), count)]
+    frames = [*_readable(scene, chosen, model)]
+    frames = [seen for seen in frames if seen.references and seen.labels.shape == frames[0].labels.shape]
+    if len(frames) < 2 * RUN:
+        return None
+    n = len(frames)
+    own = np.stack([_coarse(seen.references) for seen in frames])
+    maps = np.stack([_coarse((_smooth(label_edges(seen.labels, seen.view.ignore_id)),)) for seen in frames])
+    fits = own @ maps.T
+    order = np.asarray(linear_sum_assignment(-fits)[1])
+    moved = order != np.arange(n)
+    if moved.mean() < 0.5 or fits[np.arange(n), order].mean() < max(LEAST_FIT, BETTER * float(np.diag(fits).mean())):
+        return None
+    views = {k: seen.view for k, seen in enumerate(frames)}
+    near = [(a, b) for a in range(n) for b in range(a + 1, min(n, a + 4))]
+    given = {k: seen.labels for k, seen in enumerate(frames)}
+    other = {k: frames[order[k]].labels for k in range(n)}
+    agreement = Contrast.of(*zip(*_agreements(views, given, other, near), strict=True))
+    if not (agreement.is_clear and 1 - agreement.other <= FEWER * (1 - agreement.given)):
+        return None
+    text = (
+        f"(their edges correlate {fits[np.arange(n), order].mean():.2f} with those of depth and colour so,"
+        f" {np.diag(fits).mean():.2f} now; {agreement.other:.0%} agree between frames, {agreement.given:.0%} now)"
+    )
+    return f"{_order(order, frames, scene)} {text}: give each frame the map of its own image"
+
+
+def _order(order: Int64, frames: Sequence[Seen], scene: Scene) -> str:
+    """Return what the order of the maps is: map `order[k]` is that of frame k."""
+    n, k = len(order), np.arange(len(order))
+    steps, counts = np.unique(order - k, return_counts=True)
+    if np.mean(np.abs(order + k - (n - 1)) <= 1) >= SAME_ORDER:
+        return "are in reversed order: the first frame has the map of the last one"
+    whole = frames[-1].view.index - frames[0].view.index == n - 1
+    if whole and counts.max() >= SAME_ORDER * (n - abs(int(steps[counts.argmax()]))):
+        step = int(steps[counts.argmax()])
+        return f"are {abs(step)} frames {'late' if step > 0 else 'early'}"
+    at = int(np.flatnonzero(order != k)[0])
+    of, to = (scene.frame_name(frames[one].view.index) for one in (int(order[at]), at))
+    return f"are in another order than the frames (the map of frame {of} is that of frame {to}, and so on)"
+
+
+def _coarse(edges: Sequence[Float64]) -> Float64:
+    """Return (cells,) the mean of maps of edges on a coarse grid, without its mean, of length 1."""
+    import cv2
+
+    H, W = edges[0].shape
+    size = (min(W, ORDER_COLUMNS), max(1, round(H * min(W, ORDER_COLUMNS) / W)))
+    mean = np.mean([cv2.resize(each, size, interpolation=cv2.INTER_AREA) for each in edges], axis=0).ravel()
+    mean = mean - mean.mean()
+    coarse: Float64 = mean / max(float(np.linalg.norm(mean)), 1e-12)
+    return coarse
+
+
 # --- findings --------------------------------------------------------------------------------------------------------
 
 
 def check_labels(
-    scene: Scene, indices: Sequence[int], model: str, space: LabelSpace | None, runs: int
+    scene: Scene,
+    indices: Sequence[int],
+    model: str,
+    space: LabelSpace | None,
+    runs: int,
+    pixels: int = ORDER_PIXELS,
 ) -> LabelFindings:
     """Compare the label maps of a model with depth, colour and each other, in `runs` times five frames.
 
-    Frames that cannot be read are passed over.
+    Two of them come first; the others are read where these do not show that the maps are right, and at most so many
+    `pixels` to find maps in another order. Frames that cannot be read are passed over.
     """
+    few = _findings(scene, indices, model, space, min(runs, FIRST_RUNS))
+    whole = few if few.clear else _findings(scene, indices, model, space, runs)
+    if whole.clear or whole.found.wrong or (other := in_another_order(scene, indices, model, pixels)) is None:
+        return whole.found
+    return dataclasses.replace(whole.found, wrong=(f"labels of {model} {other}",), open=None)
+
+
+@dataclass(frozen=True)
+class _Findings:
+    """What some runs show, and whether maps as they are fit clearly better than any other way."""
+
+    found: LabelFindings
+    clear: bool = False
+
+
+def _findings(scene: Scene, indices: Sequence[int], model: str, space: LabelSpace | None, runs: int) -> _Findings:
     read_runs = [[*_readable(scene, run, model)] for run in runs_of(scene, indices, model, runs)]
     read_runs = [run for run in read_runs if len(run) > 1]
     frames = [seen for run in read_runs for seen in run]
     if len(frames) < 2 or any(seen.labels.shape != frames[0].labels.shape for seen in frames):
-        return LabelFindings(model)
+        return _Findings(LabelFindings(model))
     texts = id_remarks(
         [seen.labels for seen in frames], frames[0].view.ignore_id, space, [run[0].whole for run in read_runs]
     )
     remarks = tuple(f"labels of {model} {text}" for text in texts)
     if (same := _identical(read_runs)) is not None:
-        return LabelFindings(model, (f"labels of {model} {same}",), remarks)
+        return _Findings(LabelFindings(model, (f"labels of {model} {same}",), remarks), clear=True)
     comparisons = compare(read_runs)
+    if (turned := from_a_frame_on(scene, model, read_runs)) is not None:
+        return _Findings(LabelFindings(model, (f"labels of {model} {turned}",), remarks))
     better = sorted((each for each in comparisons if each.is_better), key=lambda each: -each.edges.other)
     wrong = tuple(f"labels of {model} {each}" for each in better[:1])
-    return LabelFindings(model, wrong, remarks, None if wrong else _open(comparisons))
+    clear = not better and all(map(_is_right, read_runs))
+    return _Findings(LabelFindings(model, wrong, remarks, None if wrong else _open(comparisons)), clear)
+
+
+def _is_right(run: Sequence[Seen]) -> bool:
+    """Return whether maps of a run fit better as they are than in any other way."""
+    for alternative in alternatives(*run[0].labels.shape[::-1]):
+        rows = _fits_of(alternative, run)
+        fits = Contrast.of([given for _, given, _ in rows], [other for *_, other in rows])
+        if not fits.other < TELLING * fits.given:
+            return False
+    return True
 
 
 def _readable(scene: Scene, run: Sequence[int], model: str) -> Iterator[Seen]:

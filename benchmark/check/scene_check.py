@@ -10,7 +10,8 @@ from typing import Any
 
 import numpy as np
 
-from semstab.check.continuity import Neighbours, with_continuity
+from semstab.check.camera import with_camera
+from semstab.check.continuity import QUICK_PIXELS, Chain, Neighbours, with_continuity
 from semstab.check.conventions import Reading, reading
 from semstab.check.coverage import (
     FUSED_FRAMES,
@@ -25,8 +26,8 @@ from semstab.check.coverage import (
 )
 from semstab.check.geometry import Verdict, assess, shifts_and_turns
 from semstab.check.histogram import Histogram, Tally
-from semstab.check.intrinsics import with_intrinsics
-from semstab.check.labels import LabelFindings, check_labels
+from semstab.check.label_order import remarks_on_maps, wrong_ids
+from semstab.check.labels import ORDER_PIXELS, LabelFindings, check_labels
 from semstab.check.mistakes import with_mistakes
 from semstab.check.no_depth import with_invalid_depth
 from semstab.check.precision import with_precision
@@ -187,10 +188,10 @@ def check_scene(scene: Scene, config: Config, told: Sequence[str] = ()) -> Scene
     )
     sample, how = inspection.sample(config.dataset.options), inspection.reading(config.dataset.options)
     verdict = inspection.verdict(config.dataset.options, thorough=True)
-    findings, others = tuple[LabelFindings, ...](), tuple[str, ...]()
+    findings = tuple[LabelFindings, ...]()
     if verdict.state != "unsound":
-        findings = tuple(label_findings(scene, indices, models, LABEL_RUNS))
-        others = tuple(inspection.misplaced_maps(config.dataset.options, models[1:]))
+        chained = {} if first is None or inspection.chained is None else {first: inspection.chained}
+        findings = tuple(label_findings(scene, indices, models, config.dataset.options, chained, thorough=True))
     checked = SceneCheck(
         scene=scene.name,
         frames=len(scene),
@@ -208,7 +209,6 @@ def check_scene(scene: Scene, config: Config, told: Sequence[str] = ()) -> Scene
         notes=(
             *told,
             *verdict.remarks,
-            *others,
             *(line for each in findings for line in each.remarks),
             *notes(scene, [inspection.views[at] for at in sorted(inspection.views)], inspection.tally.model),
             *begun,
@@ -307,13 +307,61 @@ def quick_sample(
     return verdict, sample
 
 
-def label_findings(scene: Scene, indices: Sequence[int], models: Sequence[str], runs: int) -> Iterator[LabelFindings]:
-    """Yield what label maps show to be wrong with them, for each model that has files of its own; nothing of scans."""
+def label_findings(
+    scene: Scene,
+    indices: Sequence[int],
+    models: Sequence[str],
+    options: Mapping[str, Any] | None = None,
+    known: Mapping[str, tuple[Neighbours, Chain]] | None = None,
+    *,
+    thorough: bool,
+) -> Iterator[LabelFindings]:
+    """Yield what label maps show to be wrong with them, for each model that has files of its own; nothing of scans.
+
+    Args:
+        scene: The scene.
+        indices: Indices of the selected frames.
+        models: Label sources.
+        options: The dataset's, for the convention of the poses.
+        known: Frames in order with their labels, by model, where they were compared already.
+        thorough: Whether as many frames are compared as `check` does.
+    """
     for model in () if scene.of_scans else models:
         space = None
         with contextlib.suppress(DataError):
             space = scene.label_space(model)
-        yield check_labels(scene, indices, model, space, runs)
+        found = check_labels(scene, indices, model, space, LABEL_RUNS, ORDER_PIXELS if thorough else QUICK_PIXELS)
+        if scene.surface is None:
+            with contextlib.suppress(DataError):
+                chained = (known or {}).get(model) or chain_of(scene, indices, model, options or {}, thorough=thorough)
+                found = with_order(found, *chained)
+        yield found
+
+
+def chain_of(
+    scene: Scene, indices: Sequence[int], model: str, options: Mapping[str, Any], *, thorough: bool
+) -> tuple[Neighbours, Chain]:
+    """Return the frames of a scene in order, with the labels of a model.
+
+    Raises:
+        DataError: If the first frame cannot be read.
+    """
+    first = reader(scene, model)(indices[0])
+    how = reading(scene, first, options, None)
+    neighbours = Neighbours(scene, indices, model, how.convention)
+    return neighbours, neighbours.chain(neighbours.spread(how.size, thorough=thorough))
+
+
+def with_order(found: LabelFindings, neighbours: Neighbours, chain: Chain) -> LabelFindings:
+    """Return findings with those of label maps from frame to frame."""
+    wrong = found.wrong
+    if not wrong and (text := wrong_ids(neighbours, chain)) is not None:
+        wrong = (f"labels of {found.model} {text}",)
+    remarks = [f"labels of {found.model} {text}" for text in remarks_on_maps(neighbours, chain)]
+    single = [] if wrong else neighbours.said_of_labels(chain)
+    return dataclasses.replace(
+        found, wrong=wrong, remarks=(*found.remarks, *remarks, *single), open=None if wrong else found.open
+    )
 
 
 def require_sound(scene: Scene, indices: Sequence[int], options: Mapping[str, Any] | None = None) -> Verdict:
@@ -344,6 +392,7 @@ class Inspection:
         groups: Positions in `indices` of frames that are compared with each other.
         points: About how many points are reprojected in all.
         fused: Number of frames, evenly spaced, that are also held in memory for fusion.
+        chained: Frames in order, once a verdict compared them.
         passing_over: Leave out frames that cannot be read, instead of raising what reading them raises.
         with_color: Whether to read also the size of a colour image: intrinsics may be for that.
     """
@@ -364,6 +413,7 @@ class Inspection:
         self.tally = Tally(source or "")
         self.views: dict[int, View] = {}
         self.fused = evenly(len(indices), fused)
+        self.chained: tuple[Neighbours, Chain] | None = None
         self._first: Frame | None = None
         self.farthest: tuple[float, Frame, tuple[int, int]] | None = None
         self._pairs = pairs_within(groups)
@@ -422,19 +472,16 @@ class Inspection:
         if (mistaken := with_mistakes(verdict, sample)) != verdict:
             return mistaken
         timed = with_lateness(verdict, self.scene, sample, how)
-        verdict = with_intrinsics(verdict, sample, how) if timed == verdict else timed
+        verdict = with_camera(verdict, sample, how) if timed == verdict else timed
         verdict = with_precision(verdict, sample)
         if self.scene.made and not thorough:
             return verdict  # rendering its frames takes longer than fusing them
+        if verdict.mend:
+            return verdict
         neighbours = Neighbours(self.scene, self.indices, self.source, how.convention, self.views)
-        return with_continuity(verdict, neighbours, neighbours.spread(how.size, thorough=thorough))
-
-    def misplaced_maps(self, options: Mapping[str, Any], models: Sequence[str]) -> Iterator[str]:
-        """Yield a line on single label maps of other models that do not agree with those of the frames beside them."""
-        how = self.reading(options)
-        for model in models if self.scene.surface is None else ():
-            neighbours = Neighbours(self.scene, self.indices, model, how.convention)
-            yield from neighbours.said_of_labels(neighbours.chain(neighbours.spread(how.size, thorough=True)))
+        chain = neighbours.chain({*neighbours.spread(how.size, thorough=thorough), *neighbours.striking()})
+        self.chained = neighbours, chain
+        return with_continuity(verdict, neighbours, chain)
 
     def depth(self) -> Depth:
         """Return the depth of all frames that were read."""
@@ -458,10 +505,12 @@ def _with_coverage(checked: SceneCheck, inspection: Inspection, sample: Sample, 
     size = config.voxel_size
     if not config.sets_voxel_size and suggestion is not None and suggestion.voxel_size is not None:
         size = suggestion.voxel_size
+    faces = None if noise is None else coverage.faces(size)
     fused = [_persistence(views, coverage, size * factor, stride) for factor in VOXEL_FACTORS]
     return dataclasses.replace(
         checked,
         refused=tuple(filter(None, (inspection.too_far(size),))),
+        notes=checked.notes if faces is None else (*checked.notes, str(faces)),
         overlaps=tuple(overlaps),
         noise=noise,
         fused_frames=len(views),

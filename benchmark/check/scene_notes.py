@@ -10,9 +10,6 @@ from semstab.config import Config
 from semstab.datasets import Scene
 from semstab.predict.dataset import NAME as PREDICTED
 
-LABEL_RUNS = 2
-"""Number of runs of five frames in which label maps are compared with depth, colour and each other."""
-
 
 def scene_notes(scene: Scene, indices: Sequence[int], model: str, config: Config) -> tuple[str, ...]:
     """Return what looks wrong in depth and labels of a model, or its images, but may be right; in the words of `check`.
@@ -28,7 +25,8 @@ def scene_notes(scene: Scene, indices: Sequence[int], model: str, config: Config
     predicted = config.dataset.name == PREDICTED
     inspection = Inspection(scene, indices, None if predicted else model, (), POINTS, fused=REGISTERED_FRAMES)
     views = [inspection.views[at] for at in sorted(inspection.views)]
-    findings = [] if predicted else label_findings(scene, indices, [model], LABEL_RUNS)
+    options = config.dataset.options
+    findings = [] if predicted else label_findings(scene, indices, [model], options, thorough=False)
     return (
         *(line for each in findings for line in (*each.wrong, *each.remarks)),
         *notes(scene, views, model),

@@ -11,7 +11,15 @@ from collections import deque
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
-from semstab.check import Verdict, advise, quick_sample, refuse_unsound, with_invalid_depth, with_voxel_size
+from semstab.check import (
+    Verdict,
+    advise,
+    faces_in_surface,
+    quick_sample,
+    refuse_unsound,
+    with_invalid_depth,
+    with_voxel_size,
+)
 from semstab.check.scene_notes import scene_notes
 from semstab.config import Config
 from semstab.configure import resolve
@@ -181,10 +189,11 @@ class _Execution:
         """Check the geometry and the voxel size of each scene of missing units; those report errors of reading."""
         fused = {(unit.name.scene, unit.name.model): unit.task for unit in reversed(missing) if not unit.regions}
         tasks = {scene: task for (scene, _), task in fused.items()}
-        verdicts: dict[str, Verdict] = {}
+        verdicts, faces = dict[str, Verdict](), dict[str, list[str]]()
         for task in reversed(tasks.values()):
             with contextlib.suppress(DataError):
                 verdicts[task.scene.name], sample = quick_sample(task.scene, task.indices, config.dataset.options)
+                faces[task.scene.name] = faces_in_surface(sample, config)
                 if (advice := advise(sample, config)) is not None:
                     self.units.advice[task.scene.name] = advice
         for scene, verdict in verdicts.items():
@@ -197,5 +206,6 @@ class _Execution:
             if scene in verdicts:
                 with contextlib.suppress(DataError):
                     found = scene_notes(task.scene, task.indices, model, config)
+                    found = (*found, *faces.get(scene, []))
                     left_out = [self._gaps[scene]] if scene in self._gaps else []
                     self.units.notes[scene, model] = (*left_out, *verdicts[scene].remarks, *found)
