@@ -8,8 +8,7 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from semstab import backends, datasets, engine, metrics, models, statistics
     from semstab.api import run, run_study
-    from semstab.comparison.gate import GateConfig, gate
-    from semstab.comparison.writing import compare
+    from semstab.compare_runs import compare
     from semstab.config import Config
     from semstab.configure import load_config, load_study
     from semstab.data.events import Events
@@ -22,6 +21,7 @@ if TYPE_CHECKING:
     from semstab.exports import export
     from semstab.exports.fused_labels import Belief
     from semstab.exports.relabel import relabel
+    from semstab.gating.gate import GateConfig, gate
     from semstab.online import FusedResult, TemporalStability, fuse
     from semstab.report.saved_run import load
     from semstab.statistics.acceptance import AcceptanceThresholds
@@ -69,10 +69,10 @@ __all__ = [
 _HOMES = {
     "AcceptanceThresholds": "statistics.acceptance", "Belief": "exports.fused_labels", "Config": "config",
     "ConfigError": "errors", "DataError": "errors", "Events": "data.events", "Frame": "data.frames",
-    "GateConfig": "comparison.gate", "Intrinsics": "data.frames", "LabelSpace": "data.labels",
+    "GateConfig": "gating.gate", "Intrinsics": "data.frames", "LabelSpace": "data.labels",
     "MissingDependencyError": "errors", "Result": "data.records", "SemstabError": "errors", "VoxelTable": "data.voxels",
-    "FusedResult": "online", "TemporalStability": "online", "compare": "comparison.writing", "fuse": "online",
-    "export": "exports", "gate": "comparison.gate", "load": "report.saved_run",
+    "FusedResult": "online", "TemporalStability": "online", "compare": "compare_runs", "fuse": "online",
+    "export": "exports", "gate": "gating.gate", "load": "report.saved_run",
     "load_config": "configure", "load_result": "engine.folder", "load_study": "configure", "relabel": "exports.relabel",
     "run": "api", "run_study": "api", "run_videos": "videos",
 }  # fmt: skip

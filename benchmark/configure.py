@@ -63,7 +63,7 @@ def require_named_code(run: Path) -> None:
         require_named(name, field)
 
 
-CODE_KEYS = ("model", "backbone", "code")
+CODE_KEYS = ("model", "code")
 """Settings that may name code."""
 
 
@@ -83,10 +83,6 @@ def as_config(settings: Config | Mapping[str, Any] | str | Path) -> Config:
     return settings if isinstance(settings, Config) else load_config(settings)
 
 
-FORMER_STUDIES = {"remedies": "filters", "city": "paper"}
-"""Names of shipped studies in 0.3, and now: the old ones work for one version."""
-
-
 def load_study(study: str | Path, overrides: Mapping[str, Any] | None = None) -> Config:
     """Return the configuration of a study's file, or of a shipped study by its name.
 
@@ -103,7 +99,6 @@ def load_study(study: str | Path, overrides: Mapping[str, Any] | None = None) ->
         >>> semstab.load_study("paper").models
         ['sim-steady', 'sim-flicker', 'sim-soft']
     """
-    study = FORMER_STUDIES.get(str(study), study)
     path = _shipped("studies") / f"{study}.yaml" if str(study) in shipped_studies() else Path(study)
     if path.suffix not in (".yaml", ".yml"):
         raise ConfigError(

@@ -14,11 +14,10 @@ from semstab.core.arrays import evenly
 from semstab.data.measures import mean
 from semstab.datasets import Scene
 from semstab.errors import ConfigError
-from semstab.models import create
 from semstab.pixels.warp import density
 from semstab.predict.filters import parse, too_sparse
 from semstab.predict.predictor import NAME as STORED
-from semstab.predict.predictor import PredictorConfig, StoredSequence
+from semstab.predict.predictor import PredictorConfig
 from semstab.task import frame_indices, open_scenes
 
 STUDY = "filters"
@@ -35,9 +34,8 @@ def filter_study_config(
 ) -> tuple[Config, list[str]]:
     """Return the study `filters` with these models, and filters over the scenes' label sources, as dataset settings.
 
-    Without models or sources all sources are taken; without filters those of the shipped study, with its map prior in
-    voxels of the run. Also returns notes on the filters that are left out: those that need scores where a model gives
-    none, and shipped ones that warp where depth is sparse.
+    Without models or sources all sources are taken; without filters those of the shipped study. Also returns notes on
+    the shipped filters that warp, which are left out if depth is sparse.
 
     Raises:
         ConfigError: For an unknown name, and a filter that warps where depth is sparse.
@@ -51,20 +49,12 @@ def filter_study_config(
     predictors = [*models, *(PredictorConfig(model=STORED, options={"source": name}) for name in names)]
     config, _ = with_voxel_size(config, scenes)
     shipped = load_study(STUDY).dataset.options["try_filters"]
-    grid = [_in_voxels(text, config.voxel_size) for text in filters or shipped]
-    grid, sparse = _warpable(grid, scene, frame_indices(scene, config), named=bool(filters))
-    able, without = _able(grid, predictors, scene)
-    left_out = [*sparse, *without]
+    grid = ["+".join(str(parse(text)) for text in chain.split("+")) for chain in filters or shipped]
+    grid, left_out = _warpable(grid, scene, frame_indices(scene, config), named=bool(filters))
     settings = {**content, "voxel_size": config.voxel_size, "frame_quality": True, "check": None, "name": STUDY}
     study = predicted_config(predictors, None, {**settings, "models": None})
-    dataset_config = study.dataset.model_copy(update={"options": {**study.dataset.options, "try_filters": able}})
+    dataset_config = study.dataset.model_copy(update={"options": {**study.dataset.options, "try_filters": grid}})
     return study.model_copy(update={"dataset": dataset_config}), left_out
-
-
-def _in_voxels(chain: str, size: float) -> str:
-    """Return a chain with the numbers of its filters; the map prior has the run's voxel size by default."""
-    texts = (f"map-prior:{size:g}" if text == "map-prior" else text for text in chain.split("+"))
-    return "+".join(str(parse(text)) for text in texts)
 
 
 def _warpable(grid: Sequence[str], scene: Scene, frames: Sequence[int], *, named: bool) -> tuple[list[str], list[str]]:
@@ -83,19 +73,3 @@ def _warpable(grid: Sequence[str], scene: Scene, frames: Sequence[int], *, named
     if named:
         raise ConfigError(f"{scene.name}: {reason}")
     return [text for text in grid if text not in warping], [f"{scene.name}: left out, because {reason}"]
-
-
-def _able(grid: Sequence[str], predictors: Sequence[PredictorConfig], scene: Scene) -> tuple[list[str], list[str]]:
-    """Return the filters that all models can use, and a note on the others."""
-    needing = [text for text in grid if parse(text.partition("+")[0]).kind.needs_scores]
-    without = [each.label_name for each in predictors if needing and not _gives_scores(each, scene)]
-    if not without:
-        return list(grid), []
-    note = f"{', '.join(needing)}: left out, because {', '.join(without)} gives labels without scores"
-    return [text for text in grid if text not in needing], [note]
-
-
-def _gives_scores(predictor: PredictorConfig, scene: Scene) -> bool:
-    if predictor.model == STORED:
-        return StoredSequence(scene, predictor.options["source"], False).has_scores
-    return create(predictor.model, **predictor.resolved().options).gives_scores

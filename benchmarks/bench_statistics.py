@@ -150,7 +150,6 @@ def sections(table: VoxelTable, events: Events) -> dict[str, Callable[[], Any]]:
     """What of the statistics is timed by itself."""
     return {
         "drift in random order": lambda: statistics.expected_sbd(table, events),
-        "trends": lambda: statistics.trends(events),
         "flips": lambda: statistics.flips(events),
         "agreement by class": lambda: statistics.class_agreement(table, events),
     }

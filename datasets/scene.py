@@ -35,7 +35,7 @@ class Filtering:
 
     Attributes:
         model: The label source without them; the source itself where that is not there.
-        filters: 'ema:0.6+threshold:0.5'; '' where there are none.
+        filters: 'ema:0.6+guided:8'; '' where there are none.
         milliseconds: CPU time that they took for a frame so far, in the median.
     """
 

@@ -6,10 +6,10 @@ import contextlib
 import hashlib
 import importlib.util
 import re
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, ClassVar, Literal
+from typing import Any, Literal
 
 import huggingface_hub
 import torch
@@ -38,7 +38,6 @@ HUB_TIMEOUT = 10.0
 class ModelOptions(Settings):
     """The settings that name a pretrained model and say how it runs."""
 
-    earlier: ClassVar[Mapping[str, str]] = {"model": "checkpoint"}
     checkpoint: str = Field(description="a folder that save_pretrained wrote, or an id on the Hugging Face hub")
     revision: str | None = Field(None, description="branch, tag or commit on the hub; the newest where not given")
     device: str = Field("cpu", description="cpu, cuda, cuda:1, mps")

@@ -16,7 +16,7 @@ import argparse
 import numpy as np
 from flights import Flight, World, fly, log_of, table_of, world
 
-from semstab.comparison.runs import open_run
+from semstab.comparison.entries import open_run
 from semstab.data.measures import dominant
 from semstab.data.voxels import VoxelTable
 from semstab.metrics.agreement import rows_of

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from typing import Protocol
 
 import numpy as np
 from exact_scenes import Array, Ints
@@ -14,6 +15,15 @@ Labeller = Callable[[Seen], Ints]
 """The label (n,) that a frame gives at image coordinates, the same whenever it is asked."""
 
 Number = Callable[[Seen], Array]
+
+
+class Errors(Protocol):
+    """A way to err."""
+
+    def __call__(self, flight: Flight, K: int, rng: np.random.Generator, strength: float = 1.0) -> Labeller:
+        """Return the labels of a flight; strength: 1 where errors are as frequent, or as large, as described."""
+        ...
+
 
 IGNORED = 255
 PAD = 8
@@ -79,99 +89,106 @@ def in_squares(share: float, edge: int, flight: Flight, K: int, rng: np.random.G
     return lambda seen: np.where(error(seen) < share, other(seen.truth, by(seen), K), seen.truth)
 
 
-def none(flight: Flight, K: int, rng: np.random.Generator) -> Labeller:
+def none(flight: Flight, K: int, rng: np.random.Generator, strength: float = 1.0) -> Labeller:
     """Return the truth."""
     return lambda seen: seen.truth
 
 
-def pixels(flight: Flight, K: int, rng: np.random.Generator) -> Labeller:
+def pixels(flight: Flight, K: int, rng: np.random.Generator, strength: float = 1.0) -> Labeller:
     """Return errors of 15 % of the pixels, each by itself."""
-    return in_squares(0.15, 1, flight, K, rng)
+    return in_squares(0.15 * strength, 1, flight, K, rng)
 
 
-def blobs(flight: Flight, K: int, rng: np.random.Generator) -> Labeller:
+def blobs(flight: Flight, K: int, rng: np.random.Generator, strength: float = 1.0) -> Labeller:
     """Return errors of blobs, 20 % of each image."""
-    return in_blobs(lambda seen: np.full(len(seen.u), 0.2), flight, K, rng)
+    return in_blobs(lambda seen: np.full(len(seen.u), 0.2 * strength), flight, K, rng)
 
 
-def blocks(flight: Flight, K: int, rng: np.random.Generator) -> Labeller:
+def blocks(flight: Flight, K: int, rng: np.random.Generator, strength: float = 1.0) -> Labeller:
     """Return errors of 20 % of the blocks of 8 x 8 pixels."""
-    return in_squares(0.2, BLOCK, flight, K, rng)
+    return in_squares(0.2 * strength, BLOCK, flight, K, rng)
 
 
-def place(flight: Flight, K: int, rng: np.random.Generator) -> Labeller:
+def place(flight: Flight, K: int, rng: np.random.Generator, strength: float = 1.0) -> Labeller:
     """Return errors that stay at their place."""
     field = of_place(METRES, rng)
-    return lambda seen: np.where(field(seen) > norm.isf(0.3), (seen.truth + 1) % K, seen.truth)
+    return lambda seen: np.where(field(seen) > norm.isf(0.3 * strength), (seen.truth + 1) % K, seen.truth)
 
 
-def view(flight: Flight, K: int, rng: np.random.Generator) -> Labeller:
+def view(flight: Flight, K: int, rng: np.random.Generator, strength: float = 1.0) -> Labeller:
     """Return frames of different quality: errors of up to 60 % of the image."""
-    share = rng.uniform(0, 0.6, len(flight.poses))
+    share = strength * rng.uniform(0, 0.6, len(flight.poses))
     return in_blobs(lambda seen: np.full(len(seen.u), share[seen.frame]), flight, K, rng)
 
 
-def classes(flight: Flight, K: int, rng: np.random.Generator) -> Labeller:
+def classes(flight: Flight, K: int, rng: np.random.Generator, strength: float = 1.0) -> Labeller:
     """Return errors of every third class: half of its blocks are taken for the next one."""
     error = squares(flight, BLOCK, rng)
-    return lambda seen: np.where((seen.truth % 3 == 0) & (error(seen) < 0.5), (seen.truth + 1) % K, seen.truth)
+
+    def label(seen: Seen) -> Ints:
+        taken = (seen.truth % 3 == 0) & (error(seen) < 0.5 * strength)
+        return np.where(taken, (seen.truth + 1) % K, seen.truth)
+
+    return label
 
 
-def border(flight: Flight, K: int, rng: np.random.Generator) -> Labeller:
+def border(flight: Flight, K: int, rng: np.random.Generator, strength: float = 1.0) -> Labeller:
     """Return borders in the wrong place: the class of where another ray goes, up to 2 pixels away."""
     right, down = smooth(flight, BLOB, rng), smooth(flight, BLOB, rng)
 
     def label(seen: Seen) -> Ints:
-        du, dv = (SHIFT * np.clip(field(seen) / 2, -1, 1) for field in (right, down))
+        du, dv = (strength * SHIFT * np.clip(field(seen) / 2, -1, 1) for field in (right, down))
         shown = flight.look(seen.frame, seen.u + du, seen.v + dv).truth
         return np.where(shown >= 0, shown, seen.truth)
 
     return label
 
 
-def burst(flight: Flight, K: int, rng: np.random.Generator) -> Labeller:
+def burst(flight: Flight, K: int, rng: np.random.Generator, strength: float = 1.0) -> Labeller:
     """Return errors of 60 % in every fourth frame, one after another, and of 5 % in the others."""
     F = len(flight.poses)
     bad = max(1, F // 4)
     first = rng.integers(0, F - bad + 1)
-    share = np.where((np.arange(F) >= first) & (np.arange(F) < first + bad), 0.6, 0.05)
+    share = strength * np.where((np.arange(F) >= first) & (np.arange(F) < first + bad), 0.6, 0.05)
     return in_blobs(lambda seen: np.full(len(seen.u), share[seen.frame]), flight, K, rng)
 
 
-def lasting(flight: Flight, K: int, rng: np.random.Generator) -> Labeller:
+def lasting(flight: Flight, K: int, rng: np.random.Generator, strength: float = 1.0) -> Labeller:
     """Return errors that stay at their place for 4 frames."""
     fields = [of_place(METRES, rng) for _ in range(len(flight.poses) // LASTS + 1)]
-    return lambda seen: np.where(fields[seen.frame // LASTS](seen) > norm.isf(0.25), (seen.truth + 1) % K, seen.truth)
+    least = norm.isf(0.25 * strength)
+    return lambda seen: np.where(fields[seen.frame // LASTS](seen) > least, (seen.truth + 1) % K, seen.truth)
 
 
-def with_range(most: float) -> Callable[[Flight, int, np.random.Generator], Labeller]:
+def with_range(most: float) -> Errors:
     """Return errors that grow with range, from none to `most`, between the 5 and 95 % quantiles over the pixels."""
 
-    def errors(flight: Flight, K: int, rng: np.random.Generator) -> Labeller:
+    def errors(flight: Flight, K: int, rng: np.random.Generator, strength: float = 1.0) -> Labeller:
         distance = np.concatenate([seen.distance[seen.face >= 0] for seen in flight.images])
         low, high = np.quantile(distance, (0.05, 0.95))
-        return in_blobs(lambda seen: most * np.clip((seen.distance - low) / (high - low), 0, 1), flight, K, rng)
+        far = strength * most / (high - low)
+        return in_blobs(lambda seen: np.clip(far * (seen.distance - low), 0, strength * most), flight, K, rng)
 
     return errors
 
 
-def grazing(flight: Flight, K: int, rng: np.random.Generator) -> Labeller:
+def grazing(flight: Flight, K: int, rng: np.random.Generator, strength: float = 1.0) -> Labeller:
     """Return errors that grow from 30 degrees off the surface's normal to 70 % at 90."""
-    return in_blobs(lambda seen: 0.7 * np.clip((seen.angle - 30) / 60, 0, 1), flight, K, rng)
+    return in_blobs(lambda seen: 0.7 * strength * np.clip((seen.angle - 30) / 60, 0, 1), flight, K, rng)
 
 
-def corners(flight: Flight, K: int, rng: np.random.Generator) -> Labeller:
+def corners(flight: Flight, K: int, rng: np.random.Generator, strength: float = 1.0) -> Labeller:
     """Return errors that grow with the square of the image radius, to 60 % in the corners."""
     H, W = flight.sensor.height, flight.sensor.width
 
     def share(seen: Seen) -> Array:
         away = (seen.u - (W - 1) / 2) ** 2 + (seen.v - (H - 1) / 2) ** 2
-        return np.clip(0.6 * away / ((W / 2) ** 2 + (H / 2) ** 2), 0, 1)
+        return np.clip(0.6 * strength * away / ((W / 2) ** 2 + (H / 2) ** 2), 0, 1)
 
     return in_blobs(share, flight, K, rng)
 
 
-ERRORS: dict[str, Callable[[Flight, int, np.random.Generator], Labeller]] = {
+ERRORS: dict[str, Errors] = {
     "none": none, "pixels": pixels, "blobs": blobs, "blocks": blocks, "place": place, "view": view,
     "class": classes, "border": border, "burst": burst, "lasting": lasting, "range": with_range(0.35),
     "strong range": with_range(0.7), "angle": grazing, "radius": corners,

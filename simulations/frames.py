@@ -5,9 +5,9 @@
 Each trial makes a scene of its own: a floor of 2 to 12 classes, which a camera flies over on a random course, at a
 random height and tilt, 12 to 40 times. Labels are wrong in blobs: at places that are hard for all frames, and anew in
 each frame, in 1 to 30 % of the pixels, and depth has noise of up to 1 %. Prints a table in Markdown: numbers of trials,
-with frames that are alike, and with frames that differ in how much is wrong, by up to 20 % (standard deviation);
-without bad frames, and with labels that are wrong in 15 % of the blocks of 24 x 24 pixels of every third frame
-(`simulations/planted.py`).
+with frames of the same quality, and with frames whose quality differs: the log odds of an error have a standard
+deviation of 0.2 or 0.6. Without bad frames, and with labels that are wrong in 15 % of the blocks of 24 x 24 pixels of
+every third frame (`simulations/planted.py`).
 """
 
 from __future__ import annotations
@@ -21,6 +21,7 @@ import cv2
 import numpy as np
 from flights import field
 from planted import in_blocks
+from scipy.special import expit, logit
 from scipy.stats import norm
 
 from semstab.data.frames import Frame, Intrinsics
@@ -35,12 +36,14 @@ GRID, SIDE, PATCHES = 256, 40.0, 80
 THIRD = 3
 
 CONDITIONS = (
-    ("frames alike", 0.0, False),
-    ("frames alike, every third bad", 0.0, True),
-    ("frames uneven", 0.2, False),
-    ("frames uneven, every third bad", 0.2, True),
+    ("same quality", 0.0, False),
+    ("same quality, every third bad", 0.0, True),
+    ("log odds differ by 0.2", 0.2, False),
+    ("log odds differ by 0.2, every third bad", 0.2, True),
+    ("log odds differ by 0.6", 0.6, False),
+    ("log odds differ by 0.6, every third bad", 0.6, True),
 )
-"""Name, how uneven frames are, and whether there are bad ones."""
+"""Name, the standard deviation of the log odds of an error between frames, and whether there are bad frames."""
 
 
 @dataclass(frozen=True)
@@ -69,15 +72,14 @@ class Made:
 
     @classmethod
     def drawn(cls, rng: np.random.Generator, uneven: float) -> Made:
-        """Draw a scene; uneven: the largest standard deviation of what is wrong in a frame, of its mean."""
+        """Draw a scene; `uneven` is the standard deviation of the log odds of an error between frames."""
         K, F = int(rng.integers(2, 13)), int(rng.integers(12, 41))
         at = np.stack(np.meshgrid(np.arange(GRID), np.arange(GRID)), axis=-1).reshape(-1, 1, 2)
         patches = rng.uniform(0, GRID, (PATCHES, 2))
         nearest = np.square(at - patches).sum(axis=2).argmin(axis=1).reshape(GRID, GRID)
         first = rng.integers(0, K, PATCHES)
         other = (first + rng.integers(1, K, PATCHES)) % K
-        spread = rng.uniform(0, uneven) * rng.standard_normal(F)
-        wrong = np.clip(np.exp(rng.uniform(np.log(0.01), np.log(0.3))) * (1 + spread), 0, 0.6)
+        wrong = expit(logit(np.exp(rng.uniform(np.log(0.01), np.log(0.3)))) + uneven * rng.standard_normal(F))
         hard = field(GRID, float(rng.uniform(2, 8)), rng)
         return cls(
             K, course(F, rng), first[nearest], other[nearest], hard, float(rng.uniform(0, 0.8)), wrong,

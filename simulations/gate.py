@@ -17,11 +17,11 @@ from collections.abc import Iterator
 import numpy as np
 from flights import Flight, World, fly, number_of, sums_of, totals_of, world
 
-from semstab.comparison.gate_evaluation import bounded
-from semstab.comparison.gate_result import verdict
-from semstab.comparison.gate_rules import parse
 from semstab.core.types import OTHER_SCENES, THESE_FRAMES, THIS_SCENE, Scope
 from semstab.data.statistics import Interval
+from semstab.gating.evaluation import bounded
+from semstab.gating.result import verdict
+from semstab.gating.rules import parse
 from semstab.statistics.cluster_sums import ClusterSums
 
 EASES = (1.0, 1.0, 0.8)

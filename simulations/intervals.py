@@ -1,14 +1,12 @@
-"""How often do intervals hold what they are about?
+"""How often do intervals of voxel alpha, PSA, accuracy and numbers by location hold what they are about?
 
-    python simulations/intervals.py these-frames [--trials 300] [--seed 0]
     python simulations/intervals.py this-scene [--trials 300] [--seed 0]
     python simulations/intervals.py other-scenes [--trials 300] [--seed 0]
     python simulations/intervals.py locations [--trials 300] [--seed 0]
-    python simulations/intervals.py differences [--trials 300] [--seed 0]
-    python simulations/intervals.py correlogram [--trials 300] [--seed 0]
 
-Prints a table in Markdown. The target of an interval is the number that very many flights have together: over the same
-scene for 'this scene' and numbers by location, over all scenes for the others.
+Alpha, which is of spots, is in `exact_coverage.py`. Prints a table in Markdown. The target of an interval is the number
+that very many flights have together: over the same scene for 'this scene' and numbers by location, over all scenes for
+the others.
 """
 
 from __future__ import annotations
@@ -19,12 +17,11 @@ import math
 from collections.abc import Iterator, Sequence
 
 import numpy as np
-from flights import Flight, fly, number_of, sample_of, sums_of, totals_of, world
+from flights import Flight, fly, number_of, sums_of, totals_of, world
 
 from semstab.core.types import OTHER_SCENES, THESE_FRAMES, THIS_SCENE, Scope
 from semstab.data.statistics import Interval
-from semstab.statistics.correlogram import correlogram
-from semstab.statistics.intervals import difference, estimate
+from semstab.statistics.intervals import estimate
 
 KEYS = ("voxel_alpha", "psa", "accuracy")
 
@@ -98,30 +95,6 @@ def trials(
     return rows
 
 
-# --- These frames -----------------------------------------------------------------------------------------------------
-
-
-def these_frames(count: int, seed: int) -> Iterator[Row]:
-    """Floors of 2,000 to 50,000 voxels and a city, errors reaching half a voxel to twenty, all sorts of alpha."""
-    for side in (45, 100, 224):
-        for reach in (0.5, 2.0, 5.0, 10.0, 20.0):
-            flight, name = Flight(side=side, reach=reach), f"floor {side} x {side}, reach {reach:g}"
-            yield from trials(flight, count, seed, THESE_FRAMES, ("voxel_alpha",), name)
-    for reach in (0.5, 2.0, 5.0):
-        yield from trials(
-            Flight(80, reach, city=True), count, seed, THESE_FRAMES, ("voxel_alpha",), f"city 80 x 80, reach {reach:g}"
-        )
-    yield from trials(Flight(100, 2.0, coin=True), count, seed, THESE_FRAMES, KEYS, "floor 100 x 100, a coin")
-    for soft, K in ((True, 2), (False, 5)):
-        name = "floor 100 x 100, reach 2, " + ("scores" if soft else f"{K} classes")
-        flight, keys = Flight(100, 2.0, K=K, soft=soft), ("voxel_alpha", "accuracy")
-        yield from trials(flight, count, seed, THESE_FRAMES, keys, name)
-    for ease in (2.0, 2.5, 3.0):
-        yield from trials(
-            Flight(100, 2.0, ease), count, seed, THESE_FRAMES, KEYS, f"floor 100 x 100, reach 2, ease {ease:g}"
-        )
-
-
 # --- This scene, and other scenes -------------------------------------------------------------------------------------
 
 
@@ -180,68 +153,12 @@ def locations(count: int, seed: int) -> Iterator[Row]:
             yield from trials(flight, count, seed, THIS_SCENE, BY_LOCATION, f"{name}, {by}", interval=scope)
 
 
-# --- Differences ------------------------------------------------------------------------------------------------------
-
-
-def differences(count: int, seed: int) -> Iterator[Row]:
-    """Two models that err equally often, on the same scene: in the same frames, or in two flights."""
-    for side, observations in ((32, 60), (45, 5)):
-        for quality in ("alike", "bad", "uneven", "lasting"):
-            yield from _pairs(Flight(side, 1.5, 1.0, 60, observations, quality), count, seed)
-    yield from _pairs(Flight(32, 1.5, 1.0, 15, 5, "alike"), count, seed, THESE_FRAMES, "these frames")
-    yield from _pairs(Flight(45, 1.5, 1.0, 40, 5, "uneven", K=5), count, seed, where="five classes")
-    yield from _pairs(Flight(45, 1.5, 1.0, 40, 5, "uneven", soft=True), count, seed, where="scores")
-
-
-def _pairs(flight: Flight, count: int, seed: int, scope: Scope = THIS_SCENE, where: str = "") -> Iterator[Row]:
-    key = "voxel_alpha"
-    found: dict[str, list[Interval]] = {"same frames": [], "two flights": []}
-    for trial in range(count):
-        rng = np.random.default_rng([seed, trial])
-        over = world(flight, rng)
-        other = dataclasses.replace(over, hard=world(flight, rng).hard)
-        pair = [sums_of(fly(flight, scene, rng), scene, flight, rng) for scene in (over, other)]
-        found["same frames"].append(difference(*pair, key, scope=scope, same_frames=True))
-        found["two flights"].append(difference(*pair, key, scope=scope, same_frames=False))
-    seen = "all see all" if flight.observations == flight.frames else "strips"
-    for flights, intervals in found.items():
-        parts = (f"{flight.side} x {flight.side}, {flight.frames} frames", flight.quality, seen, where, flights)
-        spread = float(np.std([interval.value for interval in intervals]))
-        yield Row(", ".join(filter(None, parts)), f"{key} a - b", spread, np.zeros(count), tuple(intervals))
-
-
-# --- Correlogram ------------------------------------------------------------------------------------------------------
-
-APART = (1, 2, 4)
-"""Frames that two observations are apart."""
-
-
-def correlograms(count: int, seed: int) -> Iterator[Row]:
-    """Bands of the bins in time. The target is the mean of all trials."""
-    for quality in ("alike", "uneven", "lasting"):
-        flight = Flight(45, 2.0, 1.0, 40, 10, quality)
-        found: dict[int, list[Interval]] = {apart: [] for apart in APART}
-        for trial in range(count):
-            rng = np.random.default_rng([seed, trial])
-            over = world(flight, rng)
-            bins = correlogram(sample_of(fly(flight, over, rng), over, flight, rng)).time
-            for own, lag in zip(found.values(), bins, strict=False):
-                own.append(lag.alpha)
-        for apart, own in found.items():
-            values = np.array([alpha.value for alpha in own])
-            targets = np.full(count, values.mean())
-            yield Row(f"40 frames, {quality}, strips, {apart} apart", "alpha", values.std(), targets, tuple(own))
-
-
 # --- Table ------------------------------------------------------------------------------------------------------------
 
 STUDIES = {
-    "these-frames": these_frames,
     "this-scene": this_scene,
     "other-scenes": other_scenes,
     "locations": locations,
-    "differences": differences,
-    "correlogram": correlograms,
 }
 
 

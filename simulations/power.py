@@ -19,9 +19,9 @@ from flights import Flight, fly, sums_of, world
 from scipy.optimize import brentq
 
 from semstab.comparison.differences import LEVEL, sums_difference
-from semstab.comparison.gate_evaluation import bounded
-from semstab.comparison.gate_result import verdict
-from semstab.comparison.gate_rules import parse
+from semstab.gating.evaluation import bounded
+from semstab.gating.result import verdict
+from semstab.gating.rules import parse
 from semstab.statistics.cluster_sums import value
 
 RULE = parse("psa drop < 0.01")

@@ -3,6 +3,7 @@
     python simulations/risk.py made [--scenes 3] [--seed 0]
     python simulations/risk.py city [--frames 20] [--width 288]
     python simulations/risk.py runs RUN ...
+    python simulations/risk.py runs RUN ... --signs [--scores MODEL]
 
 Places are the voxels of a map that were seen three times or more and have a true class; the label of one is its
 dominant class. `made` takes flights of `pictures.py`, with errors of eight kinds at four rates, `city` the simulated
@@ -13,6 +14,10 @@ probability that it is larger at a wrong place than at a right one. The probabil
 disagreement, OP and class of its place, is then counted on other flights of the same model, and on other models, and
 held against the map: at all places, and at those where frames disagree (PSA < 0.8). No truth is needed for one bound:
 of the frames that see a place, no more can be right than give it its most frequent label. Prints a table in Markdown.
+
+`--signs` asks instead what else tells wrong places (`signs.py`): the AUROC of disagreement, of the border of the
+model's own labels, in the map or in images, and of low scores. One frame is the middle one of those that see a place.
+The images of the run are read again; scores may be those of another label source of the run.
 """
 
 from __future__ import annotations
@@ -26,11 +31,12 @@ from dataclasses import dataclass
 import numpy as np
 from alpha import RATES
 from pictures import KINDS, K, Views, frames, predicted, scene
-from scipy.stats import mannwhitneyu
+from signs import auroc
+from signs import table as table_of_signs
 
 import semstab
 from semstab import backends
-from semstab.comparison.runs import open_run
+from semstab.comparison.entries import open_run
 from semstab.data.measures import dominant
 from semstab.data.voxels import VoxelTable
 from semstab.statistics.agreement import CONSISTENT, psa
@@ -102,10 +108,7 @@ class Places:
     @property
     def auroc(self) -> float:
         """How well disagreement tells wrong places; NaN where all are right, or wrong."""
-        wrong, right = self.disagreement[self.wrong], self.disagreement[~self.wrong]
-        if not (len(wrong) and len(right)):
-            return math.nan
-        return float(mannwhitneyu(wrong, right).statistic / (len(wrong) * len(right)))
+        return auroc(self.disagreement, self.wrong)
 
 
 def cells_of(places: Places) -> np.ndarray:
@@ -208,7 +211,14 @@ def main() -> None:
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--frames", type=int, default=20)
     parser.add_argument("--width", type=int, default=288)
+    parser.add_argument("--signs", action="store_true", help="of runs: what else tells that a label is wrong")
+    parser.add_argument(
+        "--scores", metavar="MODEL", help="with --signs: the label source of the run whose scores count"
+    )
     arguments = parser.parse_args()
+    if arguments.signs:
+        table_of_signs(arguments.run, arguments.scores)
+        return
     if arguments.study == "made":
         maps = list(made(arguments.scenes, arguments.seed))
     elif arguments.study == "city":

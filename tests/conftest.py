@@ -8,7 +8,7 @@ import signal
 import sys
 import tempfile
 import time
-from collections.abc import Callable, Generator
+from collections.abc import Generator
 
 import hypothesis
 import pytest
@@ -45,21 +45,6 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     tests = collections.Counter(item.path for item in items)
     early = {f"test_{name}.py": rank for rank, name in enumerate(EARLY)}
     items.sort(key=lambda item: (early.get(item.path.name, len(early)), -tests[item.path], item.path))
-    for item in items:
-        item.setup = functools.partial(with_room_for_frames, item.setup)
-        item.runtest = functools.partial(with_room_for_frames, item.runtest)
-
-
-def with_room_for_frames(call: Callable[[], None]) -> None:
-    """Call a function; all that it calls has its frames in one piece of memory.
-
-    Python takes memory for frames in pieces of 16 KiB, and returns each as soon as it is empty. A function at the edge
-    of a piece lets the system map and unmap one at every call: half a million times while numba compiles.
-    """
-    call()
-
-
-with_room_for_frames.__code__ = with_room_for_frames.__code__.replace(co_stacksize=66_000)  # words: a piece of 1 MiB
 
 
 @pytest.hookimpl(wrapper=True)

@@ -7,10 +7,8 @@ import dataclasses
 import io
 import json
 from pathlib import Path
-from xml.etree import ElementTree
 
 import cv2
-import jsonschema
 import numpy as np
 import pytest
 from command_line import bench
@@ -22,7 +20,6 @@ from semstab.data.frames import Frame, Intrinsics
 from semstab.datasets import open_dataset
 from semstab.errors import ConfigError, DataError
 from semstab.exports.annotation import outlined
-from semstab.exports.annotation_formats import FORMATS
 
 pytestmark = pytest.mark.filterwarnings("ignore:__array__ implementation:DeprecationWarning")
 
@@ -71,9 +68,9 @@ def floor(tmp_path_factory):
     return run_of(tmp_path_factory.mktemp("floor"))
 
 
-def written(run: Path, folder: Path, kind: str, **options) -> Path:
-    path = folder / f"tasks{FORMATS[kind][0]}"
-    semstab.export(run, path, task_format=kind, **options)
+def written(run: Path, folder: Path, **options) -> Path:
+    path = folder / "tasks.json"
+    semstab.export(run, path, task_format="coco", **options)
     return path
 
 
@@ -83,7 +80,7 @@ def opened(path: Path) -> COCO:
 
 
 def test_the_contested_place_is_found_and_outlined(floor, tmp_path):
-    coco = opened(written(floor, tmp_path, "coco"))
+    coco = opened(written(floor, tmp_path))
     first, second = coco.dataset["annotations"]
     assert (first["fused"], first["second"], second["second"]) == ("floor", "mat", "hole")
     assert (first["voxels"], second["voxels"], first["op"]) == (24, 4, 6)
@@ -107,18 +104,18 @@ def test_the_contested_place_is_found_and_outlined(floor, tmp_path):
 
 
 def test_the_best_view_is_large_frontal_and_sharp(floor, tmp_path):
-    (first, *_) = json.loads(written(floor, tmp_path, "coco").read_text())["annotations"]
+    (first, *_) = json.loads(written(floor, tmp_path).read_text())["annotations"]
     assert len(first["views"]) == 5
     assert first["views"][0] == SECOND
     blurred = run_of(tmp_path / "blurred", blurred=1)
-    coco = opened(written(blurred, tmp_path, "coco"))
+    coco = opened(written(blurred, tmp_path))
     assert coco.imgs[coco.anns[1]["image_id"]]["file_name"] == f"tasks_images/{SECOND}.jpg"
 
 
 def test_at_most_so_many_of_these_classes(floor, tmp_path):
-    assert len(json.loads(written(floor, tmp_path, "coco", most=1).read_text())["annotations"]) == 1
+    assert len(json.loads(written(floor, tmp_path, most=1).read_text())["annotations"]) == 1
     with pytest.raises(ConfigError, match="no voxel with OP >= 1 and class hole"):
-        written(floor, tmp_path, "coco", classes=["hole"])
+        written(floor, tmp_path, classes=["hole"])
 
 
 def test_where_frames_agree_there_is_nothing_to_annotate(tmp_path):
@@ -127,13 +124,13 @@ def test_where_frames_agree_there_is_nothing_to_annotate(tmp_path):
     config = {"dataset": {"name": "posed_folder", "options": {"root": str(scene)}}, "voxel_size": SIZE, "check": None}
     semstab.run(config, out=tmp_path / "run", report=False)
     with pytest.raises(ConfigError, match="the frames disagree nowhere; there is nothing to annotate"):
-        written(tmp_path / "run", tmp_path, "coco")
+        written(tmp_path / "run", tmp_path)
     assert not (tmp_path / "tasks.json").exists()
 
 
 def test_frames_without_images_are_one_line(tmp_path):
     with pytest.raises(DataError, match="floor, frame0: the frame has no colour image to annotate"):
-        written(run_of(tmp_path, color=False), tmp_path, "coco")
+        written(run_of(tmp_path, color=False), tmp_path)
 
 
 def test_the_command_says_what_it_wrote(floor, tmp_path):
@@ -141,75 +138,9 @@ def test_the_command_says_what_it_wrote(floor, tmp_path):
         done = bench("export", floor, "--to", to, "--format", kind, cwd=tmp_path, code=code)
         return done.stderr if code else done.stdout
 
-    assert said("tasks.xml", "cvat").startswith("tasks.xml: 2 tasks in 1 images, 28 bits of entropy")
-    assert said("tasks.json", "cvat", code=2) == "error: tasks.json: cvat is a .xml file\n"
-    assert said("tasks.xml", "cvta", code=2) == "error: no format 'cvta'; did you mean 'cvat'?\n"
-
-
-LABEL_STUDIO = {
-    "type": "array", "minItems": 1, "items": {
-        "type": "object", "required": ["data", "predictions"], "properties": {
-            "data": {"type": "object", "required": ["image"], "properties": {
-                "image": {"type": "string", "pattern": "^/data/local-files/\\?d="}}},
-            "predictions": {"type": "array", "items": {
-                "type": "object", "required": ["model_version", "result"], "properties": {
-                    "result": {"type": "array", "minItems": 1, "items": {
-                        "type": "object",
-                        "required": ["id", "type", "from_name", "to_name", "original_width", "value"],
-                        "properties": {
-                            "id": {"type": "string"}, "type": {"const": "polygonlabels"},
-                            "image_rotation": {"const": 0},
-                            "value": {"type": "object", "required": ["points", "polygonlabels"], "properties": {
-                                "points": {"type": "array", "minItems": 3, "items": {
-                                    "type": "array", "minItems": 2, "maxItems": 2,
-                                    "items": {"type": "number", "minimum": 0, "maximum": 100}}},
-                                "polygonlabels": {"type": "array", "items": {"type": "string"}}}}}}}}}}}}}  # fmt: skip
-"""What Label Studio's importer asks of image tasks with predicted polygons (its guide, 'Import pre-annotations')."""
-
-
-def test_label_studio_has_tasks_and_a_set_up_that_fit(floor, tmp_path):
-    tasks = json.loads(written(floor, tmp_path, "labelstudio").read_text())
-    jsonschema.validate(tasks, LABEL_STUDIO)
-    view = ElementTree.parse(tmp_path / "tasks_config.xml").getroot()
-    control, image = view.find("PolygonLabels"), view.find("Image")
-    result = tasks[0]["predictions"][0]["result"][0]
-    assert (result["from_name"], result["to_name"]) == (control.get("name"), image.get("name"))
-    assert control.get("toName") == image.get("name")
-    assert image.get("value").lstrip("$") in tasks[0]["data"]
-    assert set(result["value"]["polygonlabels"]) <= {label.get("value") for label in control}
-    assert [task["data"]["rank"] for task in tasks] == [1, 2]
-    points = np.array(result["value"]["points"]) * [W, H] / 100
-    rows, columns = np.nonzero(frame(1).labels == 1)
-    np.testing.assert_allclose(points.mean(axis=0), [columns.mean(), rows.mean()], atol=2)
-    assert (tmp_path / tasks[0]["data"]["image"].partition("=")[2]).exists()
-
-
-def test_cvat_has_polygons_of_declared_labels(floor, tmp_path):
-    root = ElementTree.parse(written(floor, tmp_path, "cvat")).getroot()
-    labels = {label.find("name").text: label for label in root.iter("label")}
-    assert list(labels) == ["floor", "mat", "hole"]
-    (image,) = root.iter("image")
-    assert (image.get("name"), image.get("width"), image.get("height")) == (f"{CLOSEST}.jpg", str(W), str(H))
-    assert (tmp_path / "tasks_images" / image.get("name")).exists()
-    for polygon in image.iter("polygon"):
-        points = np.array([point.split(",") for point in polygon.get("points").split(";")], float)
-        assert ((points >= 0) & (points <= [W, H])).all()
-        declared = {each.find("name").text for each in labels[polygon.get("label")].iter("attribute")}
-        assert {attribute.get("name") for attribute in polygon} == declared
-    raw = json.loads((tmp_path / "tasks_labels.json").read_text())
-    assert [label["name"] for label in raw] == list(labels)
-    assert {attribute["name"] for attribute in raw[0]["attributes"]} == declared
-
-
-def test_fiftyone_has_a_dataset_of_polylines(floor, tmp_path):
-    dataset = json.loads(written(floor, tmp_path, "fiftyone").read_text())
-    (sample,) = dataset["samples"]
-    assert (tmp_path / sample["filepath"]).exists()
-    assert set(dataset["sample_fields"]) <= set(sample)
-    places = sample["places"]["polylines"]
-    assert [place["task"] for place in places] == [1, 2]
-    assert sample["score"] == places[0]["score"]
-    assert ((np.array(places[0]["points"][0]) >= 0) & (np.array(places[0]["points"][0]) <= 1)).all()
+    assert said("tasks.json", "coco").startswith("tasks.json: 2 tasks in 1 images, 28 bits of entropy")
+    assert said("tasks.xml", "coco", code=2) == "error: tasks.xml: coco is a .json file\n"
+    assert said("tasks.xml", "cvat", code=2).startswith("error: no format 'cvat'; write coco, which CVAT, ")
 
 
 def test_an_outline_fills_gaps_and_leaves_specks_out():
@@ -229,7 +160,7 @@ def test_tasks_hold_more_errors_than_their_images(tmp_path):
         "models": ["sim-flicker"], "voxel_size": 0.5, "taxonomy": None, "check": None,
     }  # fmt: skip
     semstab.run(config, out=tmp_path / "run", report=False)
-    coco = opened(written(tmp_path / "run", tmp_path, "coco", most=100))
+    coco = opened(written(tmp_path / "run", tmp_path, most=100))
     scene = open_dataset("city", config["dataset"]["options"]).scene("scene0")
     names = {f"tasks_images/{scene.image_name(i)}.jpg": i for i in range(16)}
     held, whole = [], []

@@ -12,7 +12,7 @@ from image_files import refused
 from posed_config import configure
 
 import semstab
-from semstab.comparison.runs import open_run, save_summary
+from semstab.comparison.entries import open_run, save_summary
 from semstab.datasets.formats.images import FrameSize, read_color, read_depth, read_labels, read_mask, read_scores
 
 SETUP = """
@@ -154,7 +154,7 @@ def summary(tmp_path_factory):
     return folder / "small.semstab"
 
 
-LOAD = "from semstab.comparison.runs import load_summary; import pyarrow.parquet, semstab.statistics.cluster_sums"
+LOAD = "from semstab.comparison.entries import load_summary; import pyarrow.parquet, semstab.statistics.cluster_sums"
 
 
 @pytest.mark.parametrize("make", [bombs.semstab, bombs.semstab_of_text])

@@ -17,16 +17,16 @@ from posed_writer import write_posed
 from rich.console import Console
 
 import semstab
+from semstab.compare_runs import load_comparison, markdown
 from semstab.comparison.differences import corrected, over_scenes
+from semstab.comparison.entries import open_runs
 from semstab.comparison.pairing import pair
-from semstab.comparison.runs import open_runs
-from semstab.comparison.tables import print_comparison, sentences
-from semstab.comparison.writing import load_comparison, markdown
 from semstab.data.contrast import Against, Contrast, RunComparison, SceneComparison
 from semstab.data.frames import Frame, Intrinsics
 from semstab.data.georeference import Georeference
 from semstab.data.statistics import Interval
 from semstab.errors import ConfigError, DataError
+from semstab.report.comparison.tables import print_comparison, sentences
 
 FAULTY = (2, 5, 8)
 CLASSES = ["wall", "door", "window", "floor"]
@@ -130,12 +130,12 @@ def test_the_columns_go_along_in_an_export(runs, fault, tmp_path):
     listed = [area.number for area in own.areas if area.what == "agreement"]
     assert set(listed) <= set(columns["area"].to_numpy().tolist())
     file = runs / "compared" / own.columns
-    semstab.export(runs / "old", tmp_path / "map.parquet", measures=["change", "area"], beside=file)
+    semstab.export(runs / "old", tmp_path / "map.parquet", measures=["change", "area"], join=file)
     exported = pq.read_table(tmp_path / "map.parquet")
     assert (exported["area"].to_numpy() > 0).sum() == (columns["area"].to_numpy() > 0).sum()
     assert exported["change"].null_count == exported.num_rows - own.compared
     with pytest.raises(DataError, match=r"voxels of 0\.125 m"):
-        semstab.export(runs / "coarse", tmp_path / "map.csv", measures=["change"], beside=file)
+        semstab.export(runs / "coarse", tmp_path / "map.csv", measures=["change"], join=file)
 
 
 def test_runs_of_other_voxel_sizes_and_frames_of_reference_are_hardly_compared(runs):

@@ -18,7 +18,7 @@ from posed_config import configure
 from posed_scene import fails
 
 import semstab
-from semstab.comparison.runs import LARGEST, open_run, open_runs, save_summary, shared_scenes
+from semstab.comparison.entries import LARGEST, open_run, open_runs, save_summary, shared_scenes
 from semstab.core.json_form import to_json
 from semstab.errors import ConfigError, DataError
 from semstab.statistics.cluster_sums import value

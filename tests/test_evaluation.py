@@ -24,13 +24,13 @@ from semstab.data.events import Events
 from semstab.data.voxels import VoxelTable
 from semstab.engine import Observer, load_result
 from semstab.engine.memory import MapMemory
-from semstab.errors import ConfigError, DataError
+from semstab.errors import ConfigError
 from semstab.report import terminal
+from semstab.report.comparison.own_models import own_models
 from semstab.report.tables import tables
 from semstab.report.tables import to_json as table_content
 from semstab.report.terminal import common_beginning, print_summary
 from semstab.statistics import MapSample, SpotObservations, analyse, describe
-from semstab.statistics.correctness import ACCURACY
 
 MODELS = ("a", "b", "gt")
 
@@ -80,10 +80,8 @@ def test_a_runs_statistics_are_those_of_its_saved_maps_and_events(ran) -> None:
 def test_all_that_was_found_is_printed_where_it_was_asked_for(ran) -> None:
     _, printed, summary = ran
     assert len(summary["runs"]) == 3
-    for words in ("Agreement of the frames", "Order of the models", "Consistent and right"):
+    for words in ("Agreement of the frames", "Consistent and right"):
         assert words in printed
-    (found,) = summary["comparisons"]
-    assert found["paired"]["values"]["accuracy"].keys() == {"a", "b"}
 
 
 def test_the_verdict_on_each_model_is_printed(ran) -> None:
@@ -118,24 +116,14 @@ def test_the_classes_with_most_of_the_disagreement_are_listed(tmp_path, monkeypa
 
 def test_without_asking_there_is_what_the_map_alone_tells(tmp_path) -> None:
     root = tiny_scene.write(tmp_path / "wall", ("a",))
-    result = semstab.run(configure(root, events=True), out=tmp_path / "run", report=False)
+    result = semstab.run(configure(root, events=True, truth=False), out=tmp_path / "run", report=False)
     (entry,) = result.runs
     table = VoxelTable.load(tmp_path / "run" / "voxels" / f"{entry.unit.slug}.parquet")
     spots = SpotObservations.load(tmp_path / "run" / "observations" / f"{entry.unit.slug}.parquet")
     assert to_json(entry.statistics) == to_json(describe(table, spots=spots, name="a"))
-    assert entry.statistics.drift.trend is None
-    assert result.comparisons == ()
-    again = semstab.run(configure(root, events=True), out=tmp_path / "run", report=False)  # kept
+    assert entry.statistics.drift.flips is None
+    again = semstab.run(configure(root, events=True, truth=False), out=tmp_path / "run", report=False)  # kept
     assert to_json(again.runs[0].statistics) == to_json(entry.statistics)
-
-
-def test_a_summary_with_ranks_but_not_their_values_is_refused(ran, tmp_path) -> None:
-    _, _, summary = ran
-    changed = json.loads(json.dumps(summary))
-    changed["comparisons"][0]["paired"]["values"] = {}
-    (tmp_path / "summary.json").write_text(json.dumps(changed))
-    with pytest.raises(DataError, match=r"summary\.json: .*ranks . by alpha without a value"):
-        load_result(tmp_path)
 
 
 class Interrupting(Observer):
@@ -154,17 +142,16 @@ def test_a_run_that_was_interrupted_ends_with_the_same_statistics(tmp_path) -> N
         semstab.run(config, out=tmp_path / "run", observers=[Interrupting()], report=False)
     resumed = semstab.run(config, out=tmp_path / "run", report=False)
     assert [to_json(entry.statistics) for entry in resumed.runs] == [to_json(entry.statistics) for entry in whole.runs]
-    assert to_json(resumed.comparisons) == to_json(whole.comparisons)
-    assert whole.comparisons[0].paired.of(ACCURACY)["a"].value > 0.5  # the truth was fused again
+    assert whole.runs[0].statistics.correctness.accuracy.value > 0.5  # the truth was fused again
 
 
 def test_the_first_backend_that_keeps_a_log_has_all_statistics(tmp_path) -> None:
     root = tiny_scene.write(tmp_path / "wall", ("a",))
     result = semstab.run(configure(root, backends=["open3d"], check="numpy", statistics=True), report=False)
     open3d, numpy = result.runs
-    assert open3d.statistics.drift.trend is None
+    assert open3d.statistics.drift.flips is None
     assert open3d.statistics.correctness is not None
-    assert numpy.statistics.drift.trend is not None
+    assert numpy.statistics.drift.flips is not None
     assert numpy.statistics.agreement.voxel_alpha.value == pytest.approx(open3d.statistics.agreement.voxel_alpha.value)
     assert numpy.statistics.headline.alpha.value == open3d.statistics.headline.alpha.value
     plain = semstab.run(configure(root, backends=["open3d"], check="numpy"), report=False)
@@ -185,13 +172,14 @@ def test_no_ground_truth_no_judgement(tmp_path) -> None:
     (root / "labels/gt").rmdir()
     (entry,) = semstab.run(configure(root, statistics=True), report=False).runs
     assert entry.statistics.correctness is entry.statistics.geometry is None
-    assert entry.statistics.drift.trend is not None
+    assert entry.statistics.drift.flips is not None
 
 
 def test_models_of_different_classes_are_not_compared(tmp_path) -> None:
     root = tiny_scene.write(tmp_path / "wall")
     (root / "labels/b/label_space.yaml").write_text("name: other\nclasses: [wall, door, window, sky]\n")
-    assert semstab.run(configure(root, statistics=True), report=False).comparisons == ()
+    result = semstab.run(configure(root, statistics=True), out=tmp_path / "run", report=False)
+    assert own_models(result) == []
 
 
 def test_the_log_counts_as_memory(tmp_path) -> None:
@@ -212,16 +200,20 @@ def test_summaries_of_several_scenes_say_which_one_a_verdict_is_of(tmp_path, cap
     for scene in ("x", "y"):
         tiny_scene.write(tmp_path / "walls" / scene, ("a",))
     print_summary(semstab.run(configure(tmp_path / "walls"), report=False), Console(width=80))
-    printed = " ".join(capsys.readouterr().out.split())
-    assert "x a no verdict" in printed
-    assert "y a no verdict" in printed
+    lines = capsys.readouterr().out.splitlines()
+    start = next(k for k, line in enumerate(lines) if line.startswith("  by scene"))
+    assert [" ".join(line.split()[:4]) for line in lines[start + 1 : start + 3]] == [
+        f"{scene} no verdict {alpha}"
+        for scene, alpha in zip("xy", (line.split()[3] for line in lines[start + 1 : start + 3]), strict=True)
+    ]
 
 
 # --- A study ----------------------------------------------------------------------------------------------------------
 
 
 def rows_of(found, name):
-    (table,) = (table for table in tables(found) if table.name == name)
+    made = own_models(found) if name.startswith("comparison") else tables(found)
+    (table,) = (table for table in made if table.name == name)
     return table_content(table)["rows"]
 
 
@@ -244,9 +236,7 @@ def test_the_tables_of_a_study_have_the_numbers_of_its_units(studied) -> None:
         assert row["psa"] == pytest.approx(dataclasses.asdict(own.agreement.psa), nan_ok=True)
         assert row["flip_rate"] == own.drift.flips.rate.value
     for row in rows_of(found, "drift"):
-        trend = base[row["model"]].drift.trend
-        assert row["trend_voxels"] == trend.voxels
-        assert row["trend_percent"]["value"] == pytest.approx(100 * trend.share.value, nan_ok=True)
+        assert row["voxels"] == base[row["model"]].drift.voxels
         assert row["sbd"] - row["sbd_null"] == pytest.approx(row["sbd_excess"]["value"])
     for row in rows_of(found, "ceiling"):
         assert row["disagreement"]["value"] == pytest.approx(row["geometry"]["value"] + row["model"]["value"])
@@ -258,10 +248,10 @@ def test_the_tables_of_a_study_have_the_numbers_of_its_units(studied) -> None:
         assert sum(parts) == pytest.approx(100)
     strata = [row for row in rows_of(found, "correctness") if row["model"] == "a"]
     assert strata[0]["voxels"] == sum(row["voxels"] for row in strata[1:])
-    (difference,) = (row for row in rows_of(found, "comparison") if row["measure"] == "accuracy")
-    values = {row["model"]: row["value"]["value"] for row in rows_of(found, "comparison_ranking")
-              if row["measure"] == "accuracy"}  # fmt: skip
-    assert difference["difference"]["value"] == pytest.approx(values["a"] - values["b"])
+    (difference,) = (
+        row for row in rows_of(found, "comparison_all") if row["measure"] == "accuracy" and not row["class"]
+    )
+    assert difference["difference"]["value"] == pytest.approx(difference["other"] - difference["base"])
     assert {row["verdict"] for row in rows_of(found, "verdicts")} == {"no verdict"}
 
 

@@ -1,11 +1,13 @@
-"""simulations/exact.py knows alpha: closed forms, labels by hand, and what a camera sees of a box."""
+"""simulations/exact.py knows alpha: closed forms, labels by hand, what a camera sees; how coverage is counted."""
 
+import dataclasses
 import itertools
 
 import exact
+import exact_coverage
 import numpy as np
 import pytest
-from exact_errors import border, in_squares, none, unlabelled
+from exact_errors import ERRORS, border, in_squares, none, unlabelled
 from exact_scenes import Scene, Solid, rectangle
 from exact_views import Flight, Pinhole, flight, strips
 
@@ -129,3 +131,76 @@ def test_points_are_as_frequent_as_their_surface_is_large():
 def test_the_tool_is_near_the_exact_value_where_errors_are_alike_everywhere():
     true, own = exact.trial(exact.Condition("orbit", "pixels", 12), 0, (60, 80), 4000)
     assert own.value == pytest.approx(true.value, abs=0.03)
+
+
+@pytest.mark.parametrize("error", [name for name in ERRORS if name != "none"])
+def test_stronger_errors_leave_less_agreement_than_weak_ones(error):
+    def at(strength):
+        rng = np.random.default_rng(3)
+        flown = flight("orbit", 8, 6, (45, 60), rng)
+        wrong = [
+            ERRORS[error](flown, 6, np.random.default_rng(4), strength)(seen) != seen.truth for seen in flown.images
+        ]
+        return np.mean(np.concatenate(wrong)[np.concatenate([seen.face for seen in flown.images]) >= 0])
+
+    assert 0 < at(0.3) < at(1.0) < 0.6
+
+
+def test_a_scene_is_flown_again_along_another_course_at_the_same_height():
+    condition = exact.Condition("orbit", "blobs", 5)
+    scene = flight("orbit", 1, 6, (45, 60), np.random.default_rng(0)).scene
+    one, other = (exact_coverage.again(condition, scene, np.random.default_rng(seed)) for seed in (1, 2))
+    assert np.abs(one.poses[:, :2, 3] - other.poses[:, :2, 3]).max() > 2
+    assert one.poses[:, 2, 3] == pytest.approx(18, abs=3)
+    assert np.hypot(*other.poses[:, :2, 3].T) == pytest.approx(18, abs=3)
+    for flown in (one, other):
+        assert flown.poses[:, :3, :3] @ flown.poses[:, :3, :3].transpose(0, 2, 1) == pytest.approx(
+            np.tile(np.eye(3), (5, 1, 1))
+        )
+        assert np.mean(flown.images[0].face >= 0) > 0.8  # it looks at the scene
+
+
+def flown(scene, exact, said, half, level="usable", probability=0.95, condition="orbit, blobs"):
+    return exact_coverage.Flown(condition, scene, exact, said, said - half, said + half, level, probability)
+
+
+def test_coverage_counts_the_scene_s_exact_alpha_and_not_that_of_a_flight():
+    rows = [
+        flown(0, 0.70, 0.72, 0.014),
+        flown(0, 0.74, 0.75, 0.014),
+        flown(1, 0.9, 0.9, 0.01),
+        flown(1, 0.9, 0.9, 0.01),
+    ]
+    name, count, targets, off, held, spread_held, _ = exact_coverage.cells("orbit, blobs", rows)
+    assert (name, count, targets) == ("orbit, blobs", "4", "0.72 to 0.90")
+    assert off.startswith("+0.008")
+    assert held.startswith("0.750")  # .736 to .764 misses .72
+    assert spread_held.startswith("0.500")  # and both miss what they say on average, .735
+
+
+def test_stated_probabilities_are_counted_by_tenths_and_by_group():
+    rows = [flown(0, 0.70, 0.72, 0.01, probability=0.65), flown(0, 0.70, 0.81, 0.01, "stable", 0.62)]
+    rows += [
+        flown(0, 0.9, 0.9, 0.01, "stable", 1.0, "orbit, burst"),
+        flown(0, 0.9, 0.8, 0.5, "undecided", 0.5, "orbit, lasting"),
+    ]
+    lines = {line[0]: line[1:] for line in exact_coverage.tenths(rows)}
+    assert lines["60% to 70%"] == ["0.50, stated 0.64", "2", "-", "0", "-", "0"]
+    assert lines["90% to 100%"] == ["-", "0", "1.00, stated 1.00", "1", "-", "0"]
+    assert lines["undecided"] == ["0.00 of 2", "0", "0.00 of 1", "0", "1.00 of 1", "1"]
+
+
+def test_what_is_saved_is_read_as_it_was(tmp_path):
+    rows = [flown(0, 0.70, 0.72, 0.01), flown(1, 0.1, 0.2, 0.3, "undecided", 0.4)]
+    with (tmp_path / "flights.csv").open("w", newline="") as file:
+        exact_coverage.writer_to(file).writerows(map(dataclasses.astuple, rows))
+    assert exact_coverage.load(tmp_path / "flights.csv") == rows
+
+
+def test_all_flights_of_a_scene_have_its_errors_of_place_and_others_are_drawn_again(monkeypatch):
+    monkeypatch.setattr(exact_coverage, "SIZE", (45, 60))
+    monkeypatch.setattr(exact_coverage, "POINTS", 500)
+    for error, least, most in (("place", 1.0, 1.0), ("blobs", 0.0, 0.99)):
+        rows = list(exact_coverage.flights(exact.Condition("orbit", error, 4), 1, 2, 0))
+        assert [row.scene for row in rows] == [0, 0]
+        assert all(least <= row.exact <= most for row in rows)

@@ -9,7 +9,6 @@ import numpy as np
 import predicted_scene
 import pytest
 
-from semstab.backends.shared.association import observe
 from semstab.data.frames import Frame, Intrinsics
 from semstab.data.labels import LabelSpace
 from semstab.errors import ConfigError
@@ -73,27 +72,12 @@ def votes(maps, now):
     return now
 
 
-@pytest.mark.parametrize("text", ["vote:3", "vote-warped:3"])
-def test_votes_count_the_last_labels(text):
+def test_votes_count_the_last_labels():
     given = beliefs(6)
-    found = [belief.argmax(axis=2) for belief in after(text, given)]
+    found = [belief.argmax(axis=2) for belief in after("vote:3", given)]
     maps = [belief.argmax(axis=2) for belief in given]
     for t in range(6):
-        window = []
-        for age in range(min(3, t + 1)):
-            seen = maps[t - age] + 1
-            for _ in range(age if "warped" in text else 0):
-                seen = moved(seen)
-            window.insert(0, seen - 1)
-        np.testing.assert_array_equal(found[t], votes(window, np.full(SHAPE, -1)))
-
-
-def test_threshold_ignores_what_is_unsure():
-    (given,) = beliefs(1)
-    (found,) = after("threshold:0.6", [given])
-    sure = given.max(axis=2) >= 0.6
-    assert 0.05 < sure.mean() < 0.95
-    np.testing.assert_array_equal(found, given * sure[..., None])
+        np.testing.assert_array_equal(found[t], votes(maps[max(t - 2, 0) : t + 1], np.full(SHAPE, -1)))
 
 
 def test_guided_is_a_line_in_each_window_averaged():
@@ -114,27 +98,6 @@ def test_guided_is_a_line_in_each_window_averaged():
         a, b = line[window(v, u)].mean(axis=(0, 1)).T
         wanted = np.maximum(a * grey[v, u] + b, 0)
         np.testing.assert_allclose(found[v, u], wanted / wanted.sum(), atol=2e-4)
-
-
-def test_map_prior_multiplies_by_what_frames_before_said_of_the_voxel():
-    given, evidence = beliefs(4), {}
-    for k, (belief, found) in enumerate(zip(given, after("map-prior:0.25", given), strict=True)):
-        frame = dataclasses.replace(predicted_scene.frame(k, 1), labels=None, scores=belief, color=None)
-        seen = observe(frame, 0.25, K)
-        where = np.floor(points(frame) / 0.25).astype(int)
-        E = np.array([evidence.get(tuple(q), np.zeros(K)) for q in where.reshape(-1, 3)]).reshape(belief.shape)
-        wanted = (0.8 * belief + 0.2 / K) * (E + 1 / K) / (E.sum(axis=2, keepdims=True) + 1)
-        np.testing.assert_allclose(found, wanted / wanted.sum(axis=2, keepdims=True), atol=1e-5)
-        for q, s in zip(seen.index, seen.s_bar, strict=True):
-            evidence[tuple(q)] = evidence.get(tuple(q), np.zeros(K)) + s
-
-
-def points(frame):
-    H, W = frame.shape
-    camera = frame.intrinsics
-    v, u = np.mgrid[:H, :W]
-    rays = np.stack([(u - camera.cx) / camera.fx, (v - camera.cy) / camera.fy, np.ones((H, W))], axis=2)
-    return (rays * frame.depth[..., None]) @ frame.T_wc[:3, :3].T + frame.T_wc[:3, 3]
 
 
 @pytest.mark.parametrize("text", REGISTRY.builtin)
@@ -223,14 +186,14 @@ def predict(model, n, **options):
 
 def test_filters_work_in_their_order_on_scores():
     given = beliefs(3)
-    model = filtered(given, "ema:0.5", "threshold:0.4")
+    model = filtered(given, "ema:0.5", "vote:3")
     found = predict(model, 3, scores=True)
-    wanted = after("threshold:0.4", after("ema:0.5", given))
+    wanted = after("vote:3", after("ema:0.5", given))
     for prediction, belief in zip(found, wanted, strict=True):
         np.testing.assert_array_equal(prediction.scores, belief)
         ids = np.where(belief.any(axis=2), np.array([3, 5, 7, 9])[belief.argmax(axis=2)], 255)
         np.testing.assert_array_equal(prediction.labels, ids)
-    assert model.identity() == {"fixed": 1, "filters": ["ema:0.5", "threshold:0.4"]}
+    assert model.identity() == {"fixed": 1, "filters": ["ema:0.5", "vote:3"]}
     assert (model.sequential, model.wants_geometry, model.gives_scores) == (True, False, True)
     assert predict(filtered(given, "ema:0.5"), 3)[0].scores is None
 
@@ -273,23 +236,13 @@ def test_a_sequence_begins_without_memory(text):
         ("ema:x", r"got 'x'"),
         ("ema:nan", r"got 'nan'"),
         ("vote:2.5", r"filter 'vote:2.5': the number of labels that vote is a whole number from 2 to 1000; got '2.5'"),
-        ("vote-warped:1", r"from 2 to 1000"),
+        ("vote:1", r"from 2 to 1000"),
         ("guided:0", r"the radius of the windows in pixels is a whole number from 1 to 500"),
-        ("map-prior:-1", r"the edge of a voxel in metres"),
     ],
 )
 def test_filters_that_there_are_not(text, said):
     with pytest.raises(ConfigError, match=said):
         parse(text)
-
-
-def test_a_filter_that_needs_scores_of_a_model_without():
-    said = (
-        r"--filter threshold:0.6: it needs scores, and 'fixed' gives labels alone; leave it out, or put one before it"
-    )
-    with pytest.raises(ConfigError, match=said):
-        filtered([], "threshold", scores=False)
-    assert filtered([], "vote:5", "threshold", scores=False).gives_scores
 
 
 def test_regions_have_no_classes_to_filter():
@@ -300,14 +253,11 @@ def test_regions_have_no_classes_to_filter():
 
 
 def test_each_filter_looks_at_what_it_needs():
-    looks = ("sequential", "wants_geometry", "wants_color", "needs_scores", "warps")
+    looks = ("sequential", "wants_geometry", "wants_color", "warps")
     found = {name: {look for look in looks if getattr(REGISTRY.load(name), look)} for name in REGISTRY.entries()}
     assert found == {
         "ema": {"sequential"},
         "ema-warped": {"sequential", "wants_geometry", "warps"},
         "vote": {"sequential"},
-        "vote-warped": {"sequential", "wants_geometry", "warps"},
         "guided": {"wants_color"},
-        "threshold": {"needs_scores"},
-        "map-prior": {"sequential", "wants_geometry"},
     }

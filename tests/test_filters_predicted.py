@@ -38,7 +38,7 @@ class Noisy:
         scores = np.exp(-(((grey + noise)[..., None] - [0.25, 0.5, 0.75]) / 0.15) ** 2)
         return (scores / scores.sum(axis=2, keepdims=True)).astype(np.float32)
 """
-FILTERS = [*(str(parse(name)) for name in REGISTRY.builtin), "ema-warped:0.8+threshold:0.5", "vote:3+guided:2"]
+FILTERS = [*(str(parse(name)) for name in REGISTRY.builtin), "ema-warped:0.8+vote:3", "vote:3+guided:2"]
 
 
 @pytest.fixture
@@ -88,7 +88,7 @@ def test_live_and_on_disk_are_the_same(scene):
 def test_over_labels_that_are_there_they_say_what_they_say_over_the_model(scene, scores):
     to_disk(scene, predictor(scene), scores=scores, score_type="float32")
     source = "noisy-scores" if scores else "noisy"
-    for text in FILTERS if scores else ["ema:0.6", "vote-warped:3", "map-prior:0.2"]:
+    for text in FILTERS if scores else ["ema:0.6", "ema-warped:0.6", "vote:3"]:
         filters = text.split("+")
         config = resolve(filtered_config(filters, None, {"dataset": dataset_of(scene), "models": [source]}))
         opened = open_dataset("predicted", config.dataset.options).scene("flight")
@@ -124,7 +124,7 @@ def test_the_filters_are_part_of_what_a_unit_depends_on(scene):
     def digest(text):
         return live(predicted_config([predictor(scene, text)], None, {"dataset": dataset_of(scene)}))[1]
 
-    assert len({digest(text) for text in ("", "ema:0.6", "ema:0.7", "ema:0.6+threshold:0.5")}) == 4
+    assert len({digest(text) for text in ("", "ema:0.6", "ema:0.7", "ema:0.6+guided:8")}) == 4
 
 
 def test_labels_that_change_on_disk_are_filtered_again(scene):
@@ -159,7 +159,7 @@ def test_filters_over_one_model_share_its_maps(scene, monkeypatch, shown):
     (scene.parent / "counted.py").write_text(COUNTED)
     monkeypatch.setenv("COUNTS", str(scene.parent / "count"))
     file = f"{scene.parent / 'counted.py'}:net"
-    chains = [["ema:0.6"], ["vote:3"], ["guided:4", "threshold:0.6"]]
+    chains = [["ema:0.6"], ["vote:3"], ["guided:4", "vote:3"]]
     models = [parse_predictor(file)] * shown + [parse_predictor(file, filters=chain) for chain in chains]
     out = scene.parent / "run"
     config = predicted_config(models, None, {"dataset": dataset_of(scene), "voxel_size": 0.25})
@@ -167,7 +167,7 @@ def test_filters_over_one_model_share_its_maps(scene, monkeypatch, shown):
     assert (scene.parent / "count").read_text() == "x" * 6
     base = "net" if shown else "net-ema-0.6-unfiltered"
     assert {path.name for path in (out / "predictions/flight/scores").iterdir()} == {base}
-    names = ["net-ema-0.6", "net-vote-3", "net-guided-4-threshold-0.6"]
+    names = ["net-ema-0.6", "net-vote-3", "net-guided-4-vote-3"]
     assert [record.unit.model for record in found.runs] == ["net"] * shown + names
     for name, chain in zip(names, chains, strict=True):
         alone = load_predictor(parse_predictor(file, filters=chain))
@@ -187,18 +187,17 @@ def bench(*words):
 
 def test_a_chain_from_the_command_line(scene):
     to_disk(scene, predictor(scene))
-    chain = ("--filter", "vote:3", "--filter", "threshold:0.5")
+    chain = ("--filter", "vote:3", "--filter", "guided:2")
     result = bench("predict", "--model", "stored", "--set", "source=noisy", *chain, "--data", scene, "--quiet")
     assert result.exit_code == 0, result.output
-    said = json.loads((scene / "labels/noisy-vote-3-threshold-0.5/predictions.json").read_text())
-    assert said["settings"]["filters"] == ["vote:3", "threshold:0.5"]
-    assert (stored(scene, "noisy-vote-3-threshold-0.5")[2] == 255).any()
+    said = json.loads((scene / "labels/noisy-vote-3-guided-2/predictions.json").read_text())
+    assert said["settings"]["filters"] == ["vote:3", "guided:2"]
+    assert not np.array_equal(stored(scene, "noisy-vote-3-guided-2"), stored(scene))
 
 
 @pytest.mark.parametrize(
     ("words", "said"),
     [
-        (("--model", "noisy", "--filter", "threshold"), "it needs scores, and 'noisy' gives labels alone"),
         (("--model", "noisy", "--filter", "smooth"), "filter 'smooth' is not known"),
         (("--predict", "stored,source=nosy", "--filter", "ema"), "model 'nosy' is not there; did you mean 'noisy'"),
         (("--predict", "stored,filters=[ema]"), "source"),

@@ -23,15 +23,16 @@ from typer.testing import CliRunner
 
 import semstab
 from semstab.cli import app
-from semstab.comparison import differences, gate_report
-from semstab.comparison.gate import gate, gate_config
-from semstab.comparison.gate_evaluation import LOST, bounded
-from semstab.comparison.gate_result import GateResult, Judgement, negative, verdict
-from semstab.comparison.gate_rules import parse
-from semstab.comparison.runs import open_run, save_summary
+from semstab.comparison import differences
+from semstab.comparison.entries import open_run, save_summary
 from semstab.data.measures import Measure, margin, registered, sbd
 from semstab.data.statistics import Interval
 from semstab.errors import ConfigError, DataError
+from semstab.gating import report as gate_report
+from semstab.gating.evaluation import LOST, bounded
+from semstab.gating.gate import gate, gate_config
+from semstab.gating.result import GateResult, Judgement, negative, verdict
+from semstab.gating.rules import parse
 from semstab.statistics.accumulate import cluster_sums_of
 from semstab.statistics.cluster_sums import value
 from semstab.statistics.intervals import difference, same_flight, shares_of, within_a_flight

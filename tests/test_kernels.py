@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-import numba as nb
 import numpy as np
 import pytest
 
 from semstab.backends.shared import tile_loops
-from semstab.backends.shared.tile_loops import LANES, runs_of_eight
+from semstab.backends.shared.tile_loops import LANES, runs_of
 
 
 @pytest.mark.parametrize("margin", [2.0**-31, 2.0**-30 * 1.01, 2.0**-20, 1e-3, 0.4, 1e4])
@@ -20,24 +19,12 @@ def test_a_voxels_face_is_as_wide_as_its_margin_at_least(margin) -> None:
         assert (bits & face == 0) == (abs(fraction) < half or half >= 0.5)
 
 
-@pytest.mark.parametrize("features", [None, ""])
-def test_runs_are_the_same_with_and_without_wide_vectors(features, monkeypatch) -> None:
-    """None: the instructions of this machine."""
-    if features is not None:
-        monkeypatch.setattr("numba.core.codegen.JITCPUCodegen.magic_tuple", lambda _: ("", "", features))
-
-    @nb.njit
-    def runs(words, run_word, run_end):
-        n = 0
-        for at in range(0, words.shape[0] - LANES, LANES):
-            n = runs_of_eight(words, at, run_word, run_end, n)
-        return n
-
+def test_runs_of_equal_words() -> None:
     rng = np.random.default_rng(2)
     for values in (1, 2, 50):
         words = np.append(rng.integers(0, values, 10 * LANES), -1)
         run_word, run_end = np.zeros((2, len(words) + LANES), dtype=np.int64)
-        n = runs(words, run_word, run_end)
+        n = runs_of(words, run_word, run_end)
         last = np.flatnonzero(words[:-1] != words[1:])
         np.testing.assert_array_equal(run_end[:n], last + 1)
         np.testing.assert_array_equal(run_word[:n], words[last])

@@ -21,7 +21,7 @@ from posed_scene import fails
 from posed_writer import write_posed
 
 import semstab
-from semstab.comparison.runs import open_run, save_summary
+from semstab.comparison.entries import open_run, save_summary
 from semstab.configure import shipped_benchmarks
 from semstab.datasets import city
 from semstab.errors import ConfigError, DataError

@@ -25,7 +25,7 @@ from scipy.spatial.transform import Rotation
 
 import semstab
 from semstab import backends
-from semstab.comparison.calibration import calibrate_run
+from semstab.comparison import voxels as common_voxels
 from semstab.comparison.differences import find
 from semstab.core.json_form import to_json
 from semstab.data import voxels
@@ -39,7 +39,7 @@ from semstab.errors import ConfigError, DataError, OutgrownError
 from semstab.exports import export, maps
 from semstab.exports.fused_labels import Belief
 from semstab.exports.relabel import relabel
-from semstab.statistics import model_comparison
+from semstab.gating.calibration import calibrate_run
 from semstab.statistics.cluster_sums import ClusterSums
 from semstab.testing import EXACT, SUMS, random_frames, sight_line
 
@@ -198,12 +198,12 @@ def judged(wall, tmp_path_factory):
 
 
 def test_statistics_of_tiles_are_those_of_the_whole_map(judged) -> None:
-    """With log and ground truth: trends, flips, quadrants; each column of each voxel."""
+    """With log and ground truth: flips, quadrants; each column of each voxel."""
     assert_same_run(*judged)
     whole, tiles = judged
     (statistics,) = (run["statistics"] for run in summary_of(tiles)["runs"])
     assert all(statistics[name] is not None for name in ("geometry", "correctness", "flipping"))
-    assert statistics["drift"]["trend"]["voxels"] > 0
+    assert statistics["drift"]["flips"]["rate"]["value"] > 0
     one, other = (semstab.load(folder) for folder in (tiles, whole))
     names = parquet.read_schema(other.result.records[0].voxels_file).names
     names = [name for name in names if name != "evidence"]
@@ -295,7 +295,7 @@ def test_a_cloud_takes_from_tiles_what_it_takes_from_the_whole_map(both, tmp_pat
     written = []
     for folder in both:
         out = tmp_path / f"{folder.name}.ply"
-        (exported,) = export(folder, out, onto=cloud, radius=0.3)
+        (exported,) = export(folder, out, classify=cloud, radius=0.3)
         written.append((out.read_bytes(), exported.content))
     assert written[0] == written[1]
     assert "100.0%" not in written[0][1]
@@ -321,20 +321,20 @@ def test_backends_are_held_against_each_other_tile_by_tile(wall, tmp_path) -> No
 
 
 def test_models_are_compared_tile_by_tile(tmp_path) -> None:
-    """Coverage, means at a common OP, common looks: with logs and ground truth."""
+    """With ground truth."""
     root, found = tiny_scene.write(tmp_path / "wall", frames=8), []
     for size in (None, 8):
         settings = {"check": None, "backends": ["numba"], "statistics": True, "events": True, "tile_size": size}
         semstab.run(configure(root, **settings), out=tmp_path / str(size), report=False)
-        found.append(summary_of(tmp_path / str(size))["comparisons"])
+        found.append(to_json(semstab.compare([tmp_path / str(size)]).overall))
     assert differences(*found, tolerance=1e-12) == []
     assert_same_comparison(*(tmp_path / size for size in ("None", "8")))
 
 
 def test_evidence_is_calibrated_on_tiles_as_on_the_whole_map(judged, monkeypatch) -> None:
     """Also on the sample that stands for a large map."""
-    for most in (model_comparison.MOST, 100):
-        monkeypatch.setattr(model_comparison, "MOST", most)
+    for most in (common_voxels.MOST, 100):
+        monkeypatch.setattr(common_voxels, "MOST", most)
         one, other = (calibrate_run(folder, precision=0.6) for folder in judged)
         assert one == other
         assert ("1 in 4 of the locations" in one.calibrated_on) == (most == 100)

@@ -14,7 +14,7 @@ from posed_config import configure
 
 import semstab
 from semstab.cli import _Once
-from semstab.comparison.runs import open_run, save_summary
+from semstab.comparison.entries import open_run, save_summary
 from semstab.core.console import Console
 from semstab.errors import ConfigError
 from semstab.leaderboard.submission import ModelCard

@@ -18,6 +18,7 @@ from simulated_events import grid, log_of, log_of_evidence, soft, spots_of
 from striped_floor import K, flight, fused, numbered, sampled
 
 from semstab import backends
+from semstab.comparison.observations import common_observations
 from semstab.datasets import open_dataset
 from semstab.errors import DataError
 from semstab.statistics import Sampler, SpotObservations, Views, describe, disagreement, psa
@@ -26,7 +27,6 @@ from semstab.statistics.cluster_sums import lever_of, value
 from semstab.statistics.intervals import estimate
 from semstab.statistics.loops.spots import OFF, hash_cell
 from semstab.statistics.observations import COLUMNS
-from semstab.statistics.paired_differences import common_observations
 
 DATA = Path(os.environ.get("SEMSTAB_DATA", Path(__file__).parents[2] / "shared/data"))
 

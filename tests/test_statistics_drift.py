@@ -1,4 +1,4 @@
-"""Drift beside random order, exactly and by turns; trends that are zero without drift in the mean; flips."""
+"""Drift beside random order, exactly and by turns; flips."""
 
 from __future__ import annotations
 
@@ -10,10 +10,9 @@ import numpy as np
 import pytest
 from simulated_events import grid, log_of, log_of_evidence, soft
 
-from semstab.data.events import Events
 from semstab.data.information import js_divergence, normalise
 from semstab.metrics import sbd, vss
-from semstab.statistics import describe, expected_sbd, flips, trends
+from semstab.statistics import describe, expected_sbd, flips
 
 
 def sbd_of(evidence):
@@ -25,12 +24,6 @@ def sbd_of(evidence):
 def drifting(rng, n, T):
     """Labels (n, T) of two classes whose belief moves one way: the second one's share rises from 0.1 to 0.9."""
     return (rng.random((n, T)) < np.linspace(0.1, 0.9, T)).astype(int)
-
-
-def share(log):
-    """The share of all disagreement that goes one way in time."""
-    found = trends(log)
-    return np.nansum(found.common) / np.nansum(found.variation)
 
 
 # --- Random order -----------------------------------------------------------------------------------------------------
@@ -106,70 +99,14 @@ def test_the_same_seed_gives_the_same_numbers_for_any_number_of_threads():
     np.testing.assert_array_equal(alone[rows], expected_sbd(table.rows(rows), events.rows(rows), seed=7))
 
 
-# --- Trends -----------------------------------------------------------------------------------------------------------
-
-
-def test_the_trend_is_the_product_of_two_slopes_by_least_squares():
-    rng = np.random.default_rng(1)
-    evidence, seen = soft(rng, 30, 13), rng.random((30, 13)) < 0.5
-    seen[:, 0] = True
-    found = trends(log_of_evidence(evidence, seen))
-    for i in range(30):
-        own = evidence[i, seen[i]]
-        if len(own) < 6:
-            assert np.isnan([found.common[i], found.variation[i], found.share[i]]).all()
-            continue
-        slopes, lengths, variation = [], [], 0.0
-        for half in (own[0::2], own[1::2]):
-            time = np.arange(len(half)) - (len(half) - 1) / 2
-            slopes.append(np.polyfit(time, half, 1)[0])
-            lengths.append((time**2).sum())
-            variation += ((half - half.mean(axis=0)) ** 2).sum()
-        common = 2 * slopes[0] @ slopes[1] * math.sqrt(lengths[0] * lengths[1])
-        assert found.common[i] == pytest.approx(common, abs=1e-12)
-        assert found.share[i] == pytest.approx(common / variation)
-        assert -1 <= found.share[i] <= 1
-    assert np.isnan(found.share).any()
-
-
-def test_a_straight_move_is_all_trend_and_places_that_agree_tell_nothing():
-    for looks, expected in ((8, 1), (9, 2 * math.sqrt(10 * 5) / (10 + 5))):
-        part = np.linspace(0, 1, looks)
-        straight = log_of_evidence(np.stack([1 - part, part], axis=1)[None])
-        np.testing.assert_allclose(trends(straight).share, [expected])
-    for labels in (np.zeros((0, 3), dtype=int), np.ones((1, 8), dtype=int)):
-        assert np.isnan(trends(log_of(labels)).share).all()
-
-
-def test_the_trend_of_independent_errors_is_zero_whatever_their_variance():
-    """Frames that see more and more pixels have less and less noise: no test of order holds its level there."""
-    rng = np.random.default_rng(5)
-    pixels = np.broadcast_to(np.arange(1, 13) ** 2, (4000, 12))
-    wrong = rng.binomial(pixels, 0.3) / pixels
-    found = trends(log_of_evidence(np.stack([1 - wrong, wrong], axis=2)))
-    assert found.common.mean() == pytest.approx(0, abs=4 * found.common.std() / math.sqrt(4000))
-
-
-def test_a_belief_that_moves_one_way_is_found_where_vss_cannot_tell_it_from_noise():
+def test_a_belief_that_moves_one_way_has_less_drift_than_noise_of_the_same_labels():
     rng = np.random.default_rng(4)
     moving = drifting(rng, 900, 40)
     logs = [log_of(labels, K=2, index=grid(30)) for labels in (moving, rng.permuted(moving, axis=1))]
     assert np.array_equal(vss(logs[0].table()), vss(logs[1].table()))
     drift, noise = (describe(log.table(), log).drift for log in logs)
-    assert drift.trend.share.low > 0.15
-    assert noise.trend.share.low < 0 < noise.trend.share.high
-    assert drift.trend.share.value == pytest.approx(share(logs[0]))
-    assert drift.trend.voxels == np.count_nonzero(~np.isnan(trends(logs[0]).share))
     assert drift.excess.high < 0, "late evidence moves the belief less, so SBD falls below its null"
-
-
-def test_frames_need_not_be_numbered_from_zero_nor_come_in_order():
-    """Time is the order in which observations came."""
-    plain = log_of(np.random.default_rng(0).integers(0, 2, size=(400, 36)))
-    other = Events(
-        plain.ix, plain.iy, plain.iz, plain.voxel, 1000 - plain.frame, plain.evidence, plain.pixels, plain.voxel_size
-    )
-    np.testing.assert_array_equal(trends(plain).common, trends(other).common)
+    assert noise.excess.low < 0 < noise.excess.high
 
 
 # --- Flips ------------------------------------------------------------------------------------------------------------

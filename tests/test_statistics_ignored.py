@@ -7,28 +7,26 @@ import math
 
 import numpy as np
 import pytest
-from simulated_events import grid, log_of_evidence
-from striped_floor import K, flight, fused, sampled
+from simulated_events import log_of_evidence
+from striped_floor import K, flight, sampled
 
+from semstab.comparison.differences import sums_difference
+from semstab.comparison.observations import common_observations, compared_observations, psa_bounds
 from semstab.data.contrast import ComparedObservations
-from semstab.statistics import compare_models
 from semstab.statistics.accumulate import sums_of_spots
 from semstab.statistics.cluster_sums import value
 from semstab.statistics.observations import COLUMNS
-from semstab.statistics.paired_differences import common_observations, psa_bounds, stratum_counts, thin_share
-
-SIZE = 0.2
 
 
 def compared(**flights):
     """Models that made these frames, on common observations."""
-    tables = {name: fused(frames, SIZE).table() for name, frames in flights.items()}
-    return compare_models(tables, observations={name: sampled(frames) for name, frames in flights.items()})
+    return compared_observations({name: sampled(frames) for name, frames in flights.items()})
 
 
 def of_alpha(found):
-    (row,) = (row for row in found.paired.differences if row.measure == "alpha")
-    return row
+    """Alpha of the first model minus alpha of the second one."""
+    first, second = found.sums.values()
+    return sums_difference("alpha", first, second)
 
 
 def without(frames, left_out):
@@ -46,7 +44,7 @@ def test_pixels_that_are_dropped_at_random_make_no_difference():
     frames = list(flight(12, flicker=0.2, patch=10))
     half = without(frames, lambda frame: rng.random(frame.shape) < 0.5)
     row = of_alpha(compared(whole=frames, half=half))
-    assert row.difference.value == row.difference.low == row.difference.high == 0
+    assert row.value == row.low == row.high == 0
 
 
 def errs_silently(seed=1):
@@ -60,7 +58,7 @@ def errs_silently(seed=1):
 
 def test_the_order_is_said_to_depend_on_errors_that_were_left_out():
     silent, share = errs_silently()
-    found = compared(silent=silent, better=list(flight(8, flicker=0.22, patch=10, seed=2))).observations
+    found = compared(silent=silent, better=list(flight(8, flicker=0.22, patch=10, seed=2))).compared
     missing = {row.model: row for row in found.ignored}
     assert found.order == ("silent", "better")
     assert found.order_ignored == ("better", "silent")
@@ -73,24 +71,23 @@ def test_the_order_is_said_to_depend_on_errors_that_were_left_out():
 def test_bounds_hold_the_agreement_that_there_is_where_nothing_is_left_out():
     silent, _ = errs_silently()
     whole = list(flight(8, flicker=0.3, patch=10, seed=1))
-    (full,) = (row for row in compared(a=whole, b=whole).observations.ignored if row.model == "a")
-    (some,) = (row for row in compared(silent=silent, whole=whole).observations.ignored if row.model == "silent")
+    (full,) = (row for row in compared(a=whole, b=whole).compared.ignored if row.model == "a")
+    (some,) = (row for row in compared(silent=silent, whole=whole).compared.ignored if row.model == "silent")
     assert full.psa_low == full.psa_high
     assert some.psa_low < full.psa_low < some.psa_high
 
 
 def test_maps_that_left_nothing_out_have_an_order_that_depends_on_nothing():
     found = compared(steady=list(flight(8, flicker=0.1, patch=10)), nervous=list(flight(8, flicker=0.4, patch=10)))
-    assert found.observations.order == ("steady", "nervous")
-    assert found.observations.bounded
-    assert not found.observations.depends
-    assert found.paired.primary == "alpha"
-    assert of_alpha(found).p_holm < 0.05
+    assert found.compared.order == ("steady", "nervous")
+    assert found.compared.bounded
+    assert not found.compared.depends
+    assert of_alpha(found).p_value < 0.05
 
 
 def test_the_order_of_a_model_and_itself_depends_on_nothing():
     frames = list(flight(8, flicker=0.3, patch=10, seed=1))
-    found = compared(a=frames, b=frames).observations
+    found = compared(a=frames, b=frames).compared
     assert (found.order, found.bounded, found.depends) == (("a", "b"), True, False)
 
 
@@ -98,10 +95,8 @@ def test_scores_beside_labels_of_the_same_likeliest_class_make_no_difference_in_
     frames = list(flight(8, flicker=0.2, patch=10))
     unsure = [dataclasses.replace(f, labels=None, scores=0.2 + 0.4 * np.eye(K)[f.labels]) for f in frames]
     found = compared(labels=frames, scores=unsure)
-    assert of_alpha(found).difference.value == of_alpha(found).difference.low == of_alpha(found).difference.high == 0
-    (of_voxels,) = (row for row in found.paired.differences if row.measure == "voxel_alpha")
-    assert of_voxels.difference.value > 0.1
-    assert math.isnan(of_voxels.p_value)
+    row = of_alpha(found)
+    assert row.value == row.low == row.high == 0
 
 
 def across(frame):
@@ -139,16 +134,15 @@ def test_a_model_that_leaves_the_hardest_out_is_not_more_stable(hardest):
     assert apart[1] - apart[0] > 0.05  # each on its own observations
     found = compared(bold=bold, shy=shy)
     row = of_alpha(found)
-    assert row.difference.value == row.difference.low == row.difference.high == 0
-    assert not row.p_holm <= 0.05
-    missing = {row.model: row for row in found.observations.ignored}
+    assert row.value == row.low == row.high == 0
+    missing = {row.model: row for row in found.compared.ignored}
     assert missing["shy"].alpha < missing["bold"].alpha
 
 
 @pytest.mark.parametrize("hardest", [at_borders, anew_in_each_frame])
 def test_that_a_model_leaves_the_hardest_out_is_said(hardest):
     bold, shy = bold_and_shy(hardest)
-    found = compared(shy=shy, bold=bold).observations
+    found = compared(shy=shy, bold=bold).compared
     missing = {row.model: row.missing for row in found.ignored}
     assert missing["shy"] == pytest.approx(0.15, abs=0.02)
     assert missing["bold"] == 0
@@ -177,9 +171,9 @@ def test_common_observations_are_of_spots_to_which_all_models_gave_labels_at_the
 def test_models_without_common_frames_have_no_common_observations():
     apart = [dataclasses.replace(f, index=f.index + 10) for f in flight(4)]
     found = compared(a=list(flight(4)), b=apart)
-    assert isinstance(found.observations, ComparedObservations)
-    assert (found.observations.spots, found.observations.observations) == (0, 0)
-    assert math.isnan(of_alpha(found).difference.value)
+    assert isinstance(found.compared, ComparedObservations)
+    assert (found.compared.spots, found.compared.observations) == (0, 0)
+    assert math.isnan(of_alpha(found).value)
 
 
 def test_bounds_of_agreement_by_hand():
@@ -188,12 +182,3 @@ def test_bounds_of_agreement_by_hand():
     views[0, [0, 1, 2], [0, 0, 2]] = 1
     assert psa_bounds(log_of_evidence(views)) == (pytest.approx(1 / 3), pytest.approx(1))
     assert all(map(math.isnan, psa_bounds(log_of_evidence(views[:, :1]))))
-
-
-def test_strata_of_which_one_map_has_hardly_a_voxel_are_thin():
-    often = log_of_evidence(np.tile(np.eye(3)[0], (400, 8, 1)), index=grid(20)).table()
-    seldom = np.arange(8) < np.where(np.arange(400) < 20, 8, 2)[:, None]
-    few = log_of_evidence(np.tile(np.eye(3)[0], (400, 8, 1)), seldom, index=grid(20)).table()
-    assert compare_models({"a": often, "b": few}).standardised.thin == 1
-    same = stratum_counts({"a": often, "b": often})
-    assert thin_share(same, np.array([0, 0, 0, 0, 0, 1.0, 0, 0, 0, 0, 0])) == 0

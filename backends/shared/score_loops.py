@@ -13,7 +13,7 @@ from numba.extending import intrinsic
 
 from semstab.backends.shared.keys import PARTITIONS, mix, partition_of
 from semstab.backends.shared.pixel_keys import exact_keys_of_points, exact_keys_of_row
-from semstab.backends.shared.tile_loops import runs_of_eight
+from semstab.backends.shared.tile_loops import runs_of
 from semstab.core.compiled import parallel, serial
 
 # Sums over the scores of pixels, eight classes at a time, for compiled loops.
@@ -255,9 +255,7 @@ def _add_stretch(scores, at, K, stride, words, scale, run_word, run_end, table, 
         some = words[u] & words[u + 1] & words[u + 2] & words[u + 3]
         if (some & words[u + 4] & words[u + 5] & words[u + 6] & words[u + 7]) >= 0:
             scale_eight(scores, at + u * K, K, words, scale, u)
-    runs = 0
-    for u in range(0, pixels, LANES):
-        runs = runs_of_eight(words, u, run_word, run_end, runs)
+    runs = runs_of(words[: pixels + 1], run_word, run_end)
     begin = np.int64(0)
     for i in range(runs):
         k, end = run_word[i], run_end[i]

@@ -11,72 +11,27 @@ from typing import Any
 
 import numba as nb
 import numpy as np
-from llvmlite import ir
-from numba.core import cgutils, types
-from numba.extending import intrinsic
 
 from semstab.backends.shared.keys import HALF, partition_of
 from semstab.backends.shared.pixel_keys import bits_of, exact_keys_of_points, exact_keys_of_row, touch
 from semstab.core.compiled import compiled, parallel, serial
 
-# Runs of equal words, eight at a time, for compiled loops; no branch guesses where a run ends.
-
 LANES = 8
-"""Words that `runs_of_eight` looks at, and room that it needs beyond the runs there are."""
-
-INT = ir.IntType(64)
-WORDS, MASK = ir.VectorType(INT, LANES), ir.VectorType(ir.IntType(1), LANES)
+"""Words that a stretch is a multiple of, and room that its runs need."""
 
 
-@intrinsic
-def runs_of_eight(_typing: Any, word: Any, _at: Any, run_word: Any, run_end: Any, _n: Any) -> Any:
-    """Count the runs after words `at` to `at + 7`, n before.
+@compiled(forceinline=True)
+def runs_of(word, run_word, run_end):
+    """Write the words of runs, and where each ends; return the number of runs.
 
-    Arguments: word, at, run_word, run_end, n.
-    A run ends with a word that differs from the one that follows, which must be there. All arrays are int64.
+    A run ends with a word that differs from the one that follows; the last word ends none. Each word is written where
+    the last run would end, to be written over unless it does: no branch guesses where that is. All arrays are int64.
     """
-
-    def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
-        at, n = arguments[1], arguments[4]
-        own, words, ends = (
-            builder.gep(context.make_array(signature.args[i])(context, builder, arguments[i]).data, [first])
-            for i, first in ((0, at), (2, n), (3, n))
-        )
-        _, _, features = context.codegen().magic_tuple()
-        keep = _compressed if "+avx512f" in features else _one_by_one
-        return keep(builder, own, words, ends, at, n)
-
-    return types.intp(word, types.intp, run_word, run_end, types.intp), generate
-
-
-def _compressed(builder: Any, own: Any, words: Any, ends: Any, at: Any, n: Any) -> Any:
-    """Compress by instructions that put the chosen numbers of a vector side by side."""
-    word = builder.load(builder.bitcast(own, WORDS.as_pointer()), align=8)
-    following = builder.load(builder.bitcast(builder.gep(own, [INT(1)]), WORDS.as_pointer()), align=8)
-    last = builder.icmp_unsigned("!=", word, following)
-    spread = builder.insert_element(ir.Constant(WORDS, ir.Undefined), at, ir.IntType(32)(0))
-    zeros = ir.Constant(ir.VectorType(ir.IntType(32), LANES), [0] * LANES)
-    end = builder.add(builder.shuffle_vector(spread, spread, zeros), ir.Constant(WORDS, list(range(1, LANES + 1))))
-    kind = ir.FunctionType(WORDS, [WORDS, WORDS, MASK])
-    compress = cgutils.get_or_insert_function(builder.module, kind, f"llvm.x86.avx512.mask.compress.v{LANES}i64")
-    for values, to in ((word, words), (end, ends)):
-        chosen = builder.call(compress, [values, ir.Constant(WORDS, [0] * LANES), last])
-        builder.store(chosen, builder.bitcast(to, WORDS.as_pointer()), align=8)
-    number = builder.ctpop(builder.bitcast(last, ir.IntType(LANES)))
-    return builder.add(n, builder.zext(number, INT))
-
-
-def _one_by_one(builder: Any, own: Any, words: Any, ends: Any, at: Any, n: Any) -> Any:
-    """Return each word where the last run would end, to be written over unless it does."""
-    so_far = INT(0)
-    word = builder.load(own)
-    for lane in range(LANES):
-        following = builder.load(builder.gep(own, [INT(lane + 1)]))
-        builder.store(word, builder.gep(words, [so_far]))
-        builder.store(builder.add(at, INT(lane + 1)), builder.gep(ends, [so_far]))
-        so_far = builder.add(so_far, builder.zext(builder.icmp_unsigned("!=", word, following), INT))
-        word = following
-    return builder.add(n, so_far)
+    n = 0
+    for u in range(word.shape[0] - 1):
+        run_word[n], run_end[n] = word[u], u + 1
+        n += word[u] != word[u + 1]
+    return n
 
 
 NEAR = 1 << 15
@@ -257,9 +212,7 @@ def key_of(a, b, c, corner):
 @compiled(forceinline=True)
 def _enter_runs(word, run_word, run_end, table, table_count, entry, count, n):
     """Put runs of a stretch of words into the table; those that give way become entries, whose number is returned."""
-    runs = 0
-    for u in range(0, word.shape[0] - LANES, LANES):
-        runs = runs_of_eight(word, u, run_word, run_end, runs)
+    runs = runs_of(word, run_word, run_end)
     begin = 0
     for i in range(runs):
         w, end = run_word[i], run_end[i]

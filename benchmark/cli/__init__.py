@@ -97,28 +97,6 @@ class Command(TyperCommand):
 OF_PATHS = ("run", "check", "predict")
 """The commands whose first word may be a path, as with --data."""
 
-EARLIER = {
-    "commit": "calibrate", "remedies": "filters", "--commit": "--thresholds", "--onto": "--classify",
-    "--beside": "--join", "--leave-own-out": "--leave-one-out", "--trust-geometry": "--no-geometry-check",
-    "--backbone": "--model",
-}  # fmt: skip
-"""The names of version 0.3, which work for one version."""
-
-
-def _of_today(args: list[str]) -> list[str]:
-    """Return a command line with current names, and warn of earlier ones; a command is the first word."""
-    known = dict(EARLIER)
-    if args[:1] == ["predict"] and any(word.startswith(("-m", "--backbone")) for word in args):
-        known["--model"] = "--checkpoint"
-    named = []
-    for position, word in enumerate(args):
-        name, equals, value = word.partition("=")
-        if name in known and (name.startswith("-") or position == 0):
-            say(f"warning: {name} is now called {known[name]}; the next version will not know the old name")
-            name = known[name]
-        named.append(name + equals + value)
-    return named
-
 
 def _is_path(word: str) -> bool:
     """Return whether a word that is no command is meant as a path: of a file or folder, or with a suffix."""
@@ -147,7 +125,7 @@ class Group(TyperGroup):
         return _without_kind(super().get_params(ctx))
 
     def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
-        """Put `run` in front of bare options, and replace earlier names."""
+        """Put `run` in front of bare options."""
         of_group = {"--help", "-h", "--version", "--install-completion", "--show-completion"}
         if not args or (args[0].startswith("-") and args[0] not in of_group):
             args = ["run", *args]
@@ -155,7 +133,7 @@ class Group(TyperGroup):
             args = ["run", "--data", *args]
         if args[0] in OF_PATHS and len(args) > 1 and not args[1].startswith("-"):
             args = [args[0], "--data", *args[1:]]
-        return super().parse_args(ctx, _of_today(args))
+        return super().parse_args(ctx, args)
 
     def resolve_command(self, ctx: Any, args: list[str]) -> Any:
         """Return the command that the first word names; it may also have been meant as a path."""

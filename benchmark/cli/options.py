@@ -245,7 +245,10 @@ class Measurement:
     events: Annotated[bool | None, typer.Option(
         "--events", help="Also write the log of observations.", rich_help_panel=SETTINGS)] = None
     statistics: Annotated[bool | None, typer.Option(
-        "--statistics", help="Also measure drift and accuracy, and compare models; takes longer.")] = None
+        "--statistics", help="Also measure drift, flips and the part of geometry; takes longer.")] = None
+    no_truth: Annotated[bool, typer.Option(
+        "--no-truth", metavar="", help="Do not compare with the ground truth of the scene.",
+        rich_help_panel=CHECKS)] = False
     video_measures: Annotated[str | None, typer.Option(
         "--video-measures", metavar="depth|dis", show_default="none",
         help="Also VC and TC as papers report them, by depth and pose, or by optical flow between images.")] = None
@@ -259,6 +262,7 @@ class Measurement:
             "check": self.check, "events": self.events, "statistics": self.statistics,
             "video_measures": self.video_measures, "scope": self.scope,
             "check_geometry": False if self.trust_geometry else None,
+            "truth": False if self.no_truth else None,
             "tile_size": int(tile_size) if tile_size is not None and tile_size.isdigit() else tile_size,
         }
         content = chosen(

@@ -12,7 +12,7 @@ from semstab.cli.options import OwnCode, Quiet, ScopeOption, Verbose, print_line
 
 def compare(
     runs: Annotated[list[str], typer.Argument(
-        metavar="RUN...", help="Folders of runs or studies, the one to compare with first; RUN:MODEL.")],
+        metavar="RUN...", help="Folders of runs or studies, the base first; RUN:MODEL; or one run, for its models.")],
     out: Annotated[Path | None, typer.Option(
         "--out", "-o", help="Folder for report.html, tables, figures, JSON, Markdown.")] = None,
     scope: ScopeOption = None,
@@ -22,11 +22,11 @@ def compare(
     quiet: Quiet = False,
 ) -> None:  # fmt: skip
     """Compare runs: report their differences with intervals, by class, location and frame."""
-    from semstab.comparison.tables import print_comparison
-    from semstab.comparison.writing import compare
-    from semstab.comparison.writing import markdown as as_markdown
+    from semstab.compare_runs import compare
+    from semstab.compare_runs import markdown as as_markdown
     from semstab.core.console import Console
     from semstab.core.types import THIS_SCENE
+    from semstab.report.comparison.tables import print_comparison
 
     with Console(stderr=True, quiet=quiet).status("opening") as status:
         comparison = compare(
@@ -71,12 +71,12 @@ def gate(
     quiet: Quiet = False,
 ) -> None:  # fmt: skip
     """Fail if a new model is significantly worse: exit code 4 if a rule fails, 5 if one is undecided."""
-    from semstab.comparison import gate_report
-    from semstab.comparison.gate import gate as assess
-    from semstab.comparison.gate import gate_config
-    from semstab.comparison.runs import open_run, save_summary
+    from semstab.comparison.entries import open_run, save_summary
     from semstab.core.console import Console
     from semstab.engine.folder import require_output
+    from semstab.gating import report as gate_report
+    from semstab.gating.gate import gate as assess
+    from semstab.gating.gate import gate_config
 
     gate_report.require_formats(out or ())
     for file in (*(out or ()), *([] if save_baseline is None else [save_baseline])):
@@ -128,8 +128,8 @@ def calibrate(
     quiet: Quiet = False,
 ) -> None:
     """Find for each class the least evidence at which its labels are right often enough to be acted on."""
-    from semstab.comparison.calibration import calibrate_run, lines
     from semstab.engine.folder import require_output
+    from semstab.gating.calibration import calibrate_run, lines
 
     require_output(out)
     thresholds = calibrate_run(run, precision=precision, confidence=confidence)
@@ -205,7 +205,7 @@ def export(
     join: Annotated[Path | None, typer.Option(
         metavar="FILE", help="Parquet with more columns of the voxels: OUT/columns of compare.")] = None,
     task_format: Annotated[str | None, typer.Option(
-        "--format", metavar="coco|labelstudio|cvat|fiftyone",
+        "--format", metavar="coco",
         help="Annotation tasks instead of the map: locations where frames disagree.")] = None,
     most: Annotated[int, typer.Option("--most", "-n", min=1, help="Largest number of annotation tasks.")] = 50,
     code: OwnCode = None,

@@ -180,7 +180,7 @@ def filters(
 ) -> None:
     """Find a filter that makes a model more stable, with its accuracy, delay and cost. A second start resumes.
 
-    --filter replaces the shipped filters; chains are written with a plus sign, ema-warped:0.6+threshold:0.5.
+    --filter replaces the shipped filters; chains are written with a plus sign, ema-warped:0.6+guided:8.
     """
     from semstab.filter_study import filter_study_config
     from semstab.predict.predictor import parse_predictors

@@ -23,8 +23,8 @@ class FigureFormat(StrEnum):
     svg = "svg"
 
 
-FORMER_TABLES = {"glance": "overview", "remedies": "filters"}
-"""The names of tables in 0.3, with the current names; the old ones work for one version."""
+COMPARISON = "comparison"
+"""The beginning of the names of the tables that compare a run's models: they are made on demand."""
 
 
 def show(
@@ -39,6 +39,7 @@ def show(
     from semstab.core.console import Console
     from semstab.data.records import is_run
     from semstab.engine.folder import load_result
+    from semstab.report.comparison.own_models import own_models
     from semstab.report.tables import tables
     from semstab.report.tables.table import to_terminal
     from semstab.report.terminal import failure_lines, print_answer
@@ -55,16 +56,18 @@ def show(
     if not result.select():
         raise DataError(f"{run}: no unit finished; {run / 'failures.log'} has more where it exists; run it again")
     by_name = {table.name: table for table in tables(result)}
+    if any(name.startswith(COMPARISON) for name in what or ()):
+        by_name |= {table.name: table for table in own_models(result)}
     if figures is not None:
         from semstab.report.figures import write_figures
 
         print_lines(map(str, write_figures(result, run, svg=figures is FigureFormat.svg)))
     elif not what:
         print_answer(result, Console(), out=run)
-        listed = f"tables  {', '.join(by_name)}"
+        listed = f"tables  {', '.join([*by_name, COMPARISON] if len(result.models) > 1 else by_name)}"
         print_lines(textwrap.wrap(listed, 80, initial_indent="  ", subsequent_indent=" " * 10))
     for name in what or ():
-        matching = [table for key, table in by_name.items() if key.startswith(FORMER_TABLES.get(name, name))]
+        matching = [table for key, table in by_name.items() if key.startswith(name)]
         if not matching:
             raise ConfigError(f"{run}: no table '{name}'; the tables are {', '.join(by_name)}")
         print_lines(f"{to_terminal(table)}\n" for table in matching)

@@ -11,10 +11,11 @@ from pathlib import Path
 
 import numpy as np
 
+from semstab.comparison.caution import cautions
+from semstab.comparison.entries import Entry, Flicker, RunHandle, open_models, open_runs, shared_scenes
 from semstab.comparison.locations import Changes, worse_areas
 from semstab.comparison.pairing import Common, joint_class, pair
-from semstab.comparison.runs import Entry, Flicker, RunHandle, open_runs, shared_scenes
-from semstab.comparison.tables import (
+from semstab.comparison.quantities import (
     BY_CLASS,
     COVERAGE,
     FLICKER,
@@ -50,10 +51,12 @@ from semstab.statistics.intervals import (
     standard_error,
     unpaired,
 )
-from semstab.statistics.paired_differences import LEAST_VOXELS, holm
 
 OF_ANY_SIZE = OF_LIKELIEST = (ALPHA, ACCURACY, MIOU, RECALL, PRECISION, IOU)
 """Measures that hardly depend on the size of voxels, and need no more than the likeliest classes of scores."""
+
+LEAST_VOXELS = 50
+"""Least number of voxels of a class that is compared."""
 
 SIGNIFICANCE = 0.05
 """Corrected p-value below which a difference is claimed."""
@@ -106,6 +109,23 @@ def corrected(lists: Sequence[Sequence[Contrast]]) -> list[tuple[Contrast, ...]]
     of_rows = iter(p_values.tolist())
     better = {quantity.key: quantity.sign for quantity in (*quantities(), *BY_CLASS)}
     return [tuple(_with_change(row, next(of_rows), better[row.measure]) for row in contrasts) for contrasts in lists]
+
+
+def holm(p: Sequence[float]) -> list[float]:
+    """Return p-values corrected for their number.
+
+    Rejecting those <= q limits the chance of any false rejection to q (Holm 1979).
+
+    >>> [round(value, 2) for value in holm([0.01, 0.04, 0.03])]
+    [0.03, 0.06, 0.06]
+    """
+    corrected = [float("nan")] * len(p)
+    tested = sorted((own, i) for i, own in enumerate(p) if not np.isnan(own))
+    highest = 0.0
+    for rank, (own, i) in enumerate(tested):
+        highest = max(highest, min(1.0, own * (len(tested) - rank)))
+        corrected[i] = highest
+    return corrected
 
 
 def _with_change(row: Contrast, p_holm: float, sign: float) -> Contrast:
@@ -282,11 +302,23 @@ def find(
     """Compare runs with the first one for a scope; `progress` is called with each step.
 
     Raises:
-        ConfigError: For fewer than two, and as `open_runs`, `shared_scenes` and `pair` do.
+        ConfigError: For fewer than two, and as `open_runs` does.
+        DataError: As `differences_of` does.
     """
-    if len(runs) < 2:
+    handles = open_models(runs[0]) if len(runs) == 1 else open_runs(runs)
+    if len(handles) < 2:
         raise ConfigError("there is nothing to compare the run with; name two runs or more, the base first")
-    handles = open_runs(runs)
+    return differences_of(handles, progress, scope)
+
+
+def differences_of(
+    handles: Sequence[RunHandle], progress: Progress = lambda what: None, scope: Scope = THIS_SCENE
+) -> ComparisonData:
+    """Compare opened runs with the first one for a scope; `progress` is called with each step.
+
+    Raises:
+        DataError: As `shared_scenes` and `pair` do.
+    """
     scenes: list[SceneComparison] = []
     changes: dict[tuple[str, str], Changes] = {}
     for scene in shared_scenes(handles):
@@ -306,11 +338,18 @@ def find(
             )
             for each in handles
         ),
-        overall=_over_all(scenes),
+        overall=(overall := _over_all(scenes)),
         scenes=tuple(scenes),
+        cautions=tuple(dict.fromkeys(text for own in overall for text in _cautions(handles, own, scenes))),
     )
     ups = {scene: up for each in reversed(handles) for scene, entry in each.scenes.items() if (up := entry.up)}
     return ComparisonData(result, changes, ups)
+
+
+def _cautions(handles: Sequence[RunHandle], against: Against, scenes: Sequence[SceneComparison]) -> Iterator[str]:
+    base, other = handles[0], next(each for each in handles if each.name == against.other)
+    entries = [(base.scenes[each.scene], other.scenes[each.scene]) for each in scenes]
+    return cautions((base.name, other.name), entries, against.contrasts)
 
 
 def _scene(scene: str, runs: Sequence[RunHandle], scope: Scope) -> tuple[SceneComparison, dict[str, Changes]]:

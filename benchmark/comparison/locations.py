@@ -15,6 +15,7 @@ import numpy as np
 import numpy.typing as npt
 
 from semstab.comparison.pairing import Common, joint_class
+from semstab.comparison.voxels import in_share
 from semstab.core.types import Float64, Int32, Int64, Mask
 from semstab.data.contrast import Area, FrameShare
 from semstab.data.events import Events
@@ -23,7 +24,6 @@ from semstab.data.voxels import VoxelTable
 from semstab.metrics.agreement import shared_rows, voxel_keys
 from semstab.statistics.agreement import disagreement
 from semstab.statistics.correctness import join_truth
-from semstab.statistics.model_comparison import in_share
 
 WORSE = 0.2
 """A voxel got worse where so much of its agreement is lost: of ten observations, one turned to another class."""

@@ -10,7 +10,9 @@ from functools import partial
 
 import numpy as np
 
-from semstab.comparison.runs import Entry
+from semstab.comparison.entries import Entry
+from semstab.comparison.observations import SharedObservations, compared_observations
+from semstab.comparison.voxels import Region, Regions, common_voxels, coverage_of, held, share_of
 from semstab.core.types import THIS_SCENE, Int64, Mask, Scope
 from semstab.data.contrast import Basis, ComparedObservations, MapCoverage
 from semstab.data.events import Events
@@ -23,9 +25,7 @@ from semstab.statistics.accumulate import cluster_sums_of
 from semstab.statistics.cluster_sums import ClusterSums
 from semstab.statistics.correctness import join_truth
 from semstab.statistics.drift import expected_sbd
-from semstab.statistics.model_comparison import Region, Regions, common_voxels, coverage_of, held, share_of
 from semstab.statistics.observations import SpotObservations, numbered_as_one_flight
-from semstab.statistics.paired_differences import SharedObservations, compared_observations
 
 NEAR = 1e-3
 """Largest distance in metres between cameras of the same frame."""

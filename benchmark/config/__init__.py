@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Callable, Mapping, Sequence
-from typing import TYPE_CHECKING, Any, ClassVar, Literal, Self
+from typing import TYPE_CHECKING, Any, Literal, Self
 
 import yaml
 from pydantic import Field, ValidationError, ValidationInfo, field_validator
@@ -147,7 +147,6 @@ class Config(Settings):
         (0.5, 'numba')
     """
 
-    earlier: ClassVar[Mapping[str, str]] = {"backbones": "models"}
     name: str = Field("run", min_length=1, description="the title of the report; a study's is its file's by default")
     description: str = Field("", description="one line")
     dataset: DatasetConfig = Field(DatasetConfig(), description="name and options of the dataset")
@@ -177,8 +176,9 @@ class Config(Settings):
     seed: int = Field(0, ge=0, description="of the noise; the n-th repeat of a sweep takes seed + n")
     events: bool = Field(False, description="also write the log of observations, where a backend keeps one")
     statistics: bool = Field(
-        False, description="also statistics of order, correctness and model comparison; fuses the ground truth too"
+        False, description="also statistics of order, and of the geometry's part in the disagreement"
     )
+    truth: bool = Field(True, description="compare labels with the ground truth of the scene, if it has one")
     frame_quality: bool = Field(False, description="also assess each frame's labels; the filters study does")
     video_measures: FlowName | None = Field(
         None, description="also VC and TC as published, by flow: 'depth' and pose, or 'dis' (OpenCV, of the images)"

@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 import itertools
-import logging
 import math
 import operator
 import re
 import reprlib
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import Annotated, Any, ClassVar, Generic, Literal, Self, TypeVar
+from typing import Annotated, Any, Generic, Literal, Self, TypeVar
 
 from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, ValidationError, field_validator, model_validator
 
@@ -18,33 +17,14 @@ from semstab.core.files import MAX_YAML_BYTES, parse_yaml, read_limited
 from semstab.core.types import THIS_SCENE, Scope
 from semstab.errors import ConfigError, nearest, summarize_error
 
-logger = logging.getLogger("semstab")
-
 Model = TypeVar("Model", bound=BaseModel)
 V = TypeVar("V")
 
 
 class Settings(BaseModel):
-    """A group of settings: frozen, and closed to unknown keys.
-
-    Attributes:
-        earlier: Names of version 0.3, and those of today: the old ones work for one version.
-    """
+    """A group of settings: frozen, and closed to unknown keys."""
 
     model_config = ConfigDict(extra="forbid", frozen=True)
-    earlier: ClassVar[Mapping[str, str]] = {}
-
-    @model_validator(mode="before")
-    @classmethod
-    def _under_names_of_today(cls, content: Any) -> Any:
-        if not isinstance(content, dict):
-            return content
-        named = dict(content)
-        for earlier, today in cls.earlier.items():
-            if earlier in named and today not in named:
-                logger.warning("setting '%s' is now called '%s'; the next version will not know it", earlier, today)
-                named[today] = named.pop(earlier)
-        return named
 
 
 def read_yaml(path: str | Path) -> dict[str, Any]:
@@ -129,7 +109,6 @@ Deviation = Annotated[float, Field(ge=0, le=1e9)]
 class Part(Settings):
     """One of the things that are varied, on all scenes and models of the configuration or on some."""
 
-    earlier: ClassVar[Mapping[str, str]] = {"backbones": "models"}
     scenes: list[str] | None = Field(None, min_length=1, description="some of the scenes; all where not given")
     models: list[str] | None = Field(None, min_length=1, description="some of the models; all where not given")
 

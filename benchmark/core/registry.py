@@ -17,10 +17,6 @@ from typing import Any
 from semstab.core.code import Code, may_run
 from semstab.errors import ConfigError, MissingDependencyError, nearest, summarize_error
 
-EARLIER: Mapping[str, str] = {"model": "backbone"}
-"""Kinds, and their names in version 0.3: entry points of the old group work for one version."""
-
-
 _code: dict[tuple[str, str], str] = {}
 """Code of users by kind and name; see `semstab.core.code`."""
 
@@ -61,12 +57,10 @@ class Registry:
 
     @functools.cached_property
     def _plugins(self) -> dict[str, Entry]:
-        kinds = [kind for kind in (EARLIER.get(self.kind), self.kind) if kind]
         # read once: it looks through all that is installed
-        points = [point for kind in kinds for point in entry_points(group=f"semstab.{kind}s")]
         return {
             point.name: Entry(point.value, f"from the package {point.dist.name if point.dist else point.module}")
-            for point in points
+            for point in entry_points(group=f"semstab.{self.kind}s")
         }
 
     def entry(self, name: str) -> Entry:

@@ -1,16 +1,12 @@
-"""The comparison of several models' maps of one scene by `semstab.statistics`; JSON has the names of the fields."""
+"""The differences between runs; JSON has the names of the fields."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
-from semstab.data.measures import Quantity
-from semstab.data.statistics import UNDEFINED, Estimate, Interval
-
-ByModel = Mapping[str, Estimate]
+from semstab.data.statistics import Interval
 
 
 @dataclass(frozen=True)
@@ -25,98 +21,6 @@ class MapCoverage:
     recurrent: int
     common_share: float
     alone: int
-
-
-@dataclass(frozen=True)
-class Standardised:
-    """Means at a common distribution of OP, by the key of what is compared and model.
-
-    Attributes:
-        edges: Upper edges of the strata of OP.
-        weights: Weights of the strata.
-        thin: The part of the weights that lies in strata which some map hardly has: values there rest on few voxels.
-    """
-
-    edges: tuple[int, ...]
-    weights: tuple[float, ...]
-    thin: float
-    values: Mapping[str, ByModel]
-
-    def of(self, quantity: Quantity, model: str) -> Estimate:
-        """Return a model's mean; undefined for a measure that is no mean over voxels."""
-        return self.values.get(quantity.key, {}).get(model, UNDEFINED)
-
-
-@dataclass(frozen=True)
-class PairedDifference:
-    """A measure of model a minus that of b on the voxels that all saw twice or more.
-
-    Attributes:
-        p_value: P-value of no difference in the primary measure; p_holm corrects it for all pairs, and all scenes of a
-            study, of which something may be claimed (Holm 1979). The other measures describe: they have intervals and
-            no test.
-        scope: Question that interval and p-value answer, see `Interval`.
-        undecided: The reason why nothing may be claimed; empty where something may.
-    """
-
-    measure: str
-    a: str
-    b: str
-    difference: Estimate
-    p_value: float
-    p_holm: float
-    scope: str = ""
-    undecided: str = ""
-
-
-@dataclass(frozen=True)
-class Rank:
-    """A model's rank, 1 being the best, with the range that holds CONFIDENCE of the resamples.
-
-    best is the share of the resamples in which it is first.
-    """
-
-    model: str
-    value: float
-    rank: int
-    low: int
-    high: int
-    best: float
-
-
-@dataclass(frozen=True)
-class Ranking:
-    """The models by one measure on common voxels, the best first."""
-
-    measure: str
-    ranks: tuple[Rank, ...]
-
-
-@dataclass(frozen=True)
-class Paired:
-    """Models on the voxels that every one of them observed at least twice.
-
-    Attributes:
-        primary: The key of what is tested.
-        values: Values that are `compared`, by its key and model.
-    """
-
-    primary: str
-    voxels: int
-    cubes: int
-    values: Mapping[str, ByModel]
-    differences: tuple[PairedDifference, ...]
-    rankings: tuple[Ranking, ...]
-
-    def __post_init__(self) -> None:
-        for ranking in self.rankings:
-            for rank in ranking.ranks:
-                if rank.model not in self.values.get(ranking.measure, {}):
-                    raise ValueError(f"ranks {rank.model} by {ranking.measure} without a value")
-
-    def of(self, quantity: Quantity) -> ByModel:
-        """Return the values of what is compared, by model."""
-        return self.values[quantity.key]
 
 
 @dataclass(frozen=True)
@@ -160,22 +64,6 @@ class ComparedObservations:
         """Return whether the order depends on what was left out."""
         return self.order != self.order_ignored or not self.bounded
 
-
-@dataclass(frozen=True)
-class ModelComparison:
-    """Several models' maps of one scene side by side."""
-
-    scene: str
-    schema: int
-    seed: int
-    models: tuple[str, ...]
-    coverage: tuple[MapCoverage, ...]
-    standardised: Standardised
-    paired: Paired
-    observations: ComparedObservations | None
-
-
-# The differences between runs; JSON has the names of the fields. Undefined numbers are NaN.
 
 Basis = Literal["observations", "voxels", "cubes", "flights"]
 """The unit of pairing: observations (a spot in a view) that all made; voxels that all saw twice or more; cubes,
@@ -323,6 +211,7 @@ class RunComparison:
 
     Attributes:
         overall: Macro means over the scenes, each counting once.
+        cautions: What stands against taking the more stable run for the better one.
     """
 
     schema: int
@@ -330,9 +219,11 @@ class RunComparison:
     runs: tuple[Compared, ...]
     overall: tuple[Against, ...]
     scenes: tuple[SceneComparison, ...]
+    cautions: tuple[str, ...] = ()
 
     def __repr__(self) -> str:
         scenes = ", ".join(scene.scene for scene in self.scenes)
         lines = [f"<RunComparison with {self.base} on {scenes}>"]
         lines += [f"  {own.stated}" for own in self.overall]
+        lines += [f"  caution: {text}" for text in self.cautions]
         return "\n".join(lines)

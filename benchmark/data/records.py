@@ -14,7 +14,6 @@ from semstab.config import BACKENDS, BASE, nearest
 from semstab.core.json_form import INLINE
 from semstab.core.palette import KIND_COLORS, KINDS
 from semstab.data import voxels
-from semstab.data.contrast import ModelComparison
 from semstab.data.display import as_figure
 from semstab.data.georeference import Georeference
 from semstab.data.measures import measures
@@ -149,7 +148,7 @@ class FrameQuality:
     """The worth of single frames' labels, as filters left them; shares are 0 to 1, NaN where undefined.
 
     Attributes:
-        model, filters: The source of the labels, and the filters over it ('ema:0.6+threshold:0.5'; '' for nothing).
+        model, filters: The source of the labels, and the filters over it ('ema:0.6+guided:8'; '' for nothing).
         changed: Share of the pixels that the model labels to which the filters give another label, or none.
         flicker: Share of the pixels that two frames in a row see whose label changes, camera motion removed: also where
             the frame before has no depth, unlike `ImageSpace.compensated_flicker_percent`.
@@ -350,7 +349,6 @@ class Result:
         compared: The same of each other backend and the base one, which need not agree.
         advice: Advice on the voxel size, scene by scene, for data of files.
         notes: Remarks of the check, scene by scene: labels that are not registered to the depth, and the like.
-        comparisons: The comparison of the models of each scene by `compare_models`, with `statistics`.
         benchmark: The benchmark that it is a run of, 'NAME@VERSION (hash of the definition)'; '' for none.
 
     Examples:
@@ -368,7 +366,6 @@ class Result:
     georeference: Mapping[str, Georeference] = field(default_factory=dict)
     manifest: Mapping[str, Any] = field(default_factory=dict)
     regions: tuple[RegionFlicker, ...] = ()
-    comparisons: tuple[ModelComparison, ...] = ()
     compared: tuple[Agreement, ...] = ()
     advice: Mapping[str, VoxelAdvice] = field(default_factory=dict)
     notes: Mapping[str, tuple[str, ...]] = field(default_factory=dict)

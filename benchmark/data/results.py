@@ -213,15 +213,16 @@ class UnitSummary:
     def row(self) -> dict[str, str | int | float]:
         """Return a row: its names, the verdict and the number that it rests on, the size of its map, means of measures.
 
-        Means are of all voxels, and of the recurrent ones. Without statistics the verdict is empty, and alpha NaN.
+        Means are of all voxels, and of the recurrent ones. Pixels without a label count as disagreeing in the verdict.
+        Without statistics the verdict is empty, and alpha is NaN.
         """
         table, unit = self.table, self.unit
         alpha = UNKNOWN if self.statistics is None else self.statistics.headline.alpha
         verdict = None if self.statistics is None else self.statistics.verdict
         return {
             "scene": unit.scene, "model": unit.model, "backend": unit.backend,
-            "verdict": "" if verdict is None else verdict.level,
-            "probability": math.nan if verdict is None else verdict.probability,
+            "verdict": "" if verdict is None else verdict.decisive,
+            "probability": math.nan if verdict is None else verdict.decisive_probability,
             "alpha": alpha.value, "alpha_low": alpha.low, "alpha_high": alpha.high, "confidence": alpha.level,
             "agreeing": math.nan if self.statistics is None else self.statistics.agreeing,
             "taxonomy": self.taxonomy, "K": table.K, "voxel_size": table.voxel_size, "frames": self.frames,

@@ -27,7 +27,6 @@ from semstab.core.files import (
     write_text,
 )
 from semstab.core.json_form import from_json, to_json
-from semstab.data import earlier
 from semstab.data.digests import DIGESTS, write_digests
 from semstab.data.records import (
     EVENTS,
@@ -56,9 +55,6 @@ LAYOUT = "# semstab, folder layout 4"
 
 VIDEO_LAYOUT = "# semstab, video folder 1"
 """The first line of the settings of a run over videos, which has no map."""
-
-EARLIER_LAYOUT = "# semstab, folder layout 3"
-"""The first line of version 0.3, whose results are read for one version."""
 
 OF_MAPS = (
     "dataset", "taxonomy", "voxel_size", "pixel_stride", "top_k", "frames", "scene_frames", "exclude", "perturbation",
@@ -354,11 +350,9 @@ def load_result(folder: str | Path) -> Result:
         raise DataError(f"{folder}: there is no such folder; give the folder of a finished run")
     if _is_of_videos(folder):
         raise DataError(f"{folder}: a run over videos, without a map; {folder / 'report.html'} and tables/ have it")
-    if _is_earlier(folder, (LAYOUT, EARLIER_LAYOUT)):
+    if _is_earlier(folder):
         raise DataError(f"{folder}: holds results of an earlier version of semstab; run it again, into another folder")
     content = read_json(path)
-    if isinstance(content, dict) and content.get("schema") == earlier.SCHEMA:
-        content = earlier.translated(content, path) | {"schema": SCHEMA}
     if not isinstance(content, dict) or content.get("schema") != SCHEMA:
         raise DataError(f"{path}: is not a summary of this version of semstab; run it again, into another folder")
     result = from_json(Result, {**content, "records": content.get("runs")}, path)
@@ -412,10 +406,8 @@ def _claimed(path: Path) -> dict[str, Any] | None:
     return None
 
 
-def _is_earlier(folder: Path, layouts: Collection[str] = (LAYOUT,)) -> bool:
-    if (folder / "study.yaml").exists() or not (folder / SETTINGS).exists():
-        return (folder / "study.yaml").exists()
-    return _layout_of(folder) not in layouts
+def _is_earlier(folder: Path) -> bool:
+    return (folder / SETTINGS).exists() and _layout_of(folder) != LAYOUT
 
 
 def _is_of_videos(folder: Path) -> bool:

@@ -82,7 +82,7 @@ class LiveMap:
         live = cls(work, task, frames=_as_set(work.frames))
         if work.fuses:
             live.backend = new_map(config, K, work.within)
-            if config.statistics and truth_task(task) is not None:
+            if unit.compares_truth and truth_task(task) is not None:
                 live.truth = new_map(config, K, work.within, log=False)
             if unit.sampled:
                 live.reference = NumpySample(config.voxel_size, K, work.within)
@@ -231,7 +231,7 @@ class Stream:
         flow = maps[0].config.video_measures if base else None
         self.video = None if flow is None else VideoMeter(len(self.task.mapping.target), flow)
         self.wants_color = flow == "dis"
-        self.truth_task = truth_task(self.task) if base or maps[0].config.statistics else None
+        self.truth_task = truth_task(self.task) if base or maps[0].work.unit.compares_truth else None
         self._poses = Rows(POSE)
         self._estimates_up = base and self.task.scene.up is None
         self.shown = self.task.indices[len(self.task.indices) // 2] if base else None

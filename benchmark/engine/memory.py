@@ -23,7 +23,7 @@ from semstab.errors import ConfigError, DataError, OutgrownError
 from semstab.pixels.preparation import perturb
 from semstab.statistics.cluster_sums import count_distinct
 from semstab.statistics.sample import MOST_VOXELS
-from semstab.task import Task, read
+from semstab.task import Task, read, truth_task
 
 if TYPE_CHECKING:
     from semstab.engine.live_maps import LiveMap
@@ -45,8 +45,9 @@ class MapMemory:
         backend: By which they are fused.
         K: Number of classes.
         soft: Of scores, which are fused as labels as well.
-        logged: With every observation and the ground truth.
-        sampled: With the reference on a sample of the voxels.
+        logged: Whether every observation is kept.
+        compared: Whether the ground truth is fused, too.
+        sampled: Whether the reference fuses a sample of the voxels.
     """
 
     backend: str
@@ -54,18 +55,19 @@ class MapMemory:
     soft: bool = False
     logged: bool = False
     sampled: bool = False
+    compared: bool = False
 
     def growing(self, voxels: float, observations: float) -> float:
         """Return the bytes of a map, of that of the ground truth or of reduced scores, and of the reference."""
         n, seen = int(voxels), int(observations)
         total = expected_bytes(self.backend, n, seen, self.K, soft=self.soft)
-        total += (self.logged + self.soft) * expected_bytes(self.backend, n, seen, self.K)
+        total += (self.compared + self.soft) * expected_bytes(self.backend, n, seen, self.K)
         return total + self.sampled * expected_bytes("numpy", n // ONE_IN, 0, self.K)
 
     def tables(self, voxels: float, observations: float) -> float:
         """Return the bytes of its tables and of its log."""
         n, seen = int(voxels), int(observations)
-        tables = (1 + self.logged) * table_bytes(n, self.K, soft=self.soft)
+        tables = (1 + self.compared) * table_bytes(n, self.K, soft=self.soft)
         return tables + self.logged * log_bytes(seen, self.K, soft=self.soft)
 
     def statistics(self, voxels: float) -> float:
@@ -228,7 +230,8 @@ def available_for_maps(config: Config, width: int, taken: float) -> float:
 
 def _kind(unit: Unit, *, soft: bool) -> MapMemory:
     config, K = unit.config, len(unit.task.mapping.target)
-    return MapMemory(unit.name.backend, K, soft, config.statistics or config.events, unit.sampled)
+    compared = unit.compares_truth and truth_task(unit.task) is not None
+    return MapMemory(unit.name.backend, K, soft, config.statistics or config.events, unit.sampled, compared)
 
 
 def _without(group: Sequence[Unit], settings: Config) -> str:

@@ -14,20 +14,15 @@ from typing import Any
 from semstab.check import Verdict
 from semstab.config import BACKENDS, BASE, Config
 from semstab.core.process import Stopwatch
-from semstab.data.events import Events
-from semstab.data.labels import sharing_classes
 from semstab.data.records import REGIONS, Failure, Record, RegionFlicker, Result, Tables
 from semstab.data.results import Agreement, VoxelAdvice
 from semstab.data.tiles import Tiles, side_by_side
 from semstab.data.voxels import VoxelTable
-from semstab.datasets import GROUND_TRUTH
 from semstab.engine.folder import Folder
 from semstab.engine.units import Plan, must_agree
 from semstab.engine.work import Work
 from semstab.metrics import compare
 from semstab.metrics.agreement import together
-from semstab.statistics import ModelComparison, SpotObservations, claimed_together
-from semstab.statistics.model_comparison import Region, Regions, compare_regions
 
 
 @dataclass
@@ -54,7 +49,7 @@ class UnitResults:
 
 
 def result_of(plan: Plan, folder: Folder, units: UnitResults) -> Result:
-    """Return the result of all units that there are: how they agree, and how models compare."""
+    """Return the result of all units that there are: how backends agree."""
     config = plan.config
     finished = [(unit, kept) for unit in plan.units if isinstance(kept := units.records.get(unit.identity), Record)]
     records = tuple(folder.record(unit, record) for unit, record in finished)
@@ -63,8 +58,6 @@ def result_of(plan: Plan, folder: Folder, units: UnitResults) -> Result:
         checks = (record.checked for unit, record in finished if unit.sampled)
         agreement = (*filter(None, checks), *_agreements(config, records, tables, must=True))
         compared = tuple(_agreements(config, records, tables, must=False))
-    with units.watch("comparisons"):
-        comparisons = claimed_together(tuple(_comparisons(config, records, tables)) if config.statistics else ())
     up: dict[str, tuple[float, float, float]] = {}  # of the first model whose base unit has it
     base = [record for unit, record in finished if unit.variation.sweep == BASE]
     for record in base:
@@ -77,7 +70,6 @@ def result_of(plan: Plan, folder: Folder, units: UnitResults) -> Result:
         records=records,
         failures=tuple(Failure(unit.name, unit.variation, units.errors[unit.identity]) for unit in failed),
         agreement=agreement,
-        comparisons=comparisons,
         up=up,
         georeference={name: known for name, scene in plan.scenes.items() if (known := scene.georeference) is not None},
         regions=tuple(
@@ -132,66 +124,6 @@ def _alike(config: Config, a: Record, b: Record, tables: Tables) -> Agreement:
     if not (a.in_tiles or b.in_tiles):
         return compare(tables.of(a), tables.of(b), units, tolerance=config.tolerance)
     return together([compare(one, other, units, tolerance=config.tolerance) for one, other in side_by_side(maps)])
-
-
-def _comparisons(config: Config, records: Sequence[Record], tables: Tables) -> Iterator[ModelComparison]:
-    """Yield the comparison of each scene's base units; with accuracy where there is ground truth."""
-    base = [record for record in records if record.variation.sweep == BASE and record.unit.model != GROUND_TRUTH]
-    for scene in dict.fromkeys(record.unit.scene for record in base):
-        there = [record for record in base if record.unit.scene == scene]
-        if len(there) > 1:
-            files = {record.unit.model: record.observations_file for record in there}
-            loaded = {name: SpotObservations.load(file) for name, file in files.items() if file and file.exists()}
-            regions, observations = _regions_of(there, config, tables), loaded if len(loaded) == len(there) else None
-            of_labels = {record.unit.model: record.summary.reduced is None for record in there}
-            if (compared := _compared_maps(scene, regions, observations, of_labels)) is not None:
-                yield compared
-
-
-def _compared_maps(
-    scene: str, regions: Regions, observations: Mapping[str, SpotObservations] | None, of_labels: Mapping[str, bool]
-) -> ModelComparison | None:
-    """Return the comparison of a scene's maps in the label space that most have; None without two such maps.
-
-    The samples of all of them give matched observations.
-    """
-    first = next(iter(regions()))
-    names = sharing_classes({name: table.classes for name, table in first.tables.items()})
-    if not names:
-        return None
-    classes = first.tables[names[0]].classes
-
-    def comparable() -> Iterator[Region]:
-        for own in regions():
-            tables = {name: own.tables[name] for name in names}
-            logs = None if own.events is None else {name: own.events[name] for name in names}
-            truth = own.truth if own.truth is not None and own.truth.classes == classes else None
-            yield Region(tables, logs, truth, own.share)
-
-    mixed = len({of_labels[name] for name in names}) > 1
-    return compare_regions(comparable, observations=observations, mixed=mixed, scene=scene)
-
-
-def _regions_of(there: Sequence[Record], config: Config, tables: Tables) -> Regions:
-    """Yield the maps of a scene's units tile by tile, or whole, with their logs and the ground truth."""
-    names = [record.unit.model for record in there]
-    in_tiles = any(record.in_tiles for record in there)
-    files = [record.events_file for record in there if config.events]
-    logs: list[Tiles[Any]] = [Tiles.open(file, Events) for file in files if file is not None and file.exists()]
-    logs = logs if len(logs) == len(there) else []
-    truths = [Tiles.open(file, VoxelTable) for record in there if (file := record.truth_file) is not None][:1]
-    maps = [
-        Tiles.open(file, VoxelTable) if in_tiles else Tiles.of(tables.of(record))
-        for record in there
-        if (file := record.voxels_file) is not None
-    ]
-
-    def regions() -> Iterator[Region]:
-        for own in side_by_side([*maps, *logs, *truths]):
-            log = dict(zip(names, own[len(maps) :], strict=False)) if logs else None
-            yield Region(dict(zip(names, own, strict=False)), log, own[-1] if truths else None)
-
-    return regions
 
 
 # The content of manifest.json: the origin of a run's numbers.

@@ -106,6 +106,11 @@ class Unit:
         return unit_key(self.identity, self.task.digest)
 
     @property
+    def compares_truth(self) -> bool:
+        """Return whether the ground truth of the scene is fused, if there is one, and the labels compared with it."""
+        return self.config.truth and (self.image_space or self.config.statistics)
+
+    @property
     def regions(self) -> bool:
         """Return whether it is the flicker of regions without classes, and nothing is fused."""
         return self.variation.sweep == REGIONS
@@ -208,7 +213,7 @@ def _base_units(config: Config, scenes: Mapping[str, Scene]) -> Iterator[Unit]:
         for task in tasks_of(scene, settings):
             _check_classes(config.critical_classes, task)
             one = settings.model_copy(update={"models": [task.model]})
-            if config.statistics and scene.ground_truth and task.model != GROUND_TRUTH and truth_task(task) is None:
+            if config.truth and scene.ground_truth and task.model != GROUND_TRUTH and truth_task(task) is None:
                 space, target = scene.label_space(GROUND_TRUTH), task.mapping.target
                 logger.warning(
                     "%s: labels are not compared with the ground truth, as %s has classes that %s has not;"
@@ -328,7 +333,7 @@ def identity(config: Config, task: Task) -> str:
         "frames": [*task.indices],
         "taxonomy": [mapping.target.name, mapping.target.classes, mapping.source.ids, mapping.rows],
     }
-    truth = truth_task(task) if config.statistics else None
+    truth = truth_task(task) if config.truth else None
     compared = {} if truth is None else {"truth": truth.mapping.rows}
     beside = {"beside": filtering.model} if config.frame_quality else {}
     settings = config.model_dump(mode="json", exclude=NOT_IN_KEYS, exclude_defaults=True)

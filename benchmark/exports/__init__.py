@@ -13,11 +13,11 @@ from semstab.config import nearest
 from semstab.core.files import only_writer, remove_abandoned
 from semstab.engine.folder import load_result, model_of, require_output
 from semstab.errors import ConfigError
-from semstab.exports import annotation_formats, clouds, maps
+from semstab.exports import clouds, coco, maps
 from semstab.exports import join as joining
 from semstab.exports import voxels as tabular
 from semstab.exports.annotation import annotation_tasks
-from semstab.exports.annotation_formats import MOST, TaskFile, write_tasks
+from semstab.exports.coco import MOST, TaskFile, write_tasks
 from semstab.exports.relabel import task_of
 from semstab.exports.voxels import Chosen, Voxels, crs_name
 from semstab.statistics.acceptance import AcceptanceThresholds
@@ -84,9 +84,6 @@ def export(
     classify: str | Path | None = None,
     radius: float | None = None,
     join: str | Path | None = None,
-    commit: str | Path | None = None,
-    onto: str | Path | None = None,
-    beside: str | Path | None = None,
     task_format: str | None = None,
     most: int = MOST,
     code: Sequence[str] = (),
@@ -109,11 +106,7 @@ def export(
             `radius`.
         radius: Metres, a voxel's edge where not given.
         join: A Parquet file with further columns of the same voxels, such as `compare` writes.
-        commit: Name of `thresholds` in the version before.
-        onto: Name of `classify` in the version before.
-        beside: Name of `join` in the version before.
-        task_format: 'coco', 'labelstudio', 'cvat' or 'fiftyone': write annotation tasks for it, the locations
-            where frames disagree, instead of the map.
+        task_format: 'coco': write annotation tasks, the locations where frames disagree, instead of the map.
         most: The largest number of annotation tasks.
         code: Code that the run's settings name and that may run for annotation tasks, FILE.py:NAME each; other code is
             refused.
@@ -129,7 +122,6 @@ def export(
         >>> file.path.name
         'map.ply'
     """
-    classify, join, thresholds = classify or onto, join or beside, thresholds or commit
     run, model = model_of(run, model)
     files = [Path(file) for file in ([to] if isinstance(to, str | Path) else to)]
     _require_writable(files, (asprs, join, thresholds), task_format)
@@ -152,7 +144,7 @@ def export(
             task, _ = held.enter_context(task_of(run, record, result.manifest["inputs"], code))
             tasks = annotation_tasks(chosen(("op",)), task, most)
             named = task.mapping.target, task.scene.name, task.model
-            return [_tasks_written(TaskFile(tasks, *named, file), task_format, task) for file in files]
+            return [_tasks_written(TaskFile(tasks, *named, file), task) for file in files]
         if classify is not None:
             return [_classified(chosen(joining.MEASURES), Path(classify), file, radius, settings) for file in files]
         usual = {".tif": maps.RASTER_MEASURES}
@@ -164,7 +156,7 @@ def _require_writable(files: Sequence[Path], inputs: Sequence[str | Path | None]
     for file in files:
         require_output(file, inputs)
         if task_format is not None:
-            annotation_formats.check(task_format, file)
+            coco.check(task_format, file)
         elif file.suffix.lower() not in SUFFIXES:
             raise ConfigError(f"{file}: format '{file.suffix}' is not known; {nearest(file.suffix, SUFFIXES)}")
     for folder in {file.parent for file in files if file.parent.is_dir()}:
@@ -178,10 +170,10 @@ def _written(chosen: Chosen, file: Path, settings: Settings) -> Exported:
     return Exported(file, f"{voxels:,} voxels, {where}", tuple(_notes(part, file, settings)))
 
 
-def _tasks_written(file: TaskFile, kind: str, task: Task) -> Exported:
-    notes, images = write_tasks(file, kind, task), len(file.by_image())
+def _tasks_written(file: TaskFile, task: Task) -> Exported:
+    note, images = write_tasks(file, task), len(file.sizes())
     bits = sum(each.score for each in file.tasks)
-    return Exported(file.path, f"{len(file.tasks)} tasks in {images} images, {bits:,.0f} bits of entropy", notes)
+    return Exported(file.path, f"{len(file.tasks)} tasks in {images} images, {bits:,.0f} bits of entropy", (note,))
 
 
 def _classified(chosen: Chosen, cloud: Path, file: Path, radius: float | None, settings: Settings) -> Exported:

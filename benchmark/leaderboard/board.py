@@ -11,7 +11,8 @@ from typing import Any
 
 import numpy as np
 
-from semstab.comparison.runs import Entry, RunHandle
+from semstab.comparison.entries import Entry, RunHandle
+from semstab.comparison.ranking import over_places, ranked
 from semstab.core.files import write_json, write_text
 from semstab.data.statistics import UNKNOWN, Interval
 from semstab.errors import ConfigError, DataError
@@ -19,7 +20,6 @@ from semstab.leaderboard.definition import Benchmark, Number
 from semstab.leaderboard.submission import SUFFIX, Submission, load_submission
 from semstab.report.charts import point_chart
 from semstab.report.html import filled, table_block
-from semstab.report.ranking import over_places, ranked
 from semstab.report.tables.table import Column, Group, Row, Table, relations, to_csv, to_json, to_markdown
 from semstab.statistics.intervals import estimate, mean_over_frames, scope_of
 
@@ -159,7 +159,7 @@ def _unranked(own: Mapping[str, Result], benchmark: Benchmark) -> dict[str, tupl
 
 def _levels(handle: RunHandle) -> list[str]:
     statistics = [entry.summary.statistics for entry in handle.scenes.values()]
-    return ["" if own is None else own.verdict.level for own in statistics]
+    return ["" if own is None else own.verdict.decisive for own in statistics]
 
 
 def _name(about: Submission, handle: RunHandle) -> str:

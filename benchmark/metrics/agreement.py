@@ -53,8 +53,16 @@ def shared_rows(*tables: VoxelTable) -> list[Int64]:
     if same_voxels(*tables):
         return [np.arange(len(tables[0]))] * len(tables)
     keys = voxel_keys(*(table.index for table in tables))
-    common = reduce(lambda a, b: np.intersect1d(a, b, assume_unique=True), keys)
+    common = reduce(_intersection, keys)
     return [np.searchsorted(own, common).astype(np.int64) for own in keys]
+
+
+def _intersection(a: Int64, b: Int64) -> Int64:
+    """Return the common keys of two ascending arrays."""
+    if not len(b):
+        return b
+    common: Int64 = a[b[np.minimum(np.searchsorted(b, a), len(b) - 1)] == a]
+    return common
 
 
 def same_voxels(first: VoxelTable, *others: VoxelTable) -> bool:

@@ -64,8 +64,8 @@ class Summary:
             psa=statistics.agreement.psa.value,
             flicker=flicker,
             recurrent_share=table.recurrent.share,
-            verdict=verdict.level,
-            probability=verdict.probability,
+            verdict=verdict.decisive,
+            probability=verdict.decisive_probability,
         )
 
     def scalars(self) -> dict[str, float]:

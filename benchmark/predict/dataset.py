@@ -41,7 +41,6 @@ PREDICTIONS = "predictions"
 class PredictedOptions(Settings):
     """The dataset whose images are predicted on, and the models that predict."""
 
-    earlier: ClassVar[Mapping[str, str]] = {"backbones": "models", "remedies": "try_filters", "kept": "folder"}
     title: ClassVar[str] = "predictions"
     dataset: DatasetConfig = Field(description="a dataset with its options")
     models: list[PredictorConfig] = Field(min_length=1, description="each predicts every frame")

@@ -6,7 +6,7 @@ import math
 import time
 from abc import ABC, abstractmethod
 from collections import deque
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, ClassVar, cast
 
@@ -20,7 +20,7 @@ from semstab.data.labels import LabelSpace, ignore_id
 from semstab.errors import ConfigError, DataError
 from semstab.models import Image, Labels, Model, Prediction, narrowed
 from semstab.models.validation import Wrapped
-from semstab.pixels.warp import LEAST_DENSITY, carry, density, warp
+from semstab.pixels.warp import LEAST_DENSITY, carry, density
 
 Belief = Float32
 """(H, W, K) float32: the belief of each pixel, which sums to 1 over the classes, or to 0 where there is none."""
@@ -37,21 +37,9 @@ REGISTRY = Registry(
             "KEEP: average at the surface point, by depth and pose",
         ),
         "vote": Entry("semstab.predict.filters:Vote", "N: majority of the pixel's last N labels"),
-        "vote-warped": Entry(
-            "semstab.predict.filters:VoteWarped",
-            "N: majority at the surface point, by depth and pose",
-        ),
         "guided": Entry(
             "semstab.predict.filters:Guided",
             "PIXELS: guided filter: borders follow those of the image",
-        ),
-        "threshold": Entry(
-            "semstab.predict.filters:Threshold",
-            "SCORE: ignore pixels where no class reaches it; needs scores",
-        ),
-        "map-prior": Entry(
-            "semstab.predict.map_prior:MapPrior",
-            "METRES: multiply by the belief of the map so far, in such voxels",
         ),
     },
 )
@@ -109,7 +97,6 @@ class Filter(ABC):
         sequential: Whether it remembers the images before.
         wants_geometry: Whether it looks at depth and pose.
         wants_color: Whether it looks at the image.
-        needs_scores: Whether labels alone will not do; else a label counts as certain.
         warps: Whether it looks points up in the frames before pixel by pixel, which sparse depth does not allow.
     """
 
@@ -117,7 +104,6 @@ class Filter(ABC):
     sequential: ClassVar[bool] = False
     wants_geometry: ClassVar[bool] = False
     wants_color: ClassVar[bool] = False
-    needs_scores: ClassVar[bool] = False
     warps: ClassVar[bool] = False
 
     def __init__(self, value: float) -> None:
@@ -191,18 +177,13 @@ class Filtered(Wrapped):
     Filters see its scores where it has any; else its labels count as certain.
 
     Raises:
-        ConfigError: For a model without classes, and for one without scores where the first filter needs them.
+        ConfigError: For a model without classes.
     """
 
     def __init__(self, inner: Model, filters: Sequence[FilterSpec], name: str) -> None:
         super().__init__(inner)
         if inner.label_space is None:
             raise ConfigError(f"--filter {filters[0]}: '{name}' finds regions without classes; leave the filter out")
-        if filters[0].kind.needs_scores and not inner.gives_scores:
-            raise ConfigError(
-                f"--filter {filters[0]}: it needs scores, and '{name}' gives labels alone; leave it out, or put one"
-                " before it that makes shares of them, such as vote:5"
-            )
         self.filters = tuple(filters)
         self.space = inner.label_space
         self.gives_scores = True
@@ -270,21 +251,6 @@ def labels_of(belief: Belief, space: LabelSpace, like: npt.NDArray[Any]) -> Labe
     ids = np.array([*space.ids], dtype=like.dtype)[belief.argmax(axis=2)]
     ids[~belief.any(axis=2)] = ignore_id(like)
     return ids if like.dtype == np.uint8 else narrowed(ids, np.iinfo(np.uint16).max)
-
-
-# Unsure pixels are left out.
-
-
-class Threshold(Filter):
-    """Pixels whose largest score is below the threshold are ignored."""
-
-    parameter = Parameter("the score from which a pixel counts", 0.6, 0, 1)
-    needs_scores = True
-
-    def __call__(self, belief: Belief, shown: Shown) -> Belief:
-        """See `Filter`."""
-        sure = belief.max(axis=2, keepdims=True) >= np.float32(self.value)
-        return np.where(sure, belief, np.float32(0))
 
 
 # Exponential averages of beliefs: at the pixel, or at the surface point.
@@ -381,9 +347,7 @@ class Guided(Filter):
         return np.asarray(cv2.boxFilter(values, -1, (side, side), normalize=False, borderType=cv2.BORDER_CONSTANT))
 
 
-# Majorities of the last labels: at the pixel, or at the surface point.
-
-Rows = UInt16
+# The majority of the last labels at the pixel.
 
 
 class Vote(Filter):
@@ -397,36 +361,15 @@ class Vote(Filter):
 
     def __init__(self, value: float) -> None:
         super().__init__(value)
-        self._last: deque[tuple[Rows, Frame | None]] = deque(maxlen=int(value))
+        self._last: deque[UInt16] = deque(maxlen=int(value))
 
     def __call__(self, belief: Belief, shown: Shown) -> Belief:
         """See `Filter`."""
         K, N = belief.shape[2], int(self.value)
         rows = np.where(belief.any(axis=2), belief.argmax(axis=2), K).astype(np.uint16)
-        self._last.append((rows, shown.frame))
+        self._last.append(rows)
         counts = np.zeros((rows.size, K + 1), dtype=np.float32)
         pixels = np.arange(rows.size)
-        for age, seen in enumerate(self._seen_now(shown, K)):
+        for age, seen in enumerate(reversed(self._last)):
             counts[pixels, seen.reshape(-1)] += 1 + (N - age) / (N * (N + 1))  # of all N together less than 1
         return normalised(counts[:, :K].reshape(belief.shape))
-
-    def _seen_now(self, shown: Shown, nothing: int) -> Iterator[Rows]:
-        """Return the last label maps at the pixels of this one, the newest first; `nothing` where one says nothing."""
-        return (rows for rows, _ in reversed(self._last))
-
-
-class VoteWarped(Vote):
-    """The same at each surface point: the last N - 1 frames are asked for the pixel's surface point, by depth and pose.
-
-    A frame that did not see the point has no vote.
-    """
-
-    wants_geometry = True
-    warps = True
-
-    def _seen_now(self, shown: Shown, nothing: int) -> Iterator[Rows]:
-        (rows, _), *before = reversed(self._last)
-        yield rows
-        for past, frame in before:
-            assert frame is not None
-            yield warp(past, frame, shown.geometry, fill=nothing)[0]

@@ -8,7 +8,7 @@ import re
 from collections.abc import Mapping, Sequence
 from functools import partial
 from pathlib import Path
-from typing import Any, ClassVar, Literal, Self
+from typing import Any, Literal, Self
 
 import numpy as np
 from pydantic import BaseModel, Field, field_validator, model_validator
@@ -151,7 +151,6 @@ def shares(frame: Frame) -> Any:
 class PredictorConfig(Settings):
     """The settings that name a model, and say how its predictions are called and given."""
 
-    earlier: ClassVar[Mapping[str, str]] = {"backbone": "model"}
     model: str = Field(description="a name from `semstab-bench list`; or FILE.py:NAME, net.onnx")
     name: str | None = Field(None, description="the name of its predictions; the model's by default")
     options: dict[str, Any] = Field(default_factory=dict, description="options of that model")

@@ -66,11 +66,6 @@ class FilterResult:
     seen: float
     better: tuple[int, int] = (0, 0)
 
-    @property
-    def family(self) -> str:
-        """Return the filter's name without its number; of a chain the whole name."""
-        return self.filters if "+" in self.filters else self.filters.partition(":")[0]
-
 
 @dataclass(frozen=True)
 class FilterStudy:
@@ -105,17 +100,9 @@ class FilterStudy:
         Of filters with equal quality the one with the least flicker is returned. Stability alone is no reason: a label
         that never changes has no flicker.
         """
-        return self._best_of(self.filtered)
-
-    @property
-    def best_whole(self) -> FilterResult | None:
-        """Return the best of the filters that leave every label."""
-        return self._best_of([row for row in self.filtered if row.coverage >= 1 - ALIKE])
-
-    def _best_of(self, rows: Sequence[FilterResult]) -> FilterResult | None:
         if not self.unfiltered.seen >= LEAST_SEEN:
             return None
-        acting = [row for row in rows if row not in self.idle]
+        acting = [row for row in self.filtered if row not in self.idle]
         able = [row for row in acting if row.flicker < self.unfiltered.flicker and self.harmless(row)]
         most = max(map(self.worth, able), default=math.nan)
         return min(
@@ -133,15 +120,6 @@ class FilterStudy:
         base = self.unfiltered
         worse = [row for row in self.filtered if self.worth(row) < self.worth(base) - ALIKE]
         return sorted((r for r in worse if r.flicker < base.flicker or r.plain < base.plain), key=self.worth)
-
-    @property
-    def front(self) -> list[FilterResult]:
-        """Return the rows that no other row beats in both flicker and quality, the least flicker first."""
-        front: list[FilterResult] = []
-        for row in sorted([self.unfiltered, *self.filtered], key=lambda row: (row.flicker, -self.worth(row))):
-            if not front or self.worth(row) > self.worth(front[-1]):
-                front.append(row)
-        return front
 
 
 def filter_studies(result: Result) -> list[FilterStudy]:
@@ -190,8 +168,6 @@ def advice(study: FilterStudy) -> Iterator[str]:
         yield f"Use none of these filters over {study.model}: none lowers its flicker without a loss of {least}."
     else:
         yield f"Use --filter {typed(best)} over {study.model}: {_why(study, best)}."
-        if (whole := study.best_whole) is not None and whole != best:
-            yield f"Use --filter {typed(whole)} to leave every label: {_why(study, whole)}."
     if study.idle:
         names = ", ".join(row.filters for row in study.idle[:4])
         more = f" and {len(study.idle) - 4} more" if len(study.idle) > 4 else ""

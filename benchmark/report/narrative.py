@@ -8,6 +8,7 @@ from collections.abc import Iterator, Mapping, Sequence
 
 import yaml
 
+from semstab.comparison.caution import suspicions
 from semstab.data.measures import VSS
 from semstab.data.records import Record, Result
 from semstab.data.results import UnitSummary, VoxelAdvice
@@ -18,13 +19,9 @@ from semstab.report.means import ENOUGH, by_model, pooled
 from semstab.report.tables.backends import one_in
 from semstab.report.tables.stability import comparable
 from semstab.statistics.frame_disagreement import LEAST_FRAMES, LEAST_PLACES
-from semstab.statistics.verdict import LIMITS
 
 MOSTLY_ONCE = 0.5
 """The share of voxels seen once from which on there is a warning."""
-
-LEAST_RECALL = 0.25
-"""The share of the edges of depth with a border of labels below which there is a warning of coarse labels."""
 
 TOO_LARGE = 25
 """The multiple of the suggested voxel size from which on there is a warning."""
@@ -163,18 +160,9 @@ def _is_untested(record: Record) -> bool:
 
 
 def _suspicions(record: Record) -> Iterator[str]:
-    """Yield reasons why frames may agree although the labels are poor."""
-    statistics, recall = record.statistics, record.image_space.edge_recall
-    if statistics is None or statistics.verdict.level not in ("stable", "usable"):
-        return
-    if statistics.spots is not None and statistics.spots.labelled < LIMITS.labelled:
-        missing = f"{1 - statistics.spots.labelled:.0%} of the locations have no label in most frames"
-        yield f"{missing}; what has no label cannot flicker"
-    if recall < LEAST_RECALL and record.unit.model != GROUND_TRUTH:
-        yield (
-            f"only {recall:.0%} of the edges of depth have a border of labels near them: the labels may be coarse,"
-            " blurred, or of few objects"
-        )
+    """Yield reasons why frames may agree although the labels are poor; of the ground truth none."""
+    if record.unit.model != GROUND_TRUTH:
+        yield from suspicions(record.summary, record.image_space)
 
 
 def _traffic(record: Record) -> Iterator[str]:

@@ -1,7 +1,7 @@
 """Stability at any number of observations, its null models, its uncertainty, and the accuracy of consistent voxels.
 
-Pure functions of a VoxelTable and its Events. `describe` returns all statistics of one map, `compare_models`
-compares several; docs/metrics.md derives each measure.
+Pure functions of a VoxelTable and its Events. `describe` returns all statistics of one map;
+docs/metrics.md derives each measure.
 
 Examples:
     >>> table = semstab.load("run").table(model="sim-flicker")
@@ -9,17 +9,14 @@ Examples:
     True
 """
 
-from semstab.data.contrast import ModelComparison
 from semstab.data.statistics import Estimate, Reliability
 from semstab.statistics.agreement import class_agreement, decompose, disagreement, fleiss_kappa, krippendorff_alpha, psa
 from semstab.statistics.correctness import consistent_wrong, correctness, join_truth, reliability
 from semstab.statistics.correlogram import correlogram
-from semstab.statistics.drift import expected_sbd, flips, trends
+from semstab.statistics.drift import expected_sbd, flips
 from semstab.statistics.geometry import ceiling, losses, rendered
 from semstab.statistics.map_statistics import Analysis, analyse, describe
-from semstab.statistics.model_comparison import compare_models, coverage, paired
 from semstab.statistics.observations import SpotObservations, Views
-from semstab.statistics.paired_differences import claimed_together, standardised
 from semstab.statistics.sample import MapSample
 from semstab.statistics.sampler import Sampler
 from semstab.statistics.verdict import verdict
@@ -28,20 +25,16 @@ __all__ = [
     "Analysis",
     "Estimate",
     "MapSample",
-    "ModelComparison",
     "Reliability",
     "Sampler",
     "SpotObservations",
     "Views",
     "analyse",
     "ceiling",
-    "claimed_together",
     "class_agreement",
-    "compare_models",
     "consistent_wrong",
     "correctness",
     "correlogram",
-    "coverage",
     "decompose",
     "describe",
     "disagreement",
@@ -51,11 +44,8 @@ __all__ = [
     "join_truth",
     "krippendorff_alpha",
     "losses",
-    "paired",
     "psa",
     "reliability",
     "rendered",
-    "standardised",
-    "trends",
     "verdict",
 ]

@@ -17,7 +17,7 @@ from semstab.data.voxels import VoxelTable
 from semstab.statistics.accumulate import Cubes
 from semstab.statistics.agreement import decompose, disagreement, kappa_of, psa
 from semstab.statistics.cluster_sums import ClusterSums, Functional, mean_functional
-from semstab.statistics.drift import flips, trends
+from semstab.statistics.drift import flips
 from semstab.statistics.intervals import estimate
 from semstab.statistics.sample import MapSample
 
@@ -55,7 +55,7 @@ OF_CLUSTERS = {"psa": "psa", "voxel_alpha": "voxel_alpha", "entropy": "entropy",
 OF_FLIPS = (mean_functional("flip_rate"), mean_functional("flip_null"), mean_functional("flip_excess", -1.0))
 """Means over the same voxels as the first of `MEANS`, so that those are identical without a log."""
 
-OF_CHANGES = (mean_functional("frames_since", 0.0, math.inf), mean_functional("trend", -1.0))
+OF_CHANGES = (mean_functional("frames_since", 0.0, math.inf),)
 """Means over fewer voxels."""
 
 
@@ -133,31 +133,16 @@ def _together(table: VoxelTable, inconsistent: Float64) -> Float64:
 # --- Sums that need a log
 
 
-@dataclass(frozen=True, eq=False)
-class LogSums:
-    """The sums over cubes that need a log, and how many voxels can show a trend."""
-
-    sums: ClusterSums
-    telling: int
-
-
-def log_sums(sample: MapSample, cubes: Cubes) -> tuple[Columns, LogSums | None]:
+def log_sums(sample: MapSample, cubes: Cubes) -> tuple[Columns, ClusterSums | None]:
     """Return the columns and sums that need a log; none without one."""
     if sample.events is None:
         return {}, None
-    changes, trend = flips(sample.events), trends(sample.events)
+    changes = flips(sample.events)
     means = {
         "flip_rate": changes.rate,
         "flip_null": changes.null,
         "flip_excess": changes.rate - changes.null,
         "frames_since": changes.since,
     }
-    sums = cubes.means(means)
-    sums["trend"] = cubes.sums(np.nan_to_num(np.stack([trend.common, trend.variation], axis=1)))
-    log = LogSums(cubes.named(sums), int(np.count_nonzero(~np.isnan(trend.variation))))
-    columns: Columns = {
-        "trend": trend.share,
-        "flip_rate": changes.rate,
-        "frames_since_flip": changes.since,
-    }
-    return columns, log
+    columns: Columns = {"flip_rate": changes.rate, "frames_since_flip": changes.since}
+    return columns, cubes.named(cubes.means(means))

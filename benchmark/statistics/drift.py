@@ -20,9 +20,6 @@ from semstab.statistics.agreement import ONE_HOT
 
 FLIP_RATE = Quantity(key="flip_rate", title="Flip rate", better="lower", needs="events")
 
-ENOUGH_OBSERVATIONS = 6
-"""Lowest OP of the voxels that can show a trend: three observations in each half."""
-
 
 @dataclass(frozen=True, eq=False)
 class Flips:
@@ -37,27 +34,6 @@ class Flips:
     rate: Float64
     null: Float64
     since: Float64
-
-
-@dataclass(frozen=True, eq=False)
-class Trends:
-    """Movement of a voxel's observations one way in time (n,); NaN where OP < ENOUGH_OBSERVATIONS, or where all agree.
-
-    Odd and even observations have a slope over time each. Their product is 0 in the mean for errors that are
-    independent between frames, however much each frame errs.
-
-    Attributes:
-        common: The product of both slopes, summed over classes, as variation: that of observations on such lines.
-        variation: Sums of ||s_t - mean||^2 of the odd and of the even observations about their own means.
-    """
-
-    common: Float64
-    variation: Float64
-
-    @property
-    def share(self) -> Float64:
-        """Return the part (n,) of the variation that goes one way in time, -1 to 1; it is noisy for one voxel."""
-        return self.common / self.variation
 
 
 def expected_sbd(table: VoxelTable, events: Events | None = None, *, seed: int = 0) -> Float64:
@@ -89,27 +65,6 @@ def expected_sbd(table: VoxelTable, events: Events | None = None, *, seed: int =
         stream[rest] = streams(table, rest, seed)
         in_chunks(mean_drifts, rest, events.starts, T.astype(np.int64), log, events.K, most, stream, null)
     return null
-
-
-def trends(events: Events) -> Trends:
-    """Compare the slopes over time of the odd and of the even observations of each voxel, in the order they came."""
-    from scipy.sparse import csr_array
-
-    T, m = events.ends - events.starts, len(events)
-    number = np.arange(m) - events.starts[events.voxel]
-    half = 2 * events.voxel.astype(np.int64) + number % 2
-    count = np.bincount(half, minlength=2 * len(T)).astype(np.float64)
-    starts, label, weight = events.evidence.entries
-    evidence = csr_array((weight, label.astype(np.int32), starts), shape=(m, events.K))
-    lengths = np.sqrt(count * (count * count - 1) / 12)
-    age = (number // 2 - 0.5 * (count[half] - 1)) / np.where(lengths > 0, lengths, np.inf)[half]
-    moments, sums = (csr_array((by, (half, np.arange(m))), (2 * len(T), m)) @ evidence for by in (age, np.ones(m)))
-    common = 2 * np.asarray(moments[0::2].multiply(moments[1::2]).sum(axis=1)).ravel()
-    squares = np.bincount(np.repeat(half, np.diff(starts)), weights=weight * weight, minlength=2 * len(T))
-    of_means = np.asarray(sums.multiply(sums).sum(axis=1)).ravel() / np.maximum(count, 1)
-    variation = (squares - of_means).reshape(-1, 2).sum(axis=1)
-    enough = (T >= ENOUGH_OBSERVATIONS) & (variation > ONE_HOT * T)
-    return Trends(np.where(enough, common, np.nan), np.where(enough, variation, np.nan))
 
 
 def flips(events: Events) -> Flips:

@@ -34,7 +34,10 @@ LEAST_EXCESS = 0.03
 """Share of its places by which a frame stands out at least: 3 in 100."""
 
 LEVEL = 0.025
-"""Nominal level at which any frame of equal ones is named; 4 to 5 of 100 simulated runs (docs/validity.md)."""
+"""Nominal level at which a frame is named if no frame is bad; 0 to 5 of 100 simulated runs (docs/validity.md)."""
+
+LEAST_ODDS = 0.001
+"""Added to both shares of the odds, so that they are finite; a few places then hardly move the odds."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -56,8 +59,18 @@ class LoneDisagreement:
 
     @property
     def excess(self) -> Float64:
-        """(F,) share less its null; 0 in the mean where all views of a place err alike."""
+        """(F,) share minus null; its mean is 0 if all views of a place have the same quality."""
         return self.share - self.null
+
+    @property
+    def log_odds_ratio(self) -> Float64:
+        """(F,) logit of the share minus logit of the null: about normal if the quality of frames differs.
+
+        Qualities multiply the odds of an error. On the scale of `excess` they are skewed, and the worst of many good
+        frames would look like an outlier.
+        """
+        share, null = (np.log((p + LEAST_ODDS) / (1 - p + LEAST_ODDS)) for p in (self.share, self.null))
+        return np.asarray(share - null, np.float64)
 
 
 def lone_disagreement(spots: SpotObservations) -> LoneDisagreement:
@@ -124,12 +137,12 @@ def largest_deviate(n: int, level: float) -> float:
 
 
 def outlying_frames(lone: LoneDisagreement, views: int, *, name: Callable[[int], str] = str) -> OutlyingFrames:
-    """Return the frames that stand alone more often than frames of the same quality do.
+    """Return the frames that stand alone more often than the quality of the other frames explains.
 
-    The null is the spread of the frames themselves, which has in it how places, labels and frames vary: a frame is
-    named where its excess is an outlier among the excesses, and at least LEAST_EXCESS above the mean of the frames
-    that are not named. The excess of a frame with fewer places than half of the frames have is more uncertain, and
-    counts as sqrt(places / median) of its own.
+    The null is the spread of the frames, which contains the variation of places, labels and qualities. A frame is named
+    if its log odds ratio is an outlier among the frames' and its excess is at least LEAST_EXCESS above the mean of the
+    frames that are not named. The log odds ratio of a frame with fewer places than the median is more uncertain: its
+    distance from the median is multiplied by sqrt(places / median).
 
     Args:
         lone: How often each frame of a map stands alone.
@@ -140,7 +153,8 @@ def outlying_frames(lone: LoneDisagreement, views: int, *, name: Callable[[int],
     if len(judged) < LEAST_FRAMES:
         return OutlyingFrames(judged=0, unjudged=views, usual=math.nan)
     places, excess = lone.places[judged], lone.excess[judged]
-    above = outlying_rows(excess * np.sqrt(np.minimum(places / np.median(places), 1.0)))
+    odds = lone.log_odds_ratio[judged]
+    above = outlying_rows((odds - np.median(odds)) * np.sqrt(np.minimum(places / np.median(places), 1.0)))
     usual = float(np.delete(excess, above).mean())
     named = above[excess[above] >= usual + LEAST_EXCESS]
     rows = judged[named[np.argsort(-excess[named], kind="stable")]]

@@ -26,7 +26,6 @@ from semstab.data.statistics import (
     MapStatistics,
     Repeated,
     StratumStatistics,
-    Trend,
 )
 from semstab.data.voxels import VoxelTable
 from semstab.metrics.agreement import shared_rows
@@ -54,7 +53,6 @@ from semstab.statistics.cube_sums import (
     OF_FLIPS,
     Columns,
     FlippingSums,
-    LogSums,
     location_sums,
     log_sums,
     row_columns,
@@ -144,7 +142,7 @@ def describe(
 ) -> MapStatistics:
     """Return all statistics of one map: a `MapSample` is drawn and analysed.
 
-    - `events`: the log behind the table; without it there is no trend and no flip rate
+    - `events`: the log behind the table; without it there is no flip rate
     - `truth`: the map of the ground truth labels of the same frames; without it correctness is unknown
     - `limit`: the map of view-independent labels (`ceiling`), from which geometry's part of the disagreement follows
 
@@ -258,20 +256,20 @@ def _agreement(means: Mapping[str, Interval], classes: tuple[ClassAgreement, ...
     return FrameAgreement(**{name: means[name] for name in names}, classes=classes)
 
 
-def _drift(repeats: int, means: Mapping[str, Interval], locations: ClusterSums, log: LogSums | None) -> DriftStatistics:
-    """Return SBD and its null; without a log only for one-hot evidence, and without flips and trend."""
-    trend, rates, (sampled, known) = None, None, (locations[name][:, 1].sum() for name in ("psa", "null"))
+def _drift(
+    repeats: int, means: Mapping[str, Interval], locations: ClusterSums, log: ClusterSums | None
+) -> DriftStatistics:
+    """Return SBD and its null; without a log only for one-hot evidence, and without flips."""
+    rates, (sampled, known) = None, (locations[name][:, 1].sum() for name in ("psa", "null"))
     if log is not None:
-        since, share = _intervals(log.sums, OF_CHANGES)
-        trend = Trend(share, log.telling)
-        rate, null, excess = _intervals(log.sums, OF_FLIPS)
+        (since,) = _intervals(log, OF_CHANGES)
+        rate, null, excess = _intervals(log, OF_FLIPS)
         rates = FlipRates(rate, null, excess, since)
     return DriftStatistics(
         voxels=round(known / sampled * repeats) if sampled else 0,
         sbd=means["sbd"],
         null=means["null"],
         excess=means["excess"],
-        trend=trend,
         flips=rates,
     )
 

@@ -6,8 +6,11 @@ import dataclasses
 import math
 from dataclasses import dataclass
 
+import numpy as np
+
+from semstab.core.types import Float64
+from semstab.data.events import Events
 from semstab.statistics.observations import SpotObservations
-from semstab.statistics.paired_differences import pairs_labelled
 
 
 @dataclass(frozen=True)
@@ -36,3 +39,24 @@ def silence(spots: SpotObservations) -> Silence:
         return Silence(1.0, 1.0)
     log = dataclasses.replace(spots, K=spots.K + 1, classes=()).observations()  # the last class: no label
     return Silence(float(labelled.mean()), min(pairs_labelled(log), 1.0))
+
+
+def pairs_labelled(log: Events) -> float:
+    """Return the share of the pairs of two views of a spot of which neither is the last class, spots by their views."""
+    op = np.bincount(log.voxel)
+    return (
+        float(np.average(mean_products(log, 1 - log.evidence[:, -1:]), weights=op[op >= 2]))
+        if (op >= 2).any()
+        else math.nan
+    )
+
+
+def mean_products(log: Events, shares: Float64) -> Float64:
+    """Return the mean of s . s' (v,) over the pairs of observations of each spot with two or more, shares (m, C)."""
+    starts = log.starts
+    T = np.diff(np.append(starts, len(log))).astype(np.float64)
+    again = T >= 2
+    total = np.add.reduceat(shares, starts, axis=0)[again] if len(T) else np.zeros((0, shares.shape[1]))
+    own = np.add.reduceat((shares**2).sum(axis=1), starts)[again] if len(T) else np.zeros(0)
+    products: Float64 = ((total**2).sum(axis=1) - own) / (T * (T - 1))[again]
+    return products

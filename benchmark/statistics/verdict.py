@@ -142,9 +142,11 @@ def verdict(
         return StabilityVerdict("no verdict", math.nan, f"{model}: no verdict, {reason}; {support}")
     assert spots is not None
     level, probability = _level(headline, spots, limits)
-    of_all, _ = _level(headline, spots, limits, spots.pairs)
+    of_all, probability_of_all = _level(headline, spots, limits, spots.pairs)
     silent = spots.labelled < limits.labelled
-    both = StabilityVerdict(level, probability, "", None if of_all == level else of_all, spots.pixels_labelled)
+    both = StabilityVerdict(level, probability, "", labelled=spots.pixels_labelled)
+    if of_all != level:
+        both = dataclasses.replace(both, of_all=of_all, probability_of_all=probability_of_all)
     wrong = headline.wrong_of_consistent
     same = spots.agreeing(headline.alpha.value)
     parts = [_alpha(headline.alpha, spots), f"two views see the same class at {same:.0%} of the spots"]

@@ -4,9 +4,8 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Annotated, ClassVar, Literal, get_args
+from typing import Annotated, Literal, get_args
 
 import numpy as np
 from pydantic import AfterValidator, Field, field_validator
@@ -122,7 +121,6 @@ MODELS = {
 class CityOptions(Settings):
     """Options of the built-in city."""
 
-    earlier: ClassVar[Mapping[str, str]] = {"backbones": "models"}
     seed: int = Field(0, ge=0, lt=2**63, description="of the towns and of all errors")
     width: int = Field(384, ge=16, le=3840, description="image width in pixels")
     height: int = Field(216, ge=16, le=2160, description="image height in pixels")

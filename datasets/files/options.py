@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import logging
 import os
 import re
 from collections.abc import Callable, Collection, Mapping
@@ -21,8 +20,6 @@ from semstab.datasets.formats.images import Read
 from semstab.datasets.geometry.cameras import Camera, Poses
 from semstab.datasets.geometry.lenses import Lens
 from semstab.errors import ConfigError, DataError
-
-logger = logging.getLogger("semstab")
 
 Positive = Annotated[float, Field(gt=0, le=1e30)]
 Finite = Annotated[float, Field(allow_inf_nan=False)]
@@ -170,9 +167,6 @@ class Template:
     required: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
-        if "model" in self.known and "{backbone}" in self.text:
-            logger.warning("%s: {backbone} is now called {model}; the next version will not know it", self.option)
-            object.__setattr__(self, "text", self.text.replace("{backbone}", "{model}"))
         names, where = PLACEHOLDER.findall(self.text), f"{self.option}: {self.text[:200]!r}"
         known = ", ".join(f"{{{name}}}" for name in self.known)
         if unknown := next((name for name in names if name not in self.known), None):

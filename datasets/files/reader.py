@@ -12,6 +12,7 @@ from typing import Generic, Protocol, TypeVar
 import numpy as np
 
 from semstab.config import nearest
+from semstab.core.files import cache_folder
 from semstab.core.types import UInt16
 from semstab.data.georeference import Georeference
 from semstab.datasets.files.labels import SceneEntry
@@ -117,8 +118,7 @@ class FileDataset(ScenesBelow[Options]):
                     f"{options.surface}: holds heights over x and y, but up_axis is {options.up_axis}; turn it, or take"
                     " a mesh"
                 )
-            cache = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")
-            casts = None if options.casts is False else options.casts or cache / "semstab" / "casts"
+            casts = None if options.casts is False else options.casts or cache_folder() / "casts"
             origin = self.mesh_origin(entry.folder, options.surface)
             surface = Surface(options.surface, options.surface_cell, georeference, casts, origin)
         scene = self.opened(entry, frames, options, surface)

@@ -14,7 +14,7 @@ from kind import Kind
 from posed_config import configure
 
 import semstab
-from semstab.comparison.writing import compare, load_comparison
+from semstab.compare_runs import compare, load_comparison
 from semstab.configure import load_config, resolve
 from semstab.conformance import case_folder, compared
 from semstab.data.frames import Intrinsics
@@ -95,10 +95,10 @@ def of_text(folder: Path) -> Iterator[Kind]:
     names.write_text("wall\ndoor\nwindow\n")
     yield Kind("names of classes", (names,), lambda file: class_names(str(file)))
     chains = folder / "filters.txt"
-    chains.write_text("ema:0.6\nvote-warped:5\nguided:4\nthreshold:0.5\nmap-prior:0.1\n")
+    chains.write_text("ema:0.6\nvote:5\nguided:4\nema-warped:0.5\n")
     yield Kind("filters", (chains,), read_filters)
     flight = predicted_scene.write(folder / "flight", frames=2)
-    model = {"model": "colour-clusters", "filters": ["ema:0.6", "threshold:0.5"]}
+    model = {"model": "colour-clusters", "filters": ["ema:0.6", "guided:4"]}
     inner = {"name": "posed_folder", "options": {"root": str(flight)}}
     content = {"dataset": {"name": "predicted", "options": {"dataset": inner, "models": [model]}}, "top_k": 2}
     (folder / "predicted.yaml").write_text(yaml.safe_dump(content))

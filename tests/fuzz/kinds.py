@@ -25,10 +25,8 @@ from rich.console import Console
 
 import semstab
 from semstab.comparison.differences import contrasts
-from semstab.comparison.gate import gate_config
-from semstab.comparison.gate_rules import parse
+from semstab.comparison.entries import open_run, open_runs, save_summary, shared_scenes
 from semstab.comparison.pairing import pair
-from semstab.comparison.runs import open_run, open_runs, save_summary, shared_scenes
 from semstab.configure import load_config, load_study
 from semstab.convert import convert
 from semstab.core.files import read_json
@@ -54,6 +52,8 @@ from semstab.datasets.formats.images import (
 from semstab.datasets.scannet import read_class_table
 from semstab.engine import load_result
 from semstab.exports import export
+from semstab.gating.gate import gate_config
+from semstab.gating.rules import parse
 from semstab.models.sam import read_rules
 from semstab.models.segearth_ov import read_prompts
 from semstab.predict.folder import PredictionFolder
@@ -262,7 +262,7 @@ def of_results(folder: Path) -> Iterator[Kind]:
     for cloud in (small_cloud(folder / "cloud.ply", table.centers), las_at(folder / "cloud.laz", table.centers),
                   las_at(folder / "cloud.las", table.centers)):  # fmt: skip
         out = folder / f"out{cloud.suffix}"
-        yield Kind(f"onto {cloud.name}", (cloud,), lambda file, out=out: onto(out, onto=file))
+        yield Kind(f"onto {cloud.name}", (cloud,), lambda file, out=out: onto(out, classify=file))
     codes = folder / "codes.yaml"
     codes.write_text("wall: 6\ndoor: 20\n")
     yield Kind("asprs.yaml", (codes,), lambda file: onto(folder / "coded.las", asprs=file))

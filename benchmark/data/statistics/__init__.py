@@ -17,7 +17,7 @@ from semstab.data.statistics.agreement import (
     metres,
 )
 from semstab.data.statistics.correctness import Correctness, CorrectnessStatistics, Losses, Quadrants, Reliability
-from semstab.data.statistics.drift import DriftStatistics, Flipping, FlipRates, FrameDisagreement, OutlyingFrames, Trend
+from semstab.data.statistics.drift import DriftStatistics, Flipping, FlipRates, FrameDisagreement, OutlyingFrames
 from semstab.data.statistics.intervals import CONFIDENCE, UNDEFINED, UNKNOWN, Estimate, Interval, short
 from semstab.data.statistics.map_statistics import (
     ORDER_KNOWN,
@@ -64,7 +64,6 @@ __all__ = [
     "SpotAgreement",
     "StabilityVerdict",
     "StratumStatistics",
-    "Trend",
     "metres",
     "short",
 ]

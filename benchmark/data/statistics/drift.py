@@ -27,19 +27,6 @@ class Flipping:
 
 
 @dataclass(frozen=True)
-class Trend:
-    """The movement of the belief in time: the share of the disagreement that odd and even observations both show.
-
-    It is 0 in the mean if frames err independently. Drift of the model cannot be distinguished from errors that depend
-    on the view, or that last over frames. `voxels` is the number of voxels behind it: those with OP >= 6 whose
-    observations differ.
-    """
-
-    share: Interval
-    voxels: int
-
-
-@dataclass(frozen=True)
 class FlipRates:
     """Share of the steps at which the predicted class changes, that in random order; frames since the last change."""
 
@@ -57,7 +44,6 @@ class DriftStatistics:
     sbd: Interval
     null: Interval
     excess: Interval
-    trend: Trend | None = None
     flips: FlipRates | None = None
 
 

@@ -29,6 +29,7 @@ class StabilityVerdict:
         line: The reasons.
         of_all: The level if what the model leaves out counts as disagreeing, where it is another one; else None.
         labelled: Share of the pixels with depth that have a label; NaN where that was not stored.
+        probability_of_all: Probability that `of_all` is right; NaN without `of_all`.
     """
 
     level: Level
@@ -36,11 +37,17 @@ class StabilityVerdict:
     line: str
     of_all: Level | None = None
     labelled: float = math.nan
+    probability_of_all: float = math.nan
 
     @property
     def decisive(self) -> Level:
         """The level that counts against other models: that of all, whatever has a label."""
         return self.of_all or self.level
+
+    @property
+    def decisive_probability(self) -> float:
+        """The probability that the decisive level is right; NaN if no threshold decides."""
+        return self.probability if self.of_all is None else self.probability_of_all
 
     @property
     def difference(self) -> str:

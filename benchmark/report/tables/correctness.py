@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 
-from semstab.data.contrast import ComparedObservations, MapCoverage, ModelComparison
 from semstab.data.records import Result
 from semstab.data.statistics import (
     CONFIDENCE,
@@ -24,7 +23,6 @@ from semstab.report.tables.table import Column, Group, Row, Table
 from semstab.statistics.correctness import ACCURACY, BRIER, ECE, MIOU
 from semstab.statistics.correlogram import STANDARD
 from semstab.statistics.intervals import LEAST_FRAMES
-from semstab.statistics.model_comparison import compared
 
 RIGHT = (ACCURACY, MIOU, ECE, BRIER)
 """The measures of the correctness of fused labels, in the order of the columns."""
@@ -127,149 +125,6 @@ def _right(rows: Sequence[Correctness]) -> list[float]:
     """Return the macro mean of each of RIGHT."""
     values = [(row.accuracy, row.miou, row.ece, row.brier) for row in rows]
     return [macro_mean(column) for column in zip(*values, strict=True)]
-
-
-# The models side by side, on the same locations and at the same number of observations.
-
-THIN = 0.1
-"""The share of the weight in strata that hardly overlap from which on the table reports it."""
-
-_COMMON = (
-    "Alpha is of the answers (a spot in a view) to which all models gave a label, the rest of the voxels that all saw"
-    " twice or more."
-)
-
-
-def comparison(result: Result) -> list[Table]:
-    """Return paired differences, ranking, and what each map covers; one group a scene."""
-    if not result.comparisons:
-        return []
-    covered = coverage_table({comparison.scene: comparison.coverage for comparison in result.comparisons})
-    shared = {
-        comparison.scene: comparison.observations
-        for comparison in result.comparisons
-        if comparison.observations is not None
-    }
-    return [_differences(result), _ranking(result), covered, *([ignored_table(shared)] if shared else [])]
-
-
-def _differences(result: Result) -> Table:
-    columns = (
-        Column("a", "Model"),
-        Column("b", "less model"),
-        Column("measure", "Measure"),
-        Column("difference", "Difference", 4, signed=True),
-        Column("p_holm", "p (Holm)", 4),
-        Column("answers", "interval is for"),
-    )
-    caption = (
-        f"{_COMMON} Only the first measure is tested. Its p is corrected by Holm's method for all pairs of all scenes"
-        f" that allow a claim; the other measures describe. {INTERVALS}"
-    )
-    groups = tuple(Group(comparison.scene, _difference_rows(comparison)) for comparison in result.comparisons)
-    return Table("comparison", "Differences on the same locations", caption, columns, groups, "scene")
-
-
-def _difference_rows(comparison: ModelComparison) -> tuple[Row, ...]:
-    words = {quantity.key: quantity.word for quantity in compared(truth=True)}
-    rows = sorted(comparison.paired.differences, key=lambda row: row.measure != comparison.paired.primary)
-    return tuple(
-        (row.a, row.b, words.get(row.measure, row.measure), row.difference, row.p_holm, row.undecided or row.scope)
-        for row in rows
-    )
-
-
-def _ranking(result: Result) -> Table:
-    columns = (
-        Column("measure", "Measure"),
-        Column("rank", "Rank", 0),
-        Column("model", "Model"),
-        Column("range", f"{CONFIDENCE:.0%} of resamples"),
-        Column("best_percent", "first in (%)", 0),
-        Column("value", "In common", 4),
-        Column("standardised", "Same OP", 4),
-    )
-    caption = (
-        f"The column 'In common' is of shared data. {_COMMON} The column 'Same OP' is of all voxels of each map that"
-        f" were seen twice or more, with its strata of OP weighted as in all maps together. {INTERVALS}"
-    )
-    thin = max(comparison.standardised.thin for comparison in result.comparisons)
-    if thin > THIN:
-        caption += f" {thin:.0%} of the weight is in strata of OP that hardly overlap."
-    groups = tuple(Group(comparison.scene, _ranking_rows(comparison)) for comparison in result.comparisons)
-    return Table("comparison_ranking", "Order of the models", caption, columns, groups, "scene")
-
-
-def _ranking_rows(comparison: ModelComparison) -> tuple[Row, ...]:
-    quantities = {quantity.key: quantity for quantity in compared(truth=True)}
-    return tuple(
-        (
-            quantities[ranking.measure].word,
-            rank.rank,
-            rank.model,
-            f"{rank.low} to {rank.high}",
-            100 * rank.best,
-            comparison.paired.of(quantities[ranking.measure])[rank.model],
-            comparison.standardised.of(quantities[ranking.measure], rank.model),
-        )
-        for ranking in comparison.paired.rankings
-        for rank in ranking.ranks
-    )
-
-
-def ignored_table(observations: Mapping[str, ComparedObservations]) -> Table:
-    """Return the share of pixels that each model left out, by scene."""
-    columns = (
-        Column("model", "Model"),
-        Column("missing_percent", "left out (%)", 1),
-        Column("psa_low", "at least", 3, over="Agreement with these"),
-        Column("psa_high", "at most", 3, over="Agreement with these"),
-        Column("alpha_ignored", "Alpha, left out disagrees", 3),
-        Column("order", "Order depends on it"),
-    )
-    caption = (
-        "A pixel is left out if a model gives it no label where another model gives one. The agreement of two views in"
-        " a spot has two bounds: these pixels agree never, or always (Manski). For alpha, pixels that are left out"
-        " disagree. The order depends on them if that alpha, or the agreement within its bounds, would change"
-        " the order of the models."
-    )
-    groups = tuple(Group(scene, _ignored_rows(comparison)) for scene, comparison in observations.items())
-    return Table("comparison_ignored", "Pixels that were left out", caption, columns, groups, "scene")
-
-
-def _ignored_rows(observations: ComparedObservations) -> tuple[Row, ...]:
-    depends = "yes" if observations.depends else "no"
-    return tuple(
-        (row.model, 100 * row.missing, row.psa_low, row.psa_high, row.alpha, depends) for row in observations.ignored
-    )
-
-
-def coverage_table(covered: Mapping[str, Sequence[MapCoverage]]) -> Table:
-    """Return the coverage of each map, by scene."""
-    columns = (
-        Column("model", "Model"),
-        Column("voxels", "Voxels", 0),
-        Column("mean_op", "Mean OP", 2),
-        Column("repeated", "OP>=2", 0),
-        Column("recurrent", "OP>=3", 0),
-        Column("common_percent", "in all maps (%)", 1),
-        Column("alone", "in no other", 0),
-    )
-    caption = "A model that ignores hard pixels covers less, and is compared on easier locations."
-    groups = tuple(Group(scene, tuple(map(_coverage_row, maps))) for scene, maps in covered.items())
-    return Table("comparison_coverage", "Coverage of each map", caption, columns, groups, "scene")
-
-
-def _coverage_row(row: MapCoverage) -> Row:
-    return (
-        row.model,
-        row.voxels,
-        row.mean_op,
-        row.repeated,
-        row.recurrent,
-        100 * row.common_share,
-        row.alone,
-    )
 
 
 # Agreement at a stated distance of two observations, and of the nearest and the farthest observations.

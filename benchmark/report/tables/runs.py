@@ -73,8 +73,9 @@ def _row(record: Record) -> Row:
     headline = None if statistics is None else statistics.headline
     correct = None if statistics is None else statistics.correctness
     return (
-        run.unit.scene, run.unit.model, "" if verdict is None else verdict.level,
-        unknown if verdict is None else 100 * verdict.probability, unknown if headline is None else headline.alpha,
+        run.unit.scene, run.unit.model, "" if verdict is None else verdict.decisive,
+        unknown if verdict is None else 100 * verdict.decisive_probability,
+        unknown if headline is None else headline.alpha,
         "" if headline is None else headline.alpha.scope,
         unknown if statistics is None else 100 * statistics.agreeing, record.image_space.compensated_flicker_percent,
         *means, unknown if correct is None else correct.miou, run.table.voxel_size, run.frames,

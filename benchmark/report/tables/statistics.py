@@ -146,34 +146,25 @@ def _from_to(stratum: RangeStratum) -> str:
 
 
 def drift(result: Result) -> list[Table]:
-    """Return SBD, the SBD of the same observations in random order, and the trend in time."""
+    """Return SBD and the SBD of the same observations in random order."""
     columns = (
         Column("voxels", "Voxels", 0),
         Column("sbd", "observed", 4, over="SBD (bits)"),
         Column("sbd_null", "random order", 4, over="SBD (bits)"),
         Column("sbd_excess", "excess", 4, signed=True, over="SBD (bits)"),
-        Column("trend_percent", "of the disagreement (%)", 1, signed=True, over="Trend in time"),
-        Column("trend_voxels", "voxels", 0, over="Trend in time"),
     )
     numbers: tuple[Number, ...] = (
         ordered(lambda drift: drift.voxels),
         ordered(lambda drift: drift.sbd.value),
         ordered(lambda drift: drift.null.value),
         ordered(lambda drift: drift.excess),
-        lambda stats: UNDEFINED if stats.drift.trend is None else stats.drift.trend.share.percent,
-        lambda stats: math.nan if stats.drift.trend is None else stats.drift.trend.voxels,
     )
-    logged = any(r.statistics is not None and r.statistics.drift.trend is not None for r in result.select())
-    one_class = f"{SEEN_TWICE[:-1]} in which each frame has one class; --statistics adds the others, and the trend."
+    logged = any(r.statistics is not None and r.statistics.drift.flips is not None for r in result.select())
+    one_class = f"{SEEN_TWICE[:-1]} in which each frame has one class; --statistics adds the others."
     seen = SEEN_TWICE if logged else one_class
-    trend = (
-        " Trend in time is the share of the disagreement that odd and even observations both show as a move in one"
-        " direction, in voxels seen six times or more that disagree. Its mean is 0 if the errors of frames are"
-        " independent. It does not separate drift of the model from errors that depend on the view or last over frames."
-    )
     caption = (
         f"{seen} Random order is the mean SBD of the same observations over all orders; excess is SBD less that mean."
-        f"{trend if logged else ''} {INTERVALS}"
+        f" {INTERVALS}"
     )
     return by_scene(result, "drift", "Belief drift against random order", caption, columns, numbers)
 

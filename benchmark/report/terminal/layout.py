@@ -15,6 +15,8 @@ WIDTH = 80
 
 LEVELS = f"  act on labels from alpha {short(LIMITS.stable)} on, with care from {short(LIMITS.usable)}"
 
+UNITS = "; SBD in bits"
+"""The unit of the numbers of a row that have one; shares are from 0 to 1 or in %."""
 
 TEXTS = 3
 """The number of columns of text, which are aligned left; numbers are aligned right."""

@@ -9,7 +9,7 @@ from collections.abc import Iterator
 from semstab.data.measures import measures
 from semstab.data.records import Record, Result
 from semstab.data.results import UnitSummary
-from semstab.data.statistics import Estimate, short
+from semstab.data.statistics import Estimate, MapStatistics, short
 from semstab.metrics import CATEGORIES
 from semstab.report.means import ENOUGH
 from semstab.report.narrative import nearly_all
@@ -50,15 +50,9 @@ def _verdict(run: UnitSummary) -> Iterator[str]:
         yield from wrapped(statistics.verdict.line)
         return
     yield f"  {level} {statistics.verdict.stated}".rstrip() + f"    alpha {short(alpha.value)}{_interval(alpha)}"
-    wrong = statistics.headline.wrong_of_consistent
-    told = f"{percent(wrong.value)}{_interval(wrong, 100)} of the consistent locations are wrong"
+    told = wrong_text(statistics)
     if statistics.verdict.level == "misleading":
-        yield from textwrap.wrap(
-            f"{told}, more than {percent(DANGEROUS)}: do not take agreement for truth",
-            WIDTH,
-            initial_indent="  ",
-            subsequent_indent="  ",
-        )
+        yield from textwrap.wrap(told, WIDTH, initial_indent="  ", subsequent_indent="  ")
     elif statistics.verdict.level == "uninformative" and statistics.spots is not None:
         share, name = nearly_all(statistics.spots.largest_share), statistics.spots.largest_class
         yield f"  {share} of the observations are {name}: agreement does not assess such a map"
@@ -72,11 +66,26 @@ def _verdict(run: UnitSummary) -> Iterator[str]:
     if statistics.verdict.level == "undecided":
         yield from wrapped(f"{why_undecided(alpha)}: more frames decide it")
     yield f"  two views see the same class at {percent(statistics.agreeing)} of the spots"
-    if not math.isnan(wrong.value) and statistics.verdict.level != "misleading":
+    if told and statistics.verdict.level != "misleading":
         yield f"  {told}"
     if statistics.told_ranges is not None:
         yield from wrapped(statistics.told_ranges.text)
     yield ""
+
+
+def wrong_text(statistics: MapStatistics) -> str:
+    """Return the share of the consistent locations that are wrong, and what follows from it; '' without truth."""
+    if not (share := share_of_wrong(statistics)):
+        return ""
+    told = f"{share} of the consistent locations are wrong"
+    misleads = statistics.verdict.level == "misleading"
+    return f"{told}, more than {percent(DANGEROUS)}: do not take agreement for truth" if misleads else told
+
+
+def share_of_wrong(statistics: MapStatistics) -> str:
+    """Return the share of the consistent locations that are wrong: '5 % (3 to 6 %)'; '' without truth."""
+    wrong = statistics.headline.wrong_of_consistent
+    return "" if math.isnan(wrong.value) else f"{percent(wrong.value)}{_interval(wrong, 100)}"
 
 
 def _flicker(record: Record) -> Iterator[str]:

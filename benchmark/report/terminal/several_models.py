@@ -1,4 +1,4 @@
-"""Several models or scenes: which one is more stable, and a row of numbers for each."""
+"""Several models on one scene: which one is more stable, and a row of numbers for each."""
 
 from __future__ import annotations
 
@@ -13,14 +13,26 @@ from semstab.report.means import ENOUGH
 from semstab.report.ranking import answers
 from semstab.report.terminal.disagreement import class_lines, outlying_lines
 from semstab.report.terminal.head import head_lines
-from semstab.report.terminal.layout import LEVELS, common_beginning, cut, laid_out, number, percents, wrapped
+from semstab.report.terminal.layout import (
+    LEVELS,
+    UNITS,
+    common_beginning,
+    cut,
+    laid_out,
+    number,
+    percent,
+    percents,
+    wrapped,
+)
+from semstab.report.terminal.one_model import share_of_wrong
+from semstab.statistics.verdict import DANGEROUS
 
 
 def columns() -> list[tuple[str, str]]:
-    """Return the head and the unit of each number in a model's row, see `row_of`."""
-    shown = [(measure.title, measure.unit or "OP>=3") for measure in headlines()]
+    """Return the head and the unit or the population of each number in a model's row, see `row_of`."""
+    shown = [(m.title, "OP>=3") for m in headlines()]
     texts = [("model", ""), ("verdict", ""), (f"alpha ({UNDEFINED.of})", "")]
-    return [*texts, ("agree", "%"), ("flicker", "%"), *shown, ("mIoU", "%")]
+    return [*texts, ("agree", "%"), ("flicker", "%"), *shown, ("mIoU", "OP>=2")]
 
 
 def row_of(record: Record, begin: str = "") -> list[str]:
@@ -34,7 +46,7 @@ def row_of(record: Record, begin: str = "") -> list[str]:
     means = {m: recurrent[m] if recurrent.voxels >= ENOUGH else math.nan for m in headlines()}
     shown = [short(value, digits=m.digits[0]) for m, value in means.items()]
     flicker = record.image_space.compensated_flicker_percent
-    agreeing, flickering, overlap = number(agree, 0), number(flicker, 1), number(100 * miou(record), 1)
+    agreeing, flickering, overlap = number(agree, 0), number(flicker, 1), short(miou(record), digits=3)
     return [run.unit.model.removeprefix(begin), level, alpha, agreeing, flickering, *shown, overlap]
 
 
@@ -50,9 +62,8 @@ MOST_MAPS = 2
 
 
 def several_models(result: Result, records: Sequence[Record], width: int) -> Iterator[str]:
-    """Yield which model is more stable where that is known, then a row for each scene and model."""
-    listed = ", ".join(result.scenes[:3]) + (", ..." if len(result.scenes) > 3 else "")
-    yield from head_lines(listed, result, [record.summary for record in records], width)
+    """Yield which model is more stable where that is known, then a row for each model."""
+    yield from head_lines(result.scenes[0], result, [record.summary for record in records], width)
     for text in (told := list(answers(result))):
         yield from wrapped(text)
     if told:
@@ -60,33 +71,35 @@ def several_models(result: Result, records: Sequence[Record], width: int) -> Ite
     known = any(not math.isnan(miou(record)) for record in records)
     shown, begin = columns() if known else columns()[:-1], common_beginning([*result.models])
     heads, rows = [*zip(*shown, strict=True)], [row_of(record, begin)[: len(shown)] for record in records]
-    lines = iter(laid_out([*heads, *rows], width))
-    yield next(lines)
-    yield next(lines)
-    scene = None
-    for record, line in zip(records, lines, strict=True):
-        if len(result.scenes) > 1 and record.unit.scene != scene:
-            yield f"  {(scene := record.unit.scene)}"
-        yield line
+    yield from laid_out([*heads, *rows], width)
     if begin:
         yield f"  names of models begin with '{begin}'"
     if any(record.summary.table.recurrent.voxels < ENOUGH for record in records):
         titles = ", ".join(measure.title for measure in headlines())
         yield f"  {titles} -: fewer than {ENOUGH:,} voxels were seen 3 times or more"
-    yield LEVELS
+    yield f"{LEVELS}{UNITS}"
     if len(records) <= MOST_MAPS and any(record.summary.table.categories for record in records):
         yield from ("", *_map_shares(records, width, begin), "")
     yield from class_lines(records, width, begin)
     yield from outlying_lines(records)
+    yield from _wrong_lines(records)
     for record in records:
         statistics = record.summary.statistics
         if statistics is None:
             continue
         ranges = "" if statistics.told_ranges is None else statistics.told_ranges.text
-        where = f" in {record.unit.scene}" if len(result.scenes) > 1 else ""
         for text in filter(None, (statistics.verdict.difference, ranges)):
-            yield from wrapped(f"{record.unit.model}{where}: {text}")
+            yield from wrapped(f"{record.unit.model}: {text}")
     yield ""
+
+
+def _wrong_lines(records: Sequence[Record]) -> Iterator[str]:
+    """Yield the share of the consistent locations that are wrong, of each model; nothing without ground truth."""
+    shares = {record.unit.model: share_of_wrong(record.statistics) for record in records if record.statistics}
+    if known := [f"{model} {share}" for model, share in shares.items() if share]:
+        misleads = any(record.statistics.verdict.level == "misleading" for record in records if record.statistics)
+        more = f"; more than {percent(DANGEROUS)} is MISLEADING: do not take agreement for truth" if misleads else ""
+        yield from wrapped(f"of the consistent locations are wrong: {', '.join(known)}{more}")
 
 
 def _map_shares(records: Sequence[Record], width: int, begin: str) -> Iterator[str]:
@@ -94,10 +107,8 @@ def _map_shares(records: Sequence[Record], width: int, begin: str) -> Iterator[s
     known = [record for record in records if record.summary.table.categories]
     rows = [percents([record.summary.table.categories[name] for name in reversed(CATEGORIES)]) for record in known]
     heads = ("stable", "uncertain", "drifting", "seen less than 3 times")
-    scenes = len({record.unit.scene for record in known}) > 1
     models = [record.unit.model.removeprefix(begin) for record in known]
-    named = [f"{each.unit.scene}, {name}" if scenes else name for each, name in zip(known, models, strict=True)]
-    names = [cut(name, width - sum(map(len, heads)) - 2 * len(heads) - 2) for name in named]
+    names = [cut(name, width - sum(map(len, heads)) - 2 * len(heads) - 2) for name in models]
     first = max(map(len, (OF_MAP, *names)))
     for name, row in ((OF_MAP, heads), *zip(names, rows, strict=True)):
         cells = (f"{share:>{len(head)}}" for share, head in zip(row, heads, strict=True))

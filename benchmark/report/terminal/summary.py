@@ -19,6 +19,7 @@ from semstab.report.tables.backends import one_in
 from semstab.report.tables.table import to_terminal
 from semstab.report.terminal.filters import print_filter_study
 from semstab.report.terminal.layout import WIDTH, wrapped
+from semstab.report.terminal.many_scenes import many_scenes
 from semstab.report.terminal.one_model import one_model
 from semstab.report.terminal.several_models import several_models
 
@@ -62,6 +63,8 @@ def screen(
     records, width = result.select(), max(width, WIDTH)
     if len(records) == 1:
         yield from one_model(result, records[0], width)
+    elif len(result.scenes) > 1:
+        yield from many_scenes(result, records, width)
     else:
         yield from several_models(result, records, width)
     for sweep in result.sweeps():

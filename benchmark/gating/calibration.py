@@ -7,14 +7,14 @@ from pathlib import Path
 
 import numpy as np
 
-from semstab.comparison.runs import open_run
+from semstab.comparison.entries import open_run
+from semstab.comparison.voxels import in_share, share_of
 from semstab.data.records import Record
 from semstab.data.tiles import Tiles, side_by_side
 from semstab.data.voxels import VoxelTable
 from semstab.errors import ConfigError, DataError
 from semstab.statistics.acceptance import AcceptanceThresholds, calibrate
 from semstab.statistics.correctness import Truth, join_truth
-from semstab.statistics.model_comparison import in_share, share_of
 
 
 def calibrate_run(run: str | Path, *, precision: float = 0.95, confidence: float = 0.95) -> AcceptanceThresholds:

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 from semstab.comparison.differences import ComparisonData, Progress, find
 from semstab.comparison.locations import Changes
-from semstab.comparison.tables import HEADLINES, IN_CLASSES, IOU, by_key, heading, scopes, sentences, tables
+from semstab.comparison.quantities import HEADLINES, IOU, by_key
 from semstab.config.groups import ScopeOption, validated
 from semstab.core.files import TEMPORARY, FolderLock, keep_only, read_json, write_json, write_text
 from semstab.core.json_form import from_json
@@ -22,6 +22,7 @@ from semstab.data.results import slug
 from semstab.data.statistics import Estimate
 from semstab.errors import ConfigError
 from semstab.report.charts import dot_chart, sample
+from semstab.report.comparison.tables import IN_CLASSES, heading, scopes, sentences, tables
 from semstab.report.figures.maps import Panel, draw_changes
 from semstab.report.figures.style import Figure
 from semstab.report.html import blocks, filled
@@ -129,7 +130,8 @@ def compare(
     """Compare runs with the first of them, by scene and over all scenes: amounts, p-values and locations.
 
     Args:
-        runs: Folders of runs or studies, 'FOLDER:MODEL' where there are several label sources, or small summaries.
+        runs: Folders of runs or studies, 'FOLDER:MODEL' if there are several label sources, or small summaries; or one
+            folder, whose label sources are compared.
         scope: 'this scene' flown again, 'these frames' or 'other scenes': the scope of intervals and p-values.
         out: A folder for tables, figures, report.html, comparison.json and .md, columns of voxels, and a recording.
         progress: Function that is called with each compared scene.

@@ -11,7 +11,14 @@ from pathlib import Path
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field
 
-from semstab.comparison.gate_evaluation import (
+from semstab.comparison.entries import RunHandle, open_run, shared_scenes
+from semstab.comparison.quantities import COVERAGE, FLICKER
+from semstab.config import read_yaml, validated
+from semstab.config.groups import ScopeSetting
+from semstab.core.types import THESE_FRAMES, THIS_SCENE, Scope
+from semstab.data.statistics import UNKNOWN
+from semstab.errors import ConfigError
+from semstab.gating.evaluation import (
     LOST,
     GateRuns,
     Pair,
@@ -24,15 +31,8 @@ from semstab.comparison.gate_evaluation import (
     value_of,
     with_values,
 )
-from semstab.comparison.gate_result import GateResult, Judgement, Undecided
-from semstab.comparison.gate_rules import ALL, Rule, parse
-from semstab.comparison.runs import RunHandle, open_run, shared_scenes
-from semstab.comparison.tables import COVERAGE, FLICKER
-from semstab.config import read_yaml, validated
-from semstab.config.groups import ScopeSetting
-from semstab.core.types import THESE_FRAMES, THIS_SCENE, Scope
-from semstab.data.statistics import UNKNOWN
-from semstab.errors import ConfigError
+from semstab.gating.result import GateResult, Judgement, Undecided
+from semstab.gating.rules import ALL, Rule, parse
 from semstab.statistics.cluster_sums import functional
 
 

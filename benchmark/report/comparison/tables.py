@@ -9,55 +9,24 @@ from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 
 from semstab.comparison.locations import MOST
+from semstab.comparison.quantities import BY_CLASS, COVERAGE, HEADLINES, IOU, RECALL, by_key
 from semstab.core.console import Console
-from semstab.data.contrast import Against, Area, Basis, ComparedObservations, Contrast, FrameShare, RunComparison
-from semstab.data.measures import ENTROPY, VSS, Quantity, measures
+from semstab.data.contrast import (
+    Against,
+    Area,
+    Basis,
+    ComparedObservations,
+    Contrast,
+    FrameShare,
+    MapCoverage,
+    RunComparison,
+)
+from semstab.data.measures import Quantity
 from semstab.data.statistics import CONFIDENCE, Interval
-from semstab.report.tables.correctness import coverage_table, ignored_table
 from semstab.report.tables.table import Column, Group, Row, Table, to_terminal
 from semstab.report.terminal import WIDTH
-from semstab.statistics.agreement import ALPHA, PSA, VOXEL_ALPHA
-from semstab.statistics.correctness import ACCURACY, ECE, MIOU
+from semstab.statistics.agreement import ALPHA, PSA
 from semstab.statistics.intervals import LEAST_FRAMES
-
-# The compared measures, in the order of the tables.
-
-RECURRENT_VSS = Quantity(key="vss", title="VSS at OP>=3", better="higher", digits=VSS.digits)
-SBD_EXCESS = Quantity(key="sbd_excess", title="SBD excess", unit="bits", better="lower", digits=(4, 4))
-FLICKER = Quantity(key="compensated_flicker_percent", title="Flicker", unit="%", better="lower", digits=(2, 2))
-COVERAGE = Quantity(key="coverage", title="Coverage", better="higher")
-MISLEADING = Quantity(
-    key="wrong_of_consistent", title="Consistent but wrong", short="consistent, wrong", better="lower", needs="truth"
-)
-RECALL = Quantity(key="accuracy", title="Recall", better="higher", needs="truth")
-PRECISION = Quantity(key="precision", title="Precision", better="higher", needs="truth")
-IOU = Quantity(key="iou", title="IoU", better="higher", needs="truth")
-
-HEADLINES = (
-    ALPHA, PSA, RECURRENT_VSS, SBD_EXCESS, FLICKER, COVERAGE, ACCURACY, MIOU, ECE, MISLEADING, VOXEL_ALPHA,
-)  # fmt: skip
-"""Measures that every table shows; verdicts rest on the first."""
-
-BY_CLASS = (ALPHA, VOXEL_ALPHA, PSA, RECURRENT_VSS, SBD_EXCESS, RECALL, PRECISION, IOU, ECE, MISLEADING)
-"""Measures that are compared class by class."""
-
-
-def quantities() -> tuple[Quantity, ...]:
-    """Return all compared measures: the headlines, then the mean over voxels of each other measure of the register."""
-    return (*HEADLINES, *(measure for measure in measures() if measure is not VSS))
-
-
-def by_key(chosen: Sequence[Quantity]) -> Mapping[str, Quantity]:
-    """Return the measures by their keys."""
-    return {quantity.key: quantity for quantity in chosen}
-
-
-IN_SUMS = (ALPHA, VOXEL_ALPHA, PSA, RECURRENT_VSS, SBD_EXCESS, ENTROPY, ACCURACY, MIOU, ECE, MISLEADING)
-"""Measures that follow from the sums by frame and location alone."""
-
-ONE_AGAINST_ALL = (ALPHA, VOXEL_ALPHA, RECALL, PRECISION, IOU)
-"""Measures of a class against all others; others by class are of the locations of that class."""
-
 
 ALL_SCENES = "all scenes"
 NAMED_FRAMES = 5
@@ -254,6 +223,61 @@ def _all_rows(against: Against) -> Iterator[Row]:
         )  # fmt: skip
 
 
+def ignored_table(observations: Mapping[str, ComparedObservations]) -> Table:
+    """Return the share of pixels that each model left out, by scene."""
+    columns = (
+        Column("model", "Model"),
+        Column("missing_percent", "left out (%)", 1),
+        Column("psa_low", "at least", 3, over="Agreement with these"),
+        Column("psa_high", "at most", 3, over="Agreement with these"),
+        Column("alpha_ignored", "Alpha, left out disagrees", 3),
+        Column("order", "Order depends on it"),
+    )
+    caption = (
+        "A pixel is left out if a model gives it no label where another model gives one. The agreement of two views in"
+        " a spot has two bounds: these pixels agree never, or always (Manski). For alpha, pixels that are left out"
+        " disagree. The order depends on them if that alpha, or the agreement within its bounds, would change"
+        " the order of the models."
+    )
+    groups = tuple(Group(scene, _ignored_rows(comparison)) for scene, comparison in observations.items())
+    return Table("comparison_ignored", "Pixels that were left out", caption, columns, groups, "scene")
+
+
+def _ignored_rows(observations: ComparedObservations) -> tuple[Row, ...]:
+    depends = "yes" if observations.depends else "no"
+    return tuple(
+        (row.model, 100 * row.missing, row.psa_low, row.psa_high, row.alpha, depends) for row in observations.ignored
+    )
+
+
+def coverage_table(covered: Mapping[str, Sequence[MapCoverage]]) -> Table:
+    """Return the coverage of each map, by scene."""
+    columns = (
+        Column("model", "Model"),
+        Column("voxels", "Voxels", 0),
+        Column("mean_op", "Mean OP", 2),
+        Column("repeated", "OP>=2", 0),
+        Column("recurrent", "OP>=3", 0),
+        Column("common_percent", "in all maps (%)", 1),
+        Column("alone", "in no other", 0),
+    )
+    caption = "A model that ignores hard pixels covers less, and is compared on easier locations."
+    groups = tuple(Group(scene, tuple(map(_coverage_row, maps))) for scene, maps in covered.items())
+    return Table("comparison_coverage", "Coverage of each map", caption, columns, groups, "scene")
+
+
+def _coverage_row(row: MapCoverage) -> Row:
+    return (
+        row.model,
+        row.voxels,
+        row.mean_op,
+        row.repeated,
+        row.recurrent,
+        100 * row.common_share,
+        row.alone,
+    )
+
+
 # The results of a comparison in sentences, for the terminal, Markdown and the top of the report.
 
 MOST_CLASSES = 4
@@ -269,7 +293,7 @@ BASES: dict[Basis, str] = {
 
 def sentences(comparison: RunComparison) -> list[str]:
     """Return the results of one run after the other, then notes on data that could not be compared."""
-    return [*answers(comparison), *notes(comparison)]
+    return [*answers(comparison), *(f"caution: {text}." for text in comparison.cautions), *notes(comparison)]
 
 
 def answers(comparison: RunComparison) -> list[str]:
@@ -404,7 +428,7 @@ def print_comparison(
 
     `out` is the folder that they were written to.
     """
-    for sentence in answers(comparison):
+    for sentence in (*answers(comparison), *(f"caution: {text}." for text in comparison.cautions)):
         console.print(sentence, highlight=False, markup=False)
     for table in tables(comparison):
         if table.name == "comparison" or (verbose and table.name in SHOWN):

@@ -11,16 +11,17 @@ from dataclasses import dataclass
 import numpy as np
 
 from semstab.comparison.differences import flicker_difference, sums_difference
-from semstab.comparison.gate_result import Judgement, negative, verdict
-from semstab.comparison.gate_rules import Rule
+from semstab.comparison.entries import Entry, RunHandle
 from semstab.comparison.pairing import on_common_observations
-from semstab.comparison.runs import Entry, RunHandle
-from semstab.comparison.tables import COVERAGE, FLICKER, LEAST_LEFT_OUT, RECURRENT_VSS, SBD_EXCESS, left_out
+from semstab.comparison.quantities import COVERAGE, FLICKER, RECURRENT_VSS, SBD_EXCESS
 from semstab.config import nearest
 from semstab.core.types import OTHER_SCENES, THESE_FRAMES, THIS_SCENE, Scope
 from semstab.data.measures import Measure
 from semstab.data.statistics import ORDER_KNOWN, Interval
 from semstab.errors import ConfigError, DataError
+from semstab.gating.result import Judgement, negative, verdict
+from semstab.gating.rules import Rule
+from semstab.report.comparison.tables import LEAST_LEFT_OUT, left_out
 from semstab.statistics.agreement import ALPHA, PSA, VOXEL_ALPHA
 from semstab.statistics.cluster_sums import ClusterSums, chance_of, functional, parts_of, value
 from semstab.statistics.correctness import ECE

@@ -9,7 +9,16 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Literal
 
-from semstab.comparison.tables import COVERAGE, FLICKER, IOU, MISLEADING, PRECISION, RECALL, RECURRENT_VSS, SBD_EXCESS
+from semstab.comparison.quantities import (
+    COVERAGE,
+    FLICKER,
+    IOU,
+    MISLEADING,
+    PRECISION,
+    RECALL,
+    RECURRENT_VSS,
+    SBD_EXCESS,
+)
 from semstab.config import nearest
 from semstab.data.measures import ENTROPY, Quantity
 from semstab.errors import ConfigError

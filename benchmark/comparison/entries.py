@@ -24,11 +24,12 @@ import numpy as np
 from semstab.config import nearest
 from semstab.core.files import ScratchFolder, atomic_path, parse_json, read_limited
 from semstab.core.json_form import from_json, to_json
-from semstab.data import earlier, parquet
+from semstab.data import parquet
 from semstab.data.contrast import FrameShare
 from semstab.data.digests import require_unchanged
 from semstab.data.georeference import Georeference
-from semstab.data.records import ImageSpace, Record
+from semstab.data.labels import sharing_classes
+from semstab.data.records import ImageSpace, Record, Result
 from semstab.data.results import UnitSummary
 from semstab.data.statistics import LabelledPairs
 from semstab.datasets import GROUND_TRUTH
@@ -176,6 +177,29 @@ def open_runs(named: Sequence[str | os.PathLike[str]]) -> tuple[RunHandle, ...]:
     return tuple(replace(run, name=name) for run, name in zip(runs, names, strict=True))
 
 
+def open_models(named: str | os.PathLike[str]) -> tuple[RunHandle, ...]:
+    """Open all label sources of one run that have the classes that most of them have; ground truth is left out.
+
+    Raises:
+        ConfigError, DataError: As `open_run` does.
+    """
+    path, model_named = run_and_model(named)
+    if model_named is not None or not path.is_dir():
+        return (open_run(named),)
+    return models_of(load_result(path), path if isinstance(named, str | Path) else None)
+
+
+def models_of(result: Result, source: Path | None = None) -> tuple[RunHandle, ...]:
+    """Return the label sources of a run that have the classes that most of them have, without the ground truth."""
+    handles = [handle_of(result, model, source) for model in result.models if model != GROUND_TRUTH]
+    scenes = set.intersection(*({*handle.scenes} for handle in handles)) if handles else set()
+    if not scenes:
+        return tuple(handles)
+    scene = min(scenes)
+    names = sharing_classes({handle.model: handle.scenes[scene].classes for handle in handles})
+    return tuple(handle for handle in handles if handle.model in names)
+
+
 def open_run(named: str | os.PathLike[str]) -> RunHandle:
     """Open a run's only label source, or the one that 'FOLDER:MODEL' selects, at the base settings and backend.
 
@@ -191,8 +215,12 @@ def open_run(named: str | os.PathLike[str]) -> RunHandle:
         small = load_summary(path)
         _chosen(path, [small.model], wanted)
         return small
-    result, source = load_result(path), path if isinstance(named, str | Path) else None
-    model = _chosen(path, result.models, wanted)
+    result = load_result(path)
+    return handle_of(result, _chosen(path, result.models, wanted), path if isinstance(named, str | Path) else None)
+
+
+def handle_of(result: Result, model: str, source: Path | None = None) -> RunHandle:
+    """Return one label source of a run, at the base settings and backend; `source` is its folder, if it has one."""
     seed = result.manifest.get("seed")
     scenes = {
         scene: Entry(
@@ -350,8 +378,6 @@ def load_summary(path: str | Path) -> RunHandle:
             if archive.getinfo(CONTENT).file_size > LONGEST_CONTENT:
                 raise DataError(f"{path}: its text has more than {LONGEST_CONTENT} bytes; write the summary again")
             text = parse_json(archive.read(CONTENT))
-            if isinstance(text, dict) and text.get("schema") == earlier.SMALL:
-                text = earlier.translated(text, path) | {"schema": SCHEMA}
             if not isinstance(text, dict) or (text.get("kind"), text.get("schema")) != (KIND, SCHEMA):
                 raise DataError("it is of another kind or version")
             content = from_json(_Content, text, path)

@@ -9,10 +9,10 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from xml.etree import ElementTree
 
-from semstab.comparison.gate_result import POWER, GateResult, Verdict
 from semstab.core.files import write_text
 from semstab.core.json_form import to_json
 from semstab.errors import ConfigError
+from semstab.gating.result import POWER, GateResult, Verdict
 
 SCHEMA = 2
 INDENT = 10

@@ -8,10 +8,10 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Literal
 
-from semstab.comparison.gate_rules import GateMeasure, Rule
-from semstab.comparison.tables import COVERAGE
+from semstab.comparison.quantities import COVERAGE
 from semstab.core.types import THESE_FRAMES
 from semstab.data.statistics import Interval
+from semstab.gating.rules import GateMeasure, Rule
 from semstab.statistics.intervals import LEAST_FRAMES, standard_error
 
 # The verdict on one rule, for one scene or over all.
