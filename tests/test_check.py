@@ -301,7 +301,7 @@ def test_the_quick_check_reads_few_frames_each_once():
     checked(short)
     assert sorted(index for index, _ in short.read) == list(range(len(short)))
     checked(long)
-    assert len({index for index, _ in long.read}) == len(long.read) == len(long)  # of large images fewer
+    assert 40 < len({index for index, _ in long.read}) == len(long.read) < 50
     assert {model for _, model in long.read} == {"gt"}  # no model need predict for it
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import bisect
 import contextlib
 import dataclasses
+import functools
 import itertools
 import math
 from collections import deque
@@ -25,9 +26,9 @@ from semstab.datasets import Scene
 from semstab.errors import DataError
 
 MOST_FRAMES, LEAST_FRAMES = 300, 44
-MOST_PIXELS, QUICK_PIXELS = 300 * 640 * 480, 44 * 640 * 480
+MOST_PIXELS = 300 * 640 * 480
 """Frames that are read one after the other: so many, of large images as many as have so many pixels, of no size fewer
-than the second number; a quick check reads as many as have the second number of pixels."""
+than the second number, which a quick check reads."""
 
 GAPS = (1, 2, 3, 8)
 """Distances in the chain at which two frames are compared."""
@@ -258,11 +259,11 @@ class Chain:
 
 @dataclass(frozen=True)
 class MapContent:
-    """What a label map holds: the share of its pixels that have a label, and the number of classes of a part of them.
+    """What a label map holds: the share of its pixels that have a label, and the number of their classes.
 
     Attributes:
         labelled: Share of the pixels, 0 to 1.
-        classes: Number of the classes that 0.5 % or more of these have.
+        classes: Number of the classes.
         name: Id of the most frequent class; -1 without labels.
     """
 
@@ -277,7 +278,7 @@ class MapContent:
         counts = np.bincount(view.labels[view.labels != view.ignore_id].ravel())
         total = int(counts.sum())
         most = int(counts.argmax()) if total else -1
-        return cls(total / max(1, view.labels.size), int(np.sum(counts > 0.005 * total)), most)
+        return cls(total / max(1, view.labels.size), int(np.count_nonzero(counts)), most)
 
 
 def chained(views: Iterable[tuple[int, View | None]], configured: Convention) -> Chain:
@@ -397,8 +398,8 @@ class Neighbours:
 
     def spread(self, size: tuple[int, int], *, thorough: bool) -> list[int]:
         """Return the positions of the frames to compare: of large images (w, h) fewer, and of a quick check."""
-        pixels = MOST_PIXELS if thorough else QUICK_PIXELS
-        return evenly(len(self.indices), min(MOST_FRAMES, max(LEAST_FRAMES, pixels // (size[0] * size[1]))))
+        most = min(MOST_FRAMES, max(LEAST_FRAMES, MOST_PIXELS // (size[0] * size[1])))
+        return evenly(len(self.indices), most if thorough else LEAST_FRAMES)
 
     def striking(self) -> set[int]:
         """Return the positions around the longest steps of the camera, where they are far longer than those near them.
@@ -407,11 +408,15 @@ class Neighbours:
         """
         if type(self.scene).T_wc is Scene.T_wc or len(self.indices) < LEAST_CHAIN:
             return set()
-        poses = [self._pose(index) for index in self.indices]
-        steps = np.array([_step(a, b) for a, b in itertools.pairwise(poses)])
+        steps = np.array([_step(a, b) for a, b in itertools.pairwise(self._poses)])
         ratios = np.nan_to_num([_ratio_to_those_around(steps, k) for k in range(len(steps))])
         largest = [int(k) for k in np.argsort(-ratios)[:MOST_STEPS] if ratios[k] >= STRIKING_STEP]
         return {p for k in largest for p in range(k - 1, k + 3) if 0 <= p < len(self.indices)}
+
+    @functools.cached_property
+    def _poses(self) -> list[Float64]:
+        """The poses (4, 4) of all frames; NaN where there is none."""
+        return [self._pose(index) for index in self.indices]
 
     def _pose(self, index: int) -> Float64:
         try:
@@ -432,6 +437,9 @@ class Neighbours:
             return self._known[position]
         with contextlib.suppress(DataError):
             return View.of(self._read(self.indices[position]), POINTS, labelled=self.source is not None)
+        if self.source is not None:
+            with contextlib.suppress(DataError):
+                return View.of(reader(self.scene, None)(self.indices[position]), POINTS, labelled=False)
         return None
 
     def located(self, pair: Pair) -> tuple[int, Chain] | None:
@@ -501,7 +509,7 @@ class Neighbours:
         """Return the line on frames whose tracking was lost; None where it was not."""
         if type(self.scene).T_wc is Scene.T_wc or len(self.indices) < LEAST_CHAIN:
             return None
-        poses = [self._pose(index) for index in self.indices]
+        poses = self._poses
         lost = lost_tracking(poses, self._configured, self._links)
         if not lost:
             return None

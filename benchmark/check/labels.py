@@ -8,6 +8,7 @@ the agreement of labels that are reprojected from frame to frame, pair by pair.
 from __future__ import annotations
 
 import dataclasses
+import functools
 import itertools
 import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -29,7 +30,7 @@ from semstab.datasets import Scene
 from semstab.errors import DataError
 from semstab.pixels.edges import depth_edges, image_edges, label_edges
 
-RUN = 5
+IN_A_RUN = 5
 """Frames in a row that are read together: labels may be those of a neighbour."""
 
 PIXELS = 2**17
@@ -60,7 +61,10 @@ FIRST_RUNS = 2
 
 MOST_ORDERED, ORDER_COLUMNS, ORDER_PIXELS = 200, 64, 200 * 640 * 480
 """Frames whose maps are looked for among those of all others, their edges on a grid of so many columns; the pixels of
-all of them."""
+all of them, ..."""
+
+QUICK_PIXELS = 44 * 640 * 480
+"""... and those of a quick check."""
 
 SAME_ORDER = 0.8
 """Share of the maps that an order explains."""
@@ -171,15 +175,15 @@ def _scaled(labels: Ids, x: float, y: float, ignore: int) -> Ids:
 
 def runs_of(scene: Scene, indices: Sequence[int], model: str, count: int) -> list[list[int]]:
     """Return `count` runs of frames in a row, evenly spaced; of selected frames where the ones between lack labels."""
-    count = max(1, min(count, len(indices) // RUN))
-    starts = [indices[position] for position in evenly(max(1, len(indices) - RUN + 1), count)]
-    wanted, runs = [[*range(start, start + RUN)] for start in starts], []
+    count = max(1, min(count, len(indices) // IN_A_RUN))
+    starts = [indices[position] for position in evenly(max(1, len(indices) - IN_A_RUN + 1), count)]
+    wanted, runs = [[*range(start, start + IN_A_RUN)] for start in starts], []
     for run in wanted:
         if all(i < len(scene) and scene.tracked(i) and not scene.missing(i, [model]) for i in run):
             runs.append(run)
     if runs:
         return runs
-    return [[*indices[k : k + RUN]] for k in range(0, len(indices), RUN)][:count]
+    return [[*indices[k : k + IN_A_RUN]] for k in range(0, len(indices), IN_A_RUN)][:count]
 
 
 @dataclass(frozen=True, eq=False)
@@ -199,6 +203,17 @@ class Seen:
         """The labels (H, W)."""
         assert self.view.labels is not None
         return self.view.labels
+
+    @functools.cached_property
+    def edges(self) -> Float64 | None:
+        """The edges of the labels on the grid, of length 1; None where there are none."""
+        return _edges(self.labels, self.view.ignore_id)
+
+    def fit(self, edges: Float64 | None) -> float:
+        """Return the correlation of edges of labels with those of depth and of colour, their mean."""
+        if edges is None or not self.references:
+            return math.nan
+        return float(np.mean([np.sum(edges * reference) for reference in self.references]))
 
 
 def read(scene: Scene, index: int, model: str) -> Seen:
@@ -230,6 +245,96 @@ def _smooth(edges: Mask) -> Float64:
     smooth -= smooth.mean()
     normed: Float64 = smooth / max(math.sqrt(np.square(smooth).sum()), 1e-12)
     return normed
+
+
+def _edges(labels: Ids, ignore: int) -> Float64 | None:
+    edges = label_edges(labels, ignore)
+    return _smooth(edges) if edges.any() else None
+
+
+@dataclass(frozen=True, eq=False)
+class Shared:
+    """The pixels of two frames, by their places in a run, that see the same points: rows and columns in each."""
+
+    a: int
+    b: int
+    first: tuple[Int64, Int64]
+    second: tuple[Int64, Int64]
+    ignore: int
+
+    def agreement(self, maps: Mapping[int, Ids]) -> float:
+        """Return the share of the points whose labels agree; NaN where too few have some."""
+        first, second = maps[self.a][self.first], maps[self.b][self.second]
+        told = (first != self.ignore) & (second != self.ignore)
+        return float(np.mean(first[told] == second[told])) if told.sum() >= LEAST_POINTS else math.nan
+
+
+def shared_of(views: Mapping[int, View], pairs: Sequence[Pair]) -> list[Shared]:
+    """Return what pairs of frames see in common, where that is enough."""
+    sample, one = Sample(dict(views), pairs, Convention()), np.array([1.0])
+    found = []
+    for a, b in pairs:
+        matches = sample.matched((a, b), Convention(), one)
+        same = matches.error[0] < CONSISTENT
+        if same.sum() >= LEAST_POINTS:
+            first, second = (views[a].v[same], views[a].u[same]), (matches.v[0][same], matches.u[0][same])
+            found.append(Shared(a, b, first, second, views[a].ignore_id))
+    return found
+
+
+@dataclass(frozen=True, eq=False)
+class Tried:
+    """An alternative in the frames of a run for which it has a map.
+
+    Attributes:
+        maps: The map (H, W) of each, by its place in the run.
+        fits: The fit of the map as it is, and of this one, by the same places.
+    """
+
+    alternative: Alternative
+    maps: Mapping[int, Ids]
+    fits: Mapping[int, tuple[float, float]]
+
+
+class Run:
+    """Frames in a row, and all alternatives tried on them, once."""
+
+    def __init__(self, frames: Sequence[Seen]) -> None:
+        self.frames = frames
+
+    @functools.cached_property
+    def shared(self) -> list[Shared]:
+        """What each two of the frames see in common."""
+        return shared_of(self._views, [*itertools.combinations(self._views, 2)])
+
+    @functools.cached_property
+    def tried(self) -> list[Tried]:
+        """All alternatives."""
+        H, W = self.frames[0].labels.shape
+        return [self.trial(each) for each in alternatives(W, H)]
+
+    def trial(self, alternative: Alternative) -> Tried:
+        """Try one alternative."""
+        maps, fits = dict[int, Ids](), dict[int, tuple[float, float]]()
+        for k, seen in enumerate(self.frames):
+            if not 0 <= k + alternative.step < len(self.frames):
+                continue
+            source = self.frames[k + alternative.step]
+            other = alternative.change(source.labels, seen.view.ignore_id)
+            if other.shape == seen.labels.shape:
+                edges = source.edges if other is source.labels else _edges(other, seen.view.ignore_id)
+                maps[k], fits[k] = other, (seen.fit(seen.edges), seen.fit(edges))
+        return Tried(alternative, maps, fits)
+
+    def agreements(self, maps: Mapping[int, Ids]) -> list[tuple[float, float]]:
+        """Return for each pair of frames the share of common points whose labels agree, as given and by other maps."""
+        given = {k: self.frames[k].labels for k in maps}
+        pairs = [pair for pair in self.shared if pair.a in maps and pair.b in maps]
+        return [(pair.agreement(given), pair.agreement(maps)) for pair in pairs]
+
+    @property
+    def _views(self) -> dict[int, View]:
+        return {k: seen.view for k, seen in enumerate(self.frames)}
 
 
 # --- the comparison --------------------------------------------------------------------------------------------------
@@ -304,60 +409,19 @@ class Comparison:
         return f"{self.alternative.says} ({text}): {self.alternative.mend}"
 
 
-def compare(runs: Sequence[Sequence[Seen]]) -> list[Comparison]:
+def compare(runs: Sequence[Run]) -> list[Comparison]:
     """Compare every alternative with the maps as they are."""
-    H, W = runs[0][0].labels.shape
-    return [_compared(each, runs) for each in alternatives(W, H)]
+    return [_compared(each, runs) for each in zip(*(run.tried for run in runs), strict=True)]
 
 
-def _compared(alternative: Alternative, runs: Sequence[Sequence[Seen]]) -> Comparison:
-    fits: list[tuple[float, float]] = []
-    agreements: list[tuple[float, float]] = []
-    for run in runs:
-        at = [k for k in range(len(run)) if 0 <= k + alternative.step < len(run)]
-        given = {k: run[k].labels for k in at}
-        other = {k: alternative.change(run[k + alternative.step].labels, run[k].view.ignore_id) for k in at}
-        if any(given[k].shape != other[k].shape for k in at):
-            continue
-        fits += [(_fit(run[k], given[k]), _fit(run[k], other[k])) for k in at]
-        agreements += _agreements({k: run[k].view for k in at}, given, other)
-    return Comparison(alternative, *(Contrast.of(*zip(*rows, strict=True)) if rows else Contrast.of((), ())
-                                     for rows in (fits, agreements)))  # fmt: skip
+def _compared(tried: Sequence[Tried], runs: Sequence[Run]) -> Comparison:
+    fits = [both for each in tried for both in each.fits.values()]
+    agreements = [both for each, run in zip(tried, runs, strict=True) for both in run.agreements(each.maps)]
+    return Comparison(tried[0].alternative, _contrast(fits), _contrast(agreements))
 
 
-def _fit(seen: Seen, labels: Ids) -> float:
-    """Return the correlation of the edges of labels with those of depth and of colour, their mean."""
-    edges = label_edges(labels, seen.view.ignore_id)
-    if not edges.any() or not seen.references:
-        return math.nan
-    own = _smooth(edges)
-    return float(np.mean([np.sum(own * reference) for reference in seen.references]))
-
-
-def _agreements(
-    views: Mapping[int, View],
-    given: Mapping[int, Ids],
-    other: Mapping[int, Ids],
-    among: Sequence[Pair] | None = None,
-) -> list[tuple[float, float]]:
-    """Return for each pair of frames the share of common points whose labels agree, as given and otherwise."""
-    pairs: list[Pair] = [*itertools.combinations(views, 2)] if among is None else [*among]
-    sample, one = Sample(dict(views), pairs, Convention()), np.array([1.0])
-    rows = []
-    for a, b in pairs:
-        matches = sample.matched((a, b), Convention(), one)
-        same = matches.error[0] < CONSISTENT
-        if same.sum() < LEAST_POINTS:
-            continue
-        first, second = (views[a].v[same], views[a].u[same]), (matches.v[0][same], matches.u[0][same])
-        ignore = views[a].ignore_id
-        rows.append(tuple(_agreement(maps[a][first], maps[b][second], ignore) for maps in (given, other)))
-    return rows  # type: ignore[return-value]
-
-
-def _agreement(first: Ids, second: Ids, ignore: int) -> float:
-    told = (first != ignore) & (second != ignore)
-    return float(np.mean(first[told] == second[told])) if told.sum() >= LEAST_POINTS else math.nan
+def _contrast(rows: Sequence[tuple[float, float]]) -> Contrast:
+    return Contrast.of(*zip(*rows, strict=True)) if rows else Contrast.of((), ())
 
 
 # --- from a frame on -------------------------------------------------------------------------------------------------
@@ -387,15 +451,15 @@ class Turn:
         )
 
 
-def from_a_frame_on(scene: Scene, model: str, runs: Sequence[Sequence[Seen]]) -> str | None:
+def from_a_frame_on(scene: Scene, model: str, runs: Sequence[Run]) -> str | None:
     """Return the finding where maps fit as they are up to a frame, and otherwise from it on."""
-    H, W = runs[0][0].labels.shape
-    for alternative in alternatives(W, H):
-        rows = [row for run in runs for row in _fits_of(alternative, run)]
+    for tried in zip(*(run.tried for run in runs), strict=True):
+        rows = [row for each, run in zip(tried, runs, strict=True) for row in _rows(each, run)]
         if len(rows) < 2 * LEAST_FRAMES:
             continue
-        turn = Turn.of(*zip(*(row[1:] for row in rows), strict=True))  # type: ignore[arg-type]
+        turn = Turn.of([given for _, given, _ in rows], [other for *_, other in rows])
         if turn.is_one:
+            alternative = tried[0].alternative
             last, first = rows[turn.at - 1][0], rows[turn.at][0]
             index = _located(scene, model, alternative, last, first)
             before, after = turn.before, turn.after
@@ -407,32 +471,26 @@ def from_a_frame_on(scene: Scene, model: str, runs: Sequence[Sequence[Seen]]) ->
     return None
 
 
-def _fits_of(alternative: Alternative, run: Sequence[Seen]) -> list[tuple[int, float, float]]:
+def _rows(tried: Tried, run: Run) -> list[tuple[int, float, float]]:
     """Return for each frame of a run its index, and the fit of its map as given and otherwise."""
-    rows = []
-    for k, seen in enumerate(run):
-        if not 0 <= k + alternative.step < len(run):
-            continue
-        other = alternative.change(run[k + alternative.step].labels, seen.view.ignore_id)
-        if other.shape == seen.labels.shape:
-            rows.append((seen.view.index, _fit(seen, seen.labels), _fit(seen, other)))
-    return rows
+    return [(run.frames[k].view.index, given, other) for k, (given, other) in tried.fits.items()]
 
 
 def _located(scene: Scene, model: str, alternative: Alternative, last: int, first: int) -> int:
     """Return the index of the frame from which on maps are otherwise, between two that are known."""
-    while first - last > 2 * RUN:
+    while first - last > 2 * IN_A_RUN:
         middle = (last + first) // 2
-        run = [*_readable(scene, range(middle - RUN // 2, middle + RUN // 2 + 1), model)]
-        gains = [other - given for _, given, other in _fits_of(alternative, run)]
+        run = Run([*_readable(scene, range(middle - IN_A_RUN // 2, middle + IN_A_RUN // 2 + 1), model)])
+        gains = [other - given for given, other in run.trial(alternative).fits.values()]
         if not np.isfinite(gains).any():
             return first
         if float(np.nansum(gains)) > 0:
             first = middle
         else:
             last = middle
-    span = range(max(0, last - RUN), min(len(scene), first + RUN + 1))
-    rows = _fits_of(alternative, [*_readable(scene, span, model)])
+    span = range(max(0, last - IN_A_RUN), min(len(scene), first + IN_A_RUN + 1))
+    run = Run([*_readable(scene, span, model)])
+    rows = _rows(run.trial(alternative), run)
     if not rows:
         return first
     at = Turn.of([given for _, given, _ in rows], [other for *_, other in rows]).at
@@ -453,25 +511,26 @@ def in_another_order(scene: Scene, indices: Sequence[int], model: str, pixels: i
     first = next(_readable(scene, indices[:1], model), None)
     if first is None:
         return None
-    count = min(MOST_ORDERED, max(RUN, pixels // math.prod(first.view.size)))
+    count = min(MOST_ORDERED, max(IN_A_RUN, pixels // first.whole.size))
     chosen = [indices[k] for k in evenly(len(indices), count)]
     frames = [*_readable(scene, chosen, model)]
     frames = [seen for seen in frames if seen.references and seen.labels.shape == frames[0].labels.shape]
-    if len(frames) < 2 * RUN:
+    if len(frames) < 2 * IN_A_RUN:
         return None
     n = len(frames)
     own = np.stack([_coarse(seen.references) for seen in frames])
-    maps = np.stack([_coarse((_smooth(label_edges(seen.labels, seen.view.ignore_id)),)) for seen in frames])
+    none = np.zeros_like(frames[0].references[0])
+    maps = np.stack([_coarse((none if seen.edges is None else seen.edges,)) for seen in frames])
     fits = own @ maps.T
     order = np.asarray(linear_sum_assignment(-fits)[1])
     moved = order != np.arange(n)
     if moved.mean() < 0.5 or fits[np.arange(n), order].mean() < max(LEAST_FIT, BETTER * float(np.diag(fits).mean())):
         return None
-    views = {k: seen.view for k, seen in enumerate(frames)}
     near = [(a, b) for a in range(n) for b in range(a + 1, min(n, a + 4))]
     given = {k: seen.labels for k, seen in enumerate(frames)}
     other = {k: frames[order[k]].labels for k in range(n)}
-    agreement = Contrast.of(*zip(*_agreements(views, given, other, near), strict=True))
+    pairs = shared_of({k: seen.view for k, seen in enumerate(frames)}, near)
+    agreement = _contrast([(pair.agreement(given), pair.agreement(other)) for pair in pairs])
     if not (agreement.is_clear and 1 - agreement.other <= FEWER * (1 - agreement.given)):
         return None
     text = (
@@ -517,57 +576,76 @@ def check_labels(
     model: str,
     space: LabelSpace | None,
     runs: int,
-    pixels: int = ORDER_PIXELS,
+    *,
+    thorough: bool = True,
 ) -> LabelFindings:
     """Compare the label maps of a model with depth, colour and each other, in `runs` times five frames.
 
-    Two of them come first; the others are read where these do not show that the maps are right, and at most so many
-    `pixels` to find maps in another order. Frames that cannot be read are passed over.
+    Two of them come first; the others are read where these do not show that the maps are right, or, unless `thorough`,
+    where another reading fits as well. Then at most so many frames are read as to find maps in another order. Frames
+    that cannot be read are passed over.
     """
-    few = _findings(scene, indices, model, space, min(runs, FIRST_RUNS))
-    whole = few if few.clear else _findings(scene, indices, model, space, runs)
-    if whole.clear or whole.found.wrong or (other := in_another_order(scene, indices, model, pixels)) is None:
+    known = dict[int, Run]()
+    few = _findings(scene, indices, model, space, min(runs, FIRST_RUNS), known)
+    if few.clear or not (thorough or few.doubted):
+        return few.found
+    whole = _findings(scene, indices, model, space, runs, known)
+    if whole.clear or whole.found.wrong:
+        return whole.found
+    pixels = ORDER_PIXELS if thorough else QUICK_PIXELS
+    if (other := in_another_order(scene, indices, model, pixels)) is None:
         return whole.found
     return dataclasses.replace(whole.found, wrong=(f"labels of {model} {other}",), open=None)
 
 
 @dataclass(frozen=True)
 class _Findings:
-    """What some runs show, and whether maps as they are fit clearly better than any other way."""
+    """What some runs show.
+
+    Attributes:
+        clear: Whether maps as they are fit clearly better than any other way.
+        doubted: Whether another way fits as well as they do.
+    """
 
     found: LabelFindings
     clear: bool = False
+    doubted: bool = False
 
 
-def _findings(scene: Scene, indices: Sequence[int], model: str, space: LabelSpace | None, runs: int) -> _Findings:
-    read_runs = [[*_readable(scene, run, model)] for run in runs_of(scene, indices, model, runs)]
-    read_runs = [run for run in read_runs if len(run) > 1]
-    frames = [seen for run in read_runs for seen in run]
+def _findings(
+    scene: Scene, indices: Sequence[int], model: str, space: LabelSpace | None, count: int, known: dict[int, Run]
+) -> _Findings:
+    """Return what some runs show; those that are read are kept in `known`, by their first frames."""
+    wanted = runs_of(scene, indices, model, count)
+    for run in wanted:
+        if run[0] not in known:
+            known[run[0]] = Run([*_readable(scene, run, model)])
+    runs = [known[run[0]] for run in wanted if len(known[run[0]].frames) > 1]
+    frames = [seen for run in runs for seen in run.frames]
     if len(frames) < 2 or any(seen.labels.shape != frames[0].labels.shape for seen in frames):
         return _Findings(LabelFindings(model))
     texts = id_remarks(
-        [seen.labels for seen in frames], frames[0].view.ignore_id, space, [run[0].whole for run in read_runs]
+        [seen.labels for seen in frames], frames[0].view.ignore_id, space, [run.frames[0].whole for run in runs]
     )
     remarks = tuple(f"labels of {model} {text}" for text in texts)
-    if (same := _identical(read_runs)) is not None:
+    if (same := _identical(runs)) is not None:
         return _Findings(LabelFindings(model, (f"labels of {model} {same}",), remarks), clear=True)
-    comparisons = compare(read_runs)
-    if (turned := from_a_frame_on(scene, model, read_runs)) is not None:
-        return _Findings(LabelFindings(model, (f"labels of {model} {turned}",), remarks))
+    comparisons = compare(runs)
+    if (turned := from_a_frame_on(scene, model, runs)) is not None:
+        return _Findings(LabelFindings(model, (f"labels of {model} {turned}",), remarks), doubted=True)
     better = sorted((each for each in comparisons if each.is_better), key=lambda each: -each.edges.other)
     wrong = tuple(f"labels of {model} {each}" for each in better[:1])
-    clear = not better and all(map(_is_right, read_runs))
-    return _Findings(LabelFindings(model, wrong, remarks, None if wrong else _open(comparisons)), clear)
+    return _Findings(
+        LabelFindings(model, wrong, remarks, None if wrong else _open(comparisons)),
+        clear=not better and all(map(_is_right, runs)),
+        doubted=any(each.edges.other >= each.edges.given for each in comparisons),
+    )
 
 
-def _is_right(run: Sequence[Seen]) -> bool:
+def _is_right(run: Run) -> bool:
     """Return whether maps of a run fit better as they are than in any other way."""
-    for alternative in alternatives(*run[0].labels.shape[::-1]):
-        rows = _fits_of(alternative, run)
-        fits = Contrast.of([given for _, given, _ in rows], [other for *_, other in rows])
-        if not fits.other < TELLING * fits.given:
-            return False
-    return True
+    fits = [_contrast([*each.fits.values()]) for each in run.tried]
+    return all(each.other < TELLING * each.given for each in fits)
 
 
 def _readable(scene: Scene, run: Sequence[int], model: str) -> Iterator[Seen]:
@@ -578,9 +656,9 @@ def _readable(scene: Scene, run: Sequence[int], model: str) -> Iterator[Seen]:
             return
 
 
-def _identical(runs: Sequence[Sequence[Seen]]) -> str | None:
+def _identical(runs: Sequence[Run]) -> str | None:
     """Return the finding where all maps are the same, of several classes, though the camera moves."""
-    frames = [seen for run in runs for seen in run]
+    frames = [seen for run in runs for seen in run.frames]
     first = frames[0].labels
     if len(frames) < LEAST_FRAMES or len(np.unique(first)) < 2:
         return None
@@ -589,9 +667,9 @@ def _identical(runs: Sequence[Sequence[Seen]]) -> str | None:
     return f"are the same map in all {len(frames)} frames that were read, though the camera moves: predict them again"
 
 
-def _moves(run: Sequence[Seen]) -> bool:
-    views = {k: seen.view for k, seen in enumerate(run)}
-    shifts, turns = shifts_and_turns(Sample(views, [(0, len(run) - 1)], Convention()))
+def _moves(run: Run) -> bool:
+    views = {k: seen.view for k, seen in enumerate(run.frames)}
+    shifts, turns = shifts_and_turns(Sample(views, [(0, len(views) - 1)], Convention()))
     return bool(shifts.max() > MOVES or turns.max() > TURNS)
 
 

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from semstab.check.camera import with_camera
-from semstab.check.continuity import QUICK_PIXELS, Chain, Neighbours, with_continuity
+from semstab.check.continuity import Chain, Neighbours, with_continuity
 from semstab.check.conventions import Reading, reading
 from semstab.check.coverage import (
     FUSED_FRAMES,
@@ -27,7 +27,7 @@ from semstab.check.coverage import (
 from semstab.check.geometry import Verdict, assess, shifts_and_turns
 from semstab.check.histogram import Histogram, Tally
 from semstab.check.label_order import remarks_on_maps, wrong_ids
-from semstab.check.labels import ORDER_PIXELS, LabelFindings, check_labels
+from semstab.check.labels import LabelFindings, check_labels
 from semstab.check.mistakes import with_mistakes
 from semstab.check.no_depth import with_invalid_depth
 from semstab.check.precision import with_precision
@@ -69,6 +69,10 @@ MOST_VOXELS = 2**20
 
 VOXEL_FACTORS = (0.5, 1.0, 2.0)
 """Voxel sizes for which the distribution of OP is reported, relative to the configured or the suggested one."""
+
+
+Ordered = Mapping[str, tuple[Neighbours, Chain]]
+"""Frames in order, by the model whose labels they have."""
 
 
 @dataclass(frozen=True)
@@ -289,22 +293,28 @@ def quick_check(scene: Scene, indices: Sequence[int], options: Mapping[str, Any]
 
 
 def quick_sample(
-    scene: Scene, indices: Sequence[int], options: Mapping[str, Any] | None = None
-) -> tuple[Verdict, Sample | None]:
-    """Return the verdict of `quick_check`, and the frames that it looked at; None where there are not two."""
+    scene: Scene, indices: Sequence[int], options: Mapping[str, Any] | None = None, model: str | None = None
+) -> tuple[Verdict, Sample | None, Ordered]:
+    """Return the verdict of `quick_check`, the frames that it looked at, and frames in order by label source.
+
+    There is no sample where there are not two frames. Frames in order have the labels of `model`, whose files are read.
+    """
     verdict, sample = Verdict("unclear", "it takes two frames to tell whether depth and poses agree"), None
+    ordered: Ordered = {}
     if scene.of_scans:
         scans = quick_sample_of_scans(scene, indices)
-        return with_sweep(assess_scans(scans), scans), None
+        return with_sweep(assess_scans(scans), scans), None, ordered
     for count, points, thorough in ((1, QUICK_POINTS, False), (CLUSTERS, POINTS, True)):
         inspection = Inspection(scene, indices, None, clusters(len(indices), count), points, passing_over=True)
         if len(inspection.views) < 2:
             continue
         sample = inspection.sample(options or {})
-        verdict = inspection.verdict(options or {}, thorough=thorough)
+        verdict = inspection.verdict(options or {}, thorough=thorough, labels_of=model)
+        if model is not None and inspection.chained is not None:
+            ordered = {model: inspection.chained}
         if verdict.state in ("sound", "imprecise"):
             break
-    return verdict, sample
+    return verdict, sample, ordered
 
 
 def label_findings(
@@ -312,7 +322,7 @@ def label_findings(
     indices: Sequence[int],
     models: Sequence[str],
     options: Mapping[str, Any] | None = None,
-    known: Mapping[str, tuple[Neighbours, Chain]] | None = None,
+    known: Ordered | None = None,
     *,
     thorough: bool,
 ) -> Iterator[LabelFindings]:
@@ -330,7 +340,7 @@ def label_findings(
         space = None
         with contextlib.suppress(DataError):
             space = scene.label_space(model)
-        found = check_labels(scene, indices, model, space, LABEL_RUNS, ORDER_PIXELS if thorough else QUICK_PIXELS)
+        found = check_labels(scene, indices, model, space, LABEL_RUNS, thorough=thorough)
         if scene.surface is None:
             with contextlib.suppress(DataError):
                 chained = (known or {}).get(model) or chain_of(scene, indices, model, options or {}, thorough=thorough)
@@ -462,8 +472,11 @@ class Inspection:
         pairs = [pair for pair in self._pairs if pair[0] in views and pair[1] in views]
         return Sample(views, pairs, self.reading(options).convention)
 
-    def verdict(self, options: Mapping[str, Any], *, thorough: bool) -> Verdict:
-        """Assess depth by reprojection from frame to frame, and depth that is cast at a surface by the images."""
+    def verdict(self, options: Mapping[str, Any], *, thorough: bool, labels_of: str | None = None) -> Verdict:
+        """Assess depth by reprojection from frame to frame, and depth that is cast at a surface by the images.
+
+        Frames in order are read with the labels of `labels_of`, by default those of `source`.
+        """
         sample = self.sample(options)
         if self.scene.surface is not None:
             return assess_surface(match_images(self.scene, sample.views, sample.pairs), len(sample.views))
@@ -478,7 +491,9 @@ class Inspection:
             return verdict  # rendering its frames takes longer than fusing them
         if verdict.mend:
             return verdict
-        neighbours = Neighbours(self.scene, self.indices, self.source, how.convention, self.views)
+        source = labels_of or self.source
+        known = self.views if source == self.source else None
+        neighbours = Neighbours(self.scene, self.indices, source, how.convention, known)
         chain = neighbours.chain({*neighbours.spread(how.size, thorough=thorough), *neighbours.striking()})
         self.chained = neighbours, chain
         return with_continuity(verdict, neighbours, chain)
