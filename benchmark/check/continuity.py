@@ -243,12 +243,15 @@ class Chain:
         return bisect.bisect_left(self.positions, b) - bisect.bisect_left(self.positions, a)
 
     def mislabelled(self) -> list[tuple[int, Pair]]:
-        """Return the positions of frames whose labels agree with neither neighbour, while those agree; with these."""
+        """Return the positions of frames whose labels agree with neither neighbour, while those agree; with these.
+
+        Maps of one class are named as such.
+        """
         found = dict[int, Pair]()
         for a, between, c in self._around():
             limit = self.agreement(a, c) - DISAGREE
             if all(max(self.agreement(a, b), self.agreement(b, c)) < limit for b in between):
-                found |= {b: found.get(b, (a, c)) for b in between}
+                found |= {b: found.get(b, (a, c)) for b in between if self.maps[b].classes > 1}
         return sorted(found.items())
 
     def agreement(self, a: int, b: int) -> float:

@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 import dataclasses
-import math
 import re
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -19,9 +18,6 @@ from semstab.data.frames import Intrinsics
 
 FACTORS = (0.5, 0.7, 0.8, 0.9, 0.95, 1.0, 1.05, 1.1, 1.25, 1.4, 2.0)
 """Focal lengths that are tried, relative to the configured one; then nearer ones around the best."""
-
-ASPECTS = (0.8, 0.9, 0.95, 0.98, 1.0, 1.02, 1.05, 1.1, 1.25)
-"""Ratios of fy to fx that are tried, relative to the configured one."""
 
 SHIFTS = (-0.1, -0.05, -0.02, 0.0, 0.02, 0.05, 0.1)
 """Shifts of the principal point that are tried, in widths of the image."""
@@ -43,18 +39,17 @@ REFUSED = 0.5
 
 @dataclass(frozen=True)
 class Camera:
-    """A change of the intrinsics: factors on both focal lengths and on fy, and a shift of the centre in widths."""
+    """A change of the intrinsics: a factor on the focal lengths, and a shift of the principal point in widths."""
 
     factor: float = 1.0
     right: float = 0.0
     down: float = 0.0
-    aspect: float = 1.0
 
     def of(self, view: View) -> View:
         """Return a view with the changed intrinsics."""
         K, width = view.camera, view.size[0]
         cx, cy = K.cx + self.right * width, K.cy + self.down * width
-        changed = Intrinsics(K.fx * self.factor, K.fy * self.factor * self.aspect, cx, cy)
+        changed = Intrinsics(K.fx * self.factor, K.fy * self.factor, cx, cy)
         return dataclasses.replace(view, camera=changed)
 
 
@@ -79,9 +74,6 @@ class CameraFit:
         if (factor := self.camera.factor) != 1:
             share = abs(1 / factor - 1)
             what.append(f"the focal length is {share:.0%} too {'small' if factor > 1 else 'large'}")
-        if self.camera.aspect != 1:
-            share = abs(1 / self.camera.aspect - 1)
-            what.append(f"fy is {share:.0%} too {'small' if self.camera.aspect > 1 else 'large'} against fx")
         if moved := [
             f"{side} is {abs(pixels):.0f} pixels too {'small' if pixels > 0 else 'large'}"
             for side, pixels in (("cx", self.K.cx - self.before.cx), ("cy", self.K.cy - self.before.cy))
@@ -101,22 +93,16 @@ def with_intrinsics(verdict: Verdict, sample: Sample, how: Reading) -> Verdict:
     They replace a proposal that is a guess, where they fit clearly better: a depth scale that datasets do not use, or
     another size of the intrinsics' image.
     """
-    return or_intrinsics(verdict, sample, how)[0]
-
-
-def or_intrinsics(verdict: Verdict, sample: Sample, how: Reading) -> tuple[Verdict, float]:
-    """Return the verdict of `with_intrinsics`, and the error under the intrinsics that it names; inf where none."""
     if verdict.mend and not _is_a_guess(verdict, how):
-        return verdict, math.inf
+        return verdict
     fit = fitted(sample)
     if fit is None or (verdict.mend and SIMPLER * fit.error > verdict.fits[1][1].error):
-        return verdict, math.inf
+        return verdict
     if fit.error > REFUSED * fit.present and verdict.state != "unsound":
-        return dataclasses.replace(verdict, remarks=(*verdict.remarks, fit.text())), fit.error
-    said = dataclasses.replace(
+        return dataclasses.replace(verdict, remarks=(*verdict.remarks, fit.text()))
+    return dataclasses.replace(
         verdict, state="unsound", text=f"{fit.text()}; correct the intrinsics", mend=(), undetermined=(), reason=""
     )
-    return said, fit.error
 
 
 def _is_a_guess(verdict: Verdict, how: Reading) -> bool:
@@ -141,26 +127,17 @@ def fitted(sample: Sample) -> CameraFit | None:
     errors = _errors(sample, best)
     if best == Camera() or middle(errors) > GOOD or not clearly_lower(errors, present):
         return None
-    if min(middle(scaled_errors(sample, factor)) for factor in SCALES.tolist()) <= SIMPLER * middle(errors):
+    if min(middle(_scaled(sample, factor)) for factor in SCALES.tolist()) <= SIMPLER * middle(errors):
         return None  # a depth that is a little too long or too short explains it as well
     first = next(iter(sample.views.values()))
     return CameraFit(best, best.of(first).camera, first.camera, middle(errors), middle(present))
 
 
 def _fit(sample: Sample) -> Camera:
-    """Return the best of two: one focal length and the principal point fitted in turn, or fy alone."""
-
-    def error(camera: Camera) -> float:
-        return mean_log(_errors(sample, camera))
-
-    return min((_fitted_by(ways, error) for ways in ((_focal_lengths, _to_the_right, _down), (_aspects,))), key=error)
-
-
-def _fitted_by(ways: Sequence[Callable[[Camera, float], list[Camera]]], error: Callable[[Camera], float]) -> Camera:
     best, spread = Camera(), 1.0
     for _ in range(ROUNDS):
-        for tried in ways:
-            best = min((best, *tried(best, spread)), key=error)
+        for tried in (_focal_lengths, _to_the_right, _down):
+            best = min((best, *tried(best, spread)), key=lambda camera: mean_log(_errors(sample, camera)))
         spread /= 3
     return best
 
@@ -169,12 +146,6 @@ def _focal_lengths(best: Camera, spread: float) -> list[Camera]:
     """Return cameras of other focal lengths: in the whole range, or around the best in a part of it."""
     values = FACTORS if spread == 1 else [best.factor * (1 + 0.12 * spread * part) for part in FINE.tolist()]
     return [dataclasses.replace(best, factor=value) for value in values]
-
-
-def _aspects(best: Camera, spread: float) -> list[Camera]:
-    """Return cameras with another ratio of fy to fx."""
-    values = ASPECTS if spread == 1 else [best.aspect * (1 + 0.06 * spread * part) for part in FINE.tolist()]
-    return [dataclasses.replace(best, aspect=value) for value in values]
 
 
 def _to_the_right(best: Camera, spread: float) -> list[Camera]:
@@ -194,7 +165,6 @@ def _simplest(sample: Sample, best: Camera) -> Camera:
     simpler = best
     for neutral, small in (
         ({"factor": 1.0}, abs(best.factor - 1) < LEAST_FACTOR),
-        ({"aspect": 1.0}, abs(best.aspect - 1) < LEAST_FACTOR),
         ({"right": 0.0}, abs(best.right) < LEAST_SHIFT),
         ({"down": 0.0}, abs(best.down) < LEAST_SHIFT),
     ):
@@ -204,7 +174,7 @@ def _simplest(sample: Sample, best: Camera) -> Camera:
     return simpler
 
 
-def scaled_errors(sample: Sample, factor: float) -> Float64:
+def _scaled(sample: Sample, factor: float) -> Float64:
     """Return (pairs,) median relative error of depth that is so many times as long."""
     views = {
         position: dataclasses.replace(view, depth=view.depth * np.float32(factor))

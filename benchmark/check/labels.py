@@ -128,13 +128,26 @@ class Alternative:
     change: Change = lambda labels, _: labels
 
 
+def shifted(step: int) -> Alternative:
+    """Return the mistake that each frame has the map of `step` frames before."""
+    side, sign = ("late", "+") if step > 0 else ("early", "-")
+    mend = f"give frame k the file of frame k {sign} {abs(step)}"
+    return Alternative(f"are {frames_of(abs(step))} {side}", mend, step=step)
+
+
+def frames_of(count: int) -> str:
+    """Return a number of frames in words.
+
+    >>> frames_of(1), frames_of(5)
+    ('one frame', '5 frames')
+    """
+    return "one frame" if count == 1 else f"{('two', 'three', 'four')[count - 2] if count < 5 else count} frames"
+
+
 def alternatives(width: int, height: int) -> tuple[Alternative, ...]:
     """Return the mistakes that are tried, for images of that size."""
     mistakes = [
-        Alternative("are one frame late", "give frame k the file of frame k + 1", step=1),
-        Alternative("are one frame early", "give frame k the file of frame k - 1", step=-1),
-        Alternative("are two frames late", "give frame k the file of frame k + 2", step=2),
-        Alternative("are two frames early", "give frame k the file of frame k - 2", step=-2),
+        *map(shifted, (1, -1, 2, -2)),
         Alternative("are mirrored left to right", "mirror the files", change=lambda L, _: L[:, ::-1]),
         Alternative("are upside down", "mirror the files", change=lambda L, _: L[::-1]),
         Alternative("are turned by 180 degrees", "turn the files", change=lambda L, _: L[::-1, ::-1]),
@@ -396,6 +409,11 @@ class Comparison:
         return by_agreement and not edges.other < edges.given
 
     @property
+    def is_doubt(self) -> bool:
+        """Return whether the alternative fits better, clearly or not."""
+        return self.edges.other >= BETTER * self.edges.given
+
+    @property
     def is_open(self) -> bool:
         """Return whether edges fit about as well under the alternative, so that nothing is told."""
         return not self.edges.other < TELLING * self.edges.given
@@ -412,6 +430,19 @@ class Comparison:
 def compare(runs: Sequence[Run]) -> list[Comparison]:
     """Compare every alternative with the maps as they are."""
     return [_compared(each, runs) for each in zip(*(run.tried for run in runs), strict=True)]
+
+
+def counted(found: Comparison, runs: Sequence[Run]) -> Comparison:
+    """Return the comparison with maps as many frames late, or early, as fit best, where one of these was found."""
+    if not found.alternative.step:
+        return found
+    side = 1 if found.alternative.step > 0 else -1
+    others = [shifted(side * count) for count in range(1, IN_A_RUN)]
+    return max((_compared([run.trial(each) for run in runs], runs) for each in others), key=_fit_of)
+
+
+def _fit_of(comparison: Comparison) -> float:
+    return -math.inf if math.isnan(comparison.edges.other) else comparison.edges.other
 
 
 def _compared(tried: Sequence[Tried], runs: Sequence[Run]) -> Comparison:
@@ -463,10 +494,16 @@ def from_a_frame_on(scene: Scene, model: str, runs: Sequence[Run]) -> str | None
             last, first = rows[turn.at - 1][0], rows[turn.at][0]
             index = _located(scene, model, alternative, last, first)
             before, after = turn.before, turn.after
+            says, mend = alternative.says, alternative.mend
+            if alternative.step:
+                says, mend = (
+                    f"are {'late' if alternative.step > 0 else 'early'}",
+                    "give each frame the map of its own image",
+                )
             return (
-                f"{alternative.says} from frame {scene.frame_name(index)} on (their edges correlate {after.other:.2f}"
+                f"{says} from frame {scene.frame_name(index)} on (their edges correlate {after.other:.2f}"
                 f" with those of depth and colour there, {after.given:.2f} now; before it {before.other:.2f} as they"
-                f" are): {alternative.mend}"
+                f" are): {mend}"
             )
     return None
 
@@ -549,7 +586,7 @@ def _order(order: Int64, frames: Sequence[Seen], scene: Scene) -> str:
     whole = frames[-1].view.index - frames[0].view.index == n - 1
     if whole and counts.max() >= SAME_ORDER * (n - abs(int(steps[counts.argmax()]))):
         step = int(steps[counts.argmax()])
-        return f"are {abs(step)} frames {'late' if step > 0 else 'early'}"
+        return f"are {frames_of(abs(step))} {'late' if step > 0 else 'early'}"
     at = int(np.flatnonzero(order != k)[0])
     of, to = (scene.frame_name(frames[one].view.index) for one in (int(order[at]), at))
     return f"are in another order than the frames (the map of frame {of} is that of frame {to}, and so on)"
@@ -582,7 +619,7 @@ def check_labels(
     """Compare the label maps of a model with depth, colour and each other, in `runs` times five frames.
 
     Two of them come first; the others are read where these do not show that the maps are right, or, unless `thorough`,
-    where another reading fits as well. Then at most so many frames are read as to find maps in another order. Frames
+    where they fit better another way. Then frames are read to find maps in another order. Frames
     that cannot be read are passed over.
     """
     known = dict[int, Run]()
@@ -604,7 +641,7 @@ class _Findings:
 
     Attributes:
         clear: Whether maps as they are fit clearly better than any other way.
-        doubted: Whether another way fits as well as they do.
+        doubted: Whether another way fits better, however few frames show it.
     """
 
     found: LabelFindings
@@ -634,11 +671,11 @@ def _findings(
     if (turned := from_a_frame_on(scene, model, runs)) is not None:
         return _Findings(LabelFindings(model, (f"labels of {model} {turned}",), remarks), doubted=True)
     better = sorted((each for each in comparisons if each.is_better), key=lambda each: -each.edges.other)
-    wrong = tuple(f"labels of {model} {each}" for each in better[:1])
+    wrong = tuple(f"labels of {model} {counted(each, runs)}" for each in better[:1])
     return _Findings(
         LabelFindings(model, wrong, remarks, None if wrong else _open(comparisons)),
         clear=not better and all(map(_is_right, runs)),
-        doubted=any(each.edges.other >= each.edges.given for each in comparisons),
+        doubted=any(each.is_doubt for each in comparisons),
     )
 
 

@@ -10,7 +10,6 @@ from typing import Any
 
 import numpy as np
 
-from semstab.check.camera import with_camera
 from semstab.check.continuity import Chain, Neighbours, with_continuity
 from semstab.check.conventions import Reading, reading
 from semstab.check.coverage import (
@@ -26,6 +25,7 @@ from semstab.check.coverage import (
 )
 from semstab.check.geometry import Verdict, assess, shifts_and_turns
 from semstab.check.histogram import Histogram, Tally
+from semstab.check.intrinsics import with_intrinsics
 from semstab.check.label_order import remarks_on_maps, wrong_ids
 from semstab.check.labels import LabelFindings, check_labels
 from semstab.check.mistakes import with_mistakes
@@ -485,7 +485,7 @@ class Inspection:
         if (mistaken := with_mistakes(verdict, sample)) != verdict:
             return mistaken
         timed = with_lateness(verdict, self.scene, sample, how)
-        verdict = with_camera(verdict, sample, how) if timed == verdict else timed
+        verdict = with_intrinsics(verdict, sample, how) if timed == verdict else timed
         verdict = with_precision(verdict, sample)
         if self.scene.made and not thorough:
             return verdict  # rendering its frames takes longer than fusing them
