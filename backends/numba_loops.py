@@ -16,7 +16,7 @@ from semstab.backends.shared.beliefs import observe_few, observe_row, plogp
 from semstab.backends.shared.keys import PARTITIONS, bounds_of, mix, partition_of
 from semstab.backends.shared.pixel_keys import AHEAD, touch
 from semstab.core.compiled import compiled, parallel, serial
-from semstab.data.results import RECURRENT
+from semstab.data.measures import RECURRENT
 
 ALONE, DENSE = -1, -2
 

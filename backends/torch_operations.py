@@ -18,7 +18,7 @@ import torch
 from semstab.backends.shared.keys import HALF
 from semstab.backends.shared.observations import Change
 from semstab.backends.torch_storage import Columns, DepthView, Labels, MapGrid, Scores
-from semstab.data.results import RECURRENT
+from semstab.data.measures import RECURRENT
 
 NONE, LOST = -1, -2
 """Marks instead of a voxel: the pixel has no depth, or its point is out of the map's reach."""

@@ -52,12 +52,12 @@ def charts(comparison: RunComparison) -> dict[str, list[dict[str, str]]]:
         for row in against.contrasts:
             if row.measure in shown:
                 dot = (colors[against.other], against.other, row.difference)
-                panels.setdefault(shown[row.measure].title, {}).setdefault(scope, []).append(dot)
+                panels.setdefault(shown[row.measure].named, {}).setdefault(scope, []).append(dot)
     for quantity in (quantity for quantity in IN_CLASSES if quantity is not PSA):
         for own in comparison.overall if any(own.by_class for own in comparison.overall) else ():
             for row in (*own.contrasts, *own.by_class):
                 if row.measure == (MIOU.key if quantity is IOU and not row.of else quantity.key):
-                    dots = by_class.setdefault(quantity.title, {}).setdefault(row.of or "all classes", [])
+                    dots = by_class.setdefault(quantity.named, {}).setdefault(row.of or "all classes", [])
                     dots.append((colors[own.other], own.other, row.difference))
     less = f"less {comparison.base}"
     return {
@@ -121,26 +121,25 @@ KIND = "Changes"
 
 
 def compare(
-    runs: Sequence[str | os.PathLike[str]],
+    *runs: str | os.PathLike[str],
     out: str | Path | None = None,
-    *,
     scope: str = THIS_SCENE,
     progress: Progress = lambda what: None,
 ) -> RunComparison:
     """Compare runs with the first of them, by scene and over all scenes: amounts, p-values and locations.
 
     Args:
-        runs: Folders of runs or studies, 'FOLDER:MODEL' if there are several label sources, or small summaries; or one
-            folder, whose label sources are compared.
-        scope: 'this scene' flown again, 'these frames' or 'other scenes': the scope of intervals and p-values.
+        runs: Folders of runs or studies, 'FOLDER:MODEL' if there are several label sources, small summaries, or results
+            in memory (`fuse`); the first is the base. One folder alone: its label sources are compared.
         out: A folder for tables, figures, report.html, comparison.json and .md, columns of voxels, and a recording.
+        scope: 'this scene' flown again, 'these frames' or 'other scenes': the scope of intervals and p-values.
         progress: Function that is called with each compared scene.
 
     Raises:
         ConfigError, DataError: For runs that cannot be opened, or have no scene or no classes in common, in one line.
 
     Examples:
-        >>> semstab.compare(["run:sim-steady", "run:sim-flicker"])
+        >>> semstab.compare("run:sim-steady", "run:sim-flicker")
         <RunComparison with sim-steady on scene0>
           sim-flicker: alpha -.22 ..., p ...; worse in alpha, psa, vss...
     """

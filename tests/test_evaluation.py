@@ -247,7 +247,9 @@ def test_the_tables_of_a_study_have_the_numbers_of_its_units(studied) -> None:
                  ("consistent_right", "consistent_wrong", "inconsistent_right", "inconsistent_wrong")]  # fmt: skip
         assert sum(parts) == pytest.approx(100)
     strata = [row for row in rows_of(found, "correctness") if row["model"] == "a"]
-    assert strata[0]["voxels"] == sum(row["voxels"] for row in strata[1:])
+    assert strata[0]["voxels"] == sum(row["voxels"] for row in strata[1:-1])
+    right = next(record.statistics.correctness for record in found.select(model="a"))
+    assert (strata[-1]["persistence"], strata[-1]["miou"]) == ("OP>=2", pytest.approx(right.miou.value))
     (difference,) = (
         row for row in rows_of(found, "comparison_all") if row["measure"] == "accuracy" and not row["class"]
     )

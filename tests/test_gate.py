@@ -242,7 +242,7 @@ def run(tmp_path_factory):
     """A run of a wall with the label sources a and b, and ground truth."""
     base = tmp_path_factory.mktemp("gate")
     tiny_scene.write(base / "wall", frames=18)  # two frames, which lie a pixel apart, are one view
-    semstab.run(configure(base / "wall", check=None), out=base / "run", report=False)
+    semstab.run(configure(base / "wall", check=None, truth=False), out=base / "run", report=False)
     return base / "run"
 
 
@@ -302,7 +302,7 @@ def test_rules_on_measures_of_the_register(run, tmp_path):
         assert each.interval.low < each.interval.value < each.interval.high
         assert each.about == "these frames"
     table = semstab.load(run).table(model="a")
-    means = [of(table)[table.op >= 2].mean() for of in (sbd, margin)]
+    means = [of(table)[table.op >= 3].mean() for of in (sbd, margin)]
     assert [each.new for each in found.judgements[:2]] == pytest.approx(means)
     with registered(Measure(key="rival_1", title="Rival", better="lower", of=second_largest, range=(0.0, 1.0))):
         assert parse("Rival < 0.1").measure is not None
@@ -314,14 +314,22 @@ def test_rules_on_measures_of_the_register(run, tmp_path):
     fails(ConfigError, "no measure 'rival 1'", parse, "rival 1 < 0.1")
 
 
+def test_the_label_source_may_be_an_option(run):
+    named, option = (
+        cli("gate", *words, "--rule", "psa > 0.01") for words in ((f"{run}:a",), (str(run), "--model", "a"))
+    )
+    assert (named.exit_code, named.output) == (option.exit_code, option.output)
+    assert "OP>=2: " in named.output
+
+
 @pytest.mark.parametrize(("arguments", "line"), [
     (["--rule", "alpha drop < 0.02"], "a drop needs a baseline; give --against RUN"),
     (["--rule", "class q: alpha > 0.1"], "no class 'q'"),
     (["--rule", "scene q: alpha > 0.1"], "no scene 'q'; known: wall"),
     (["--rule", "flicker < 99", "--scope", "other-scenes"], "flicker is known only by frame"),
     (["--rule", "alpha > 0.1", "--scope", "some"], "scope"),
-    (["--rule", "class door: recall > 0.1"], "has no recall of wall; run it with --statistics"),
-    (["--rule", "accuracy > 0.1"], "has no accuracy of wall; run it with --statistics"),
+    (["--rule", "class door: recall > 0.1"], "has no recall of wall; run it on a scene with ground truth"),
+    (["--rule", "accuracy > 0.1"], "has no accuracy of wall; run it on a scene with ground truth"),
     (["--rule", "sbd excess < 0.1", "--out", "x.txt"], "format '.txt' is not known"),
     (["--rule", "alpha > 0.1", "--undecided", "maybe"], "undecided"),
     (["--rule", "alpha > 0.1", "--against", "nowhere"], "there is no such folder"),
@@ -510,7 +518,7 @@ def test_a_change_of_alpha_is_what_a_comparison_says_of_the_same_runs(run, quiet
     """Of observations that both labelled: a run that left out some does not gain or lose by which it left out."""
     new, base = f"{quiet_models}:part", f"{run}:a"
     monkeypatch.setattr(differences, "LEAST_VOXELS", 1)
-    (compared,) = semstab.compare([base, new]).overall
+    (compared,) = semstab.compare(base, new).overall
     rules = ["alpha drop < 0.02", "class *: alpha rise < 0.02", "alpha > 0.1", "voxel alpha drop < 0.02"]
     of_all, *of_classes, alone, voxels = gate(new, base, gate_config(rules=rules)).judgements
     (found,) = (row for row in compared.contrasts if row.measure == "alpha")
@@ -540,7 +548,7 @@ def test_runs_of_other_strides_say_nothing_of_what_was_left_out(run, tmp_path):
     """Of pixels of another size it was said that both runs left 40 % without a label."""
     out = tmp_path / "strided"
     semstab.run(configure(run.parent / "wall", check=None, models=["a"], pixel_stride=2), out=out, report=False)
-    (scene,) = semstab.compare([f"{run}:a", out]).scenes
+    (scene,) = semstab.compare(f"{run}:a", out).scenes
     assert scene.basis == "observations"
     assert (scene.observations.ignored, scene.observations.depends) == ((), False)
     notes = gate(out, f"{run}:a", gate_config(rules=["alpha drop < 0.02"])).notes

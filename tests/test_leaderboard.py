@@ -229,8 +229,8 @@ def test_the_numbers_of_a_result_are_those_of_the_run(home, results) -> None:
 
 
 def test_a_result_can_be_compared_as_a_run(home, results) -> None:
-    small = semstab.compare([results["good"], results["bad"]])
-    whole = semstab.compare([f"{home / 'run'}:good", f"{home / 'run'}:bad"])
+    small = semstab.compare(results["good"], results["bad"])
+    whole = semstab.compare(f"{home / 'run'}:good", f"{home / 'run'}:bad")
     one, other = (each.overall[0].contrasts[0] for each in (small, whole))
     assert one.measure == other.measure == "alpha"
     assert one.difference.value == pytest.approx(other.difference.value, abs=0.01)

@@ -326,7 +326,7 @@ def test_models_are_compared_tile_by_tile(tmp_path) -> None:
     for size in (None, 8):
         settings = {"check": None, "backends": ["numba"], "statistics": True, "events": True, "tile_size": size}
         semstab.run(configure(root, **settings), out=tmp_path / str(size), report=False)
-        found.append(to_json(semstab.compare([tmp_path / str(size)]).overall))
+        found.append(to_json(semstab.compare(tmp_path / str(size)).overall))
     assert differences(*found, tolerance=1e-12) == []
     assert_same_comparison(*(tmp_path / size for size in ("None", "8")))
 

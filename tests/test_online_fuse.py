@@ -50,7 +50,7 @@ def steady(city, classes):
 def test_a_generator_gives_what_a_run_gives(steady, city):
     run = semstab.run({
         "dataset": {"name": "city", "options": OPTIONS}, "scenes": ["scene0"], "models": ["sim-steady"],
-        "voxel_size": SIZE, "taxonomy": None, "exclude": {}, "check": None, "check_geometry": False,
+        "voxel_size": SIZE, "taxonomy": None, "exclude": {}, "check": None, "check_geometry": False, "truth": False,
     })  # fmt: skip
     own, other = steady.record(), run.record()
     assert own.summary.table == other.summary.table
@@ -62,7 +62,7 @@ def test_a_generator_gives_what_a_run_gives(steady, city):
     assert (steady.summary.alpha_low, steady.summary.alpha_high, steady.summary.confidence) == (
         alpha.low, alpha.high, 0.95,
     )  # fmt: skip
-    assert steady.summary.psa == other.statistics.agreement.psa.value
+    assert steady.summary.psa_op2 == other.statistics.agreement.psa.value
     assert steady.summary.flicker == own.image_space.compensated_flicker_percent > 0
     assert steady.summary.frames == len(city)
     assert len(steady.record().table()) == steady.summary.voxels
@@ -76,7 +76,7 @@ def test_frames_and_tensors_and_scores_are_taken(city, classes, steady):
     soft = [{**given, "labels": None, "scores": eye[given["labels"]]} for given in frames_of(city, "sim-steady")]
     for given in (frames, tensors, soft):
         result = semstab.fuse(given, voxel_size=SIZE, classes=classes)
-        assert result.summary.recurrent_vss == pytest.approx(steady.summary.recurrent_vss, abs=1e-12)
+        assert result.summary.vss_op3 == pytest.approx(steady.summary.vss_op3, abs=1e-12)
         assert result.summary.alpha == pytest.approx(steady.summary.alpha, abs=1e-12)
 
 
@@ -92,14 +92,15 @@ def test_truth_tells_what_is_right(city, classes):
 
 def test_results_are_compared_gated_and_exported_as_runs_are(steady, city, classes, tmp_path):
     other = semstab.fuse(frames_of(city, "sim-flicker"), voxel_size=SIZE, classes=classes, model="flicker")
-    comparison = semstab.compare([steady, other], tmp_path / "versus")
+    comparison = semstab.compare(steady, other, out=tmp_path / "versus")
     assert [own.name for own in comparison.runs] == ["steady", "flicker"]
     assert (tmp_path / "versus/report.html").exists()
     assert repr(other).startswith("<FusedResult 'frames': 1 unit, fused by numba>\n  frames, flicker: ")
     assert [own.source for own in comparison.runs] == [None, None]
     assert repr(comparison).startswith("<RunComparison with steady on frames>\n  flicker: alpha -")
     again = semstab.fuse(frames_of(city, "sim-steady"), voxel_size=SIZE, classes=classes, model="steady")
-    assert [own.name for own in semstab.compare([steady, again]).runs] == ["steady", "steady (2)"]
+    with pytest.raises(ConfigError, match=r"two results are named 'steady'; give each a name: semstab\.fuse"):
+        semstab.compare(steady, again)
     gate = semstab.GateConfig(rules=("alpha drop < 0.02",))
     assert repr(semstab.gate(other, steady, gate)).splitlines()[0] == (
         "<GateResult: fails; flicker against steady on frames>"

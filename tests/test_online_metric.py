@@ -22,7 +22,7 @@ from semstab.errors import ConfigError, DataError
 from semstab.online.metric import TemporalStability
 from semstab.online.summary import Summary
 
-EXACT = ("recurrent_vss", "psa", "recurrent_share")
+EXACT = ("vss_op3", "psa_op2", "recurrent_share")
 """What is the same however frames are shared out among processes."""
 
 ABOUT = 0.05
@@ -127,7 +127,7 @@ def test_processes_add_up_to_one(flights, owner):
     for name in EXACT:
         assert values[name] == pytest.approx(whole[name], abs=1e-9), name
     assert values["alpha"] == pytest.approx(whole["alpha"], abs=ABOUT)
-    assert math.isnan(values["sbd"]) or 0 <= values["sbd"] <= 0.32
+    assert math.isnan(values["sbd_op3"]) or 0 <= values["sbd_op3"] <= 0.32
 
 
 def test_whole_sequences_add_up_in_everything(flights):
@@ -153,7 +153,7 @@ def test_a_large_map_is_sampled_and_stays_bounded(flights):
     np.testing.assert_array_equal(sample.table.op, all_of_it.table.op[rows])
     np.testing.assert_allclose(sample.table.drift_sum, all_of_it.table.drift_sum[rows], atol=1e-12)
     np.testing.assert_allclose(sample.table.evidence, all_of_it.table.evidence[rows], atol=1e-12)
-    for name in ("recurrent_vss", "psa", "alpha"):
+    for name in ("vss_op3", "psa_op2", "alpha"):
         assert metric.compute()[name] == pytest.approx(whole.compute()[name], abs=0.06)
     metric.merge_state(whole)
     (merged,) = metric.states().values()

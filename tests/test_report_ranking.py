@@ -188,7 +188,7 @@ def test_a_run_and_compare_say_the_same_of_the_same_pair(tmp_path, frames):
     root = tiny_scene.write(tmp_path / "wall", ("a", "b"), frames=frames)
     result = semstab.run(configure(root), out=tmp_path / "run", report=False)
     (one,) = ranking(result).differences
-    comparison = semstab.compare([f"{tmp_path}/run:a", f"{tmp_path}/run:b"])
+    comparison = semstab.compare(f"{tmp_path}/run:a", f"{tmp_path}/run:b")
     (row,) = (row for row in comparison.overall[0].contrasts if row.measure == "alpha")
     found, expected = (one.value, one.low, one.high), row.difference
     assert found == pytest.approx((expected.value, expected.low, expected.high), nan_ok=True)

@@ -30,8 +30,8 @@ def run(tmp_path_factory):
 def test_the_summary_has_a_row_a_unit_and_a_unit_series_and_events(run):
     assert list(run.summary["model"]) == ["a", "b"]
     for (_, row), summary in zip(run.summary.iterrows(), run.result.runs, strict=True):
-        assert row["vss"] == summary.table.means.value["vss"]
-        assert row["recurrent_entropy"] == summary.table.recurrent.means.value["entropy"]
+        assert row["vss_all"] == summary.table.means.value["vss"]
+        assert row["entropy_op3"] == summary.table.recurrent.means.value["entropy"]
         assert row["voxels"] == summary.table.voxels
     assert list(run.series(model="b")["frame"]) == [0, 1, 2]
     assert len(run.events(model="b")) == run.table(model="b").op.sum()
@@ -73,7 +73,7 @@ def test_the_parts_of_a_run_at_a_prompt_are_one_line_each(run):
 
 def test_a_comparison_and_a_gate_at_a_prompt_are_a_few_lines(run):
     a, b = f"{run.folder}:a", f"{run.folder}:b"
-    compared = semstab.compare([a, b])
+    compared = semstab.compare(a, b)
     (line,) = repr(compared).splitlines()[1:]
     assert line.startswith("  b: ")
     assert repr(compared.scenes[0]).splitlines()[1:] == [f"  {compared.scenes[0].against[0].stated}"]

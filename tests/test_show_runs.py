@@ -41,7 +41,7 @@ def test_each_model_of_each_run_has_a_row_with_the_numbers_of_its_run(folder) ->
         assert float(row["alpha_low"]) == pytest.approx(alpha.low, abs=5e-4)
         assert float(row["flicker_percent"]) == pytest.approx(record.image_space.compensated_flicker_percent, abs=0.05)
         assert row["verdict"] == record.statistics.verdict.level
-        assert row["recurrent_vss"] == ""  # of so few voxels no mean is printed
+        assert row["vss_op3"] == ""  # of so few voxels no mean is printed
         assert int(row["frames"]) == record.summary.frames
     assert "coarse" in said
     assert "runs.png" in said

@@ -272,7 +272,7 @@ def test_a_camera_that_stood_still_has_no_verdict():
     found = describe(fused(frames, 0.3).table(), spots=sampled(frames))
     assert (found.spots.frames, found.spots.views) == (12, 1)
     assert found.verdict.level == "no verdict"
-    assert "the camera stood still" in found.verdict.line
+    assert "all frames show one view: the camera stood still" in found.verdict.line
 
 
 # --- What the verdict says of it --------------------------------------------------------------------------------------

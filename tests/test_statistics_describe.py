@@ -234,8 +234,15 @@ def test_few_locations_have_no_verdict():
 
 
 def test_a_camera_that_stood_still_has_no_verdict_and_a_single_frame_needs_more_overlap():
-    assert "no verdict, the camera stood still: all frames show one view;" in judged(0.9, 0.95, views=1).line
+    assert (
+        "no verdict, all frames show one view: the camera stood still, or moved by less"
+        in judged(0.9, 0.95, views=1).line
+    )
     assert "stood still" not in judged(math.nan, math.nan, views=1, frames=1, spots=0).line
+    assert (
+        "no verdict, no spot was sampled: no pixel has both depth and a label"
+        in judged(math.nan, math.nan, views=0).line
+    )
 
 
 def test_a_map_of_nearly_one_class_is_uninformative_whatever_its_alpha_is():

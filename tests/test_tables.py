@@ -191,7 +191,7 @@ def test_a_sweep_has_mean_and_spread_over_its_repeats():
         "mean": pytest.approx(statistics.mean(shares)), "sd": pytest.approx(statistics.stdev(shares)), "repeats": 3,
     }  # fmt: skip
     assert (calm["value"], calm["recurrent_percent"], calm["vss"]) == ("0", 100, 0.75)
-    assert disturbed["recurrent_vss"]["sd"] == 0
+    assert disturbed["vss_op3"]["sd"] == 0
 
 
 def test_levels_and_sweeps_pool_scenes_in_a_fixed_order():

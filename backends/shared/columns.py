@@ -17,7 +17,7 @@ from semstab.backends.shared.pixel_keys import AHEAD, touch
 from semstab.backends.shared.score_loops import LANES
 from semstab.core.compiled import compiled, parallel, serial
 from semstab.core.types import Int32, Int64
-from semstab.data.results import RECURRENT
+from semstab.data.measures import RECURRENT
 
 WORD = 64
 """Classes whose bits are in one number of a row's mask."""

@@ -15,7 +15,8 @@ import numpy.typing as npt
 
 from semstab.core.types import Float32, Float64, Int64, Mask, UInt16
 from semstab.data.information import entropy_bits, js_divergence, normalise
-from semstab.data.results import RECURRENT, FrameReport
+from semstab.data.measures import RECURRENT
+from semstab.data.results import FrameReport
 
 
 @dataclass(frozen=True, eq=False)

@@ -30,7 +30,7 @@ def compare(
 
     with Console(stderr=True, quiet=quiet).status("opening") as status:
         comparison = compare(
-            runs, out, scope=scope or THIS_SCENE, progress=lambda scene: status.update(f"comparing {scene}")
+            *runs, out=out, scope=scope or THIS_SCENE, progress=lambda scene: status.update(f"comparing {scene}")
         )
     if markdown:
         print_lines([as_markdown(comparison)], quiet=quiet)
@@ -54,6 +54,7 @@ def gate(
     new: Annotated[str, typer.Argument(metavar="NEW", help="Folder of a finished run, or FOLDER:MODEL.")],
     against: Annotated[str | None, typer.Option(
         metavar="BASE", help="The baseline: a folder likewise, or a small summary.")] = None,
+    model: Annotated[str | None, typer.Option("--model", "-m", help="The label source of NEW: NEW:MODEL.")] = None,
     rule: Annotated[list[str] | None, typer.Option(
         "--rule", "-r", metavar="RULE", help="E.g. 'alpha drop < 0.02', 'class car: recall > 0.6'.")] = None,
     config: Annotated[Path | None, typer.Option(
@@ -78,6 +79,7 @@ def gate(
     from semstab.gating.gate import gate as assess
     from semstab.gating.gate import gate_config
 
+    new = new if model is None else f"{new}:{model}"
     gate_report.require_formats(out or ())
     for file in (*(out or ()), *([] if save_baseline is None else [save_baseline])):
         require_output(file, [config])

@@ -218,9 +218,9 @@ def _flicker(base: Flicker, other: Flicker, *, paired: bool) -> Contrast:
 
 
 def _of_voxels(measure: Measure, base: VoxelTable, other: VoxelTable, edge: float) -> Contrast:
-    """Return the mean of a measure over the voxels where it is defined, by its differences voxel by voxel."""
+    """Return the mean of a measure over its population in both maps, by its differences voxel by voxel."""
     before, after = measure.of(base), measure.of(other)
-    known = ~np.isnan(before) & ~np.isnan(after)
+    known = ~np.isnan(before) & ~np.isnan(after) & (base.op >= measure.op) & (other.op >= measure.op)
     if not known.any():
         return Contrast(measure.key, "", math.nan, math.nan, UNKNOWN, math.nan, "")
     cubes, columns = Cubes.of(base, edge, where=known), np.stack([after - before, known], axis=1)

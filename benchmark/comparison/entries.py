@@ -172,6 +172,9 @@ def open_runs(named: Sequence[str | os.PathLike[str]]) -> tuple[RunHandle, ...]:
     whole = [f"{run.source}:{run.model}" for run in runs]
     names = next((naming for naming in (models, folders, both) if len({*naming}) == len({*whole})), whole)
     names = [run.model if run.source is None else name for name, run in zip(names, runs, strict=True)]
+    in_memory = [name for name, run in zip(names, runs, strict=True) if run.source is None]
+    if twice := next((name for name in in_memory if names.count(name) > 1), None):
+        raise ConfigError(f"two results are named '{twice}'; give each a name: semstab.fuse(frames, model=NAME)")
     times = [names[: i + 1].count(name) for i, name in enumerate(names)]
     names = [name if nth == 1 else f"{name} ({nth})" for name, nth in zip(names, times, strict=True)]
     return tuple(replace(run, name=name) for run, name in zip(runs, names, strict=True))

@@ -245,7 +245,7 @@ def _of_whole_maps(basis: Basis, note: str, entries: Sequence[Entry]) -> Common:
     without = [entry.where for entry in entries if not entry.sums.truth]
     if 0 < len(without) < len(entries):
         sums = tuple(part.without_truth() for part in sums)
-        missing = f"{without[0]} holds no ground truth (run it with --statistics): correctness is not compared"
+        missing = f"{without[0]} holds no ground truth (run it without --no-truth): correctness is not compared"
         return Common(basis, (note, missing), sums)
     return Common(basis, (note,), sums)
 

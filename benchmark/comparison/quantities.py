@@ -4,20 +4,25 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 
-from semstab.data.measures import ENTROPY, VSS, Quantity, measures
+from semstab.data.measures import ENTROPY, RECURRENT, VSS, Quantity, measures
 from semstab.statistics.agreement import ALPHA, PSA, VOXEL_ALPHA
 from semstab.statistics.correctness import ACCURACY, ECE, MIOU
 
-RECURRENT_VSS = Quantity(key="vss", title="VSS at OP>=3", better="higher", digits=VSS.digits)
-SBD_EXCESS = Quantity(key="sbd_excess", title="SBD excess", unit="bits", better="lower", digits=(4, 4))
+RECURRENT_VSS = Quantity(key="vss", title="VSS", better="higher", op=RECURRENT, digits=VSS.digits)
+SBD_EXCESS = Quantity(key="sbd_excess", title="SBD excess", op=2, unit="bits", better="lower", digits=(4, 4))
 FLICKER = Quantity(key="compensated_flicker_percent", title="Flicker", unit="%", better="lower", digits=(2, 2))
-COVERAGE = Quantity(key="coverage", title="Coverage", better="higher")
+COVERAGE = Quantity(key="coverage", title="Coverage", better="higher", op=2)
 MISLEADING = Quantity(
-    key="wrong_of_consistent", title="Consistent but wrong", short="consistent, wrong", better="lower", needs="truth"
+    key="wrong_of_consistent",
+    title="Consistent but wrong",
+    short="consistent, wrong",
+    better="lower",
+    needs="truth",
+    op=RECURRENT,
 )
-RECALL = Quantity(key="accuracy", title="Recall", better="higher", needs="truth")
-PRECISION = Quantity(key="precision", title="Precision", better="higher", needs="truth")
-IOU = Quantity(key="iou", title="IoU", better="higher", needs="truth")
+RECALL = Quantity(key="accuracy", title="Recall", better="higher", needs="truth", op=2)
+PRECISION = Quantity(key="precision", title="Precision", better="higher", needs="truth", op=2)
+IOU = Quantity(key="iou", title="IoU", better="higher", needs="truth", op=2)
 
 HEADLINES = (
     ALPHA, PSA, RECURRENT_VSS, SBD_EXCESS, FLICKER, COVERAGE, ACCURACY, MIOU, ECE, MISLEADING, VOXEL_ALPHA,

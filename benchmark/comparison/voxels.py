@@ -11,7 +11,7 @@ import numpy as np
 from semstab.core.types import Int64, Mask
 from semstab.data.contrast import MapCoverage
 from semstab.data.events import Events
-from semstab.data.results import RECURRENT
+from semstab.data.measures import RECURRENT
 from semstab.data.voxels import VoxelTable
 from semstab.metrics.agreement import shared_rows
 from semstab.statistics.drift import streams

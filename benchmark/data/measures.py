@@ -21,6 +21,10 @@ from semstab.data.evidence import Evidence, row_chunks
 from semstab.data.information import Concentration, entropy_bits, normalise
 from semstab.errors import ConfigError
 
+RECURRENT = 3
+"""The least OP of the voxels over which the mean of a measure is printed, if nothing else is stated (paper, Sensitivity
+to World-Space Association): a voxel that was seen once looks perfectly stable."""
+
 Values = TypeVar("Values", bound=npt.NDArray[Any])
 
 
@@ -111,6 +115,7 @@ class Quantity:
         digits: Decimals where a map is summarised, and where maps are compared.
         needs: Source: the voxel table, the log of events as well, or the ground truth as well.
         section: Section of the paper, where it defines it.
+        op: Least OP of the voxels that it is a number of; 0 for a number of something else.
     """
 
     key: str
@@ -121,6 +126,17 @@ class Quantity:
     needs: Literal["table", "events", "truth"] = "table"
     section: str = ""
     short: str = ""
+    op: int = 0
+
+    @property
+    def population(self) -> str:
+        """The voxels that it is a number of: 'OP>=3'; '' for a number of something else."""
+        return f"OP>={self.op}" if self.op else ""
+
+    @property
+    def named(self) -> str:
+        """The title with the population: 'VSS (OP>=3)'; two numbers of one name are one number."""
+        return f"{self.title} ({self.population})" if self.op else self.title
 
     @property
     def word(self) -> str:
@@ -158,6 +174,7 @@ class Measure(Quantity):
     panel: bool = True
     chart: bool = False
     headline: bool = False
+    op: int = RECURRENT
 
     def __post_init__(self) -> None:
         if not hasattr(self.of, "whole"):

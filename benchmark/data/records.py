@@ -469,14 +469,14 @@ class Result:
         colors = dict[str, str]()
         for run in self.runs:
             table, unit = run.table, run.unit
-            means = (voxels.number(table[measure], measure.digits[0]) for measure in measures())
+            means = (voxels.number(table.recurrent[measure], measure.digits[0]) for measure in measures())
             seen = voxels.number(table.mean_op, 2), *means, voxels.number(100 * table.recurrent.share, 2)
             verdict = alpha = ""
             if run.statistics is not None:
                 verdict, alpha = str(run.statistics.verdict), run.statistics.headline.alpha.text()
                 colors[verdict] = KIND_COLORS[KINDS.get(run.statistics.verdict.decisive, "bad")]
             rows.append([unit.scene, unit.model, unit.backend, verdict, alpha, table.voxels, *seen])
-        titles = [measure.title for measure in measures()]
+        titles = [measure.named for measure in measures()]
         headers = [
             "scene",
             "model",

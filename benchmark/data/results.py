@@ -25,9 +25,6 @@ parts of fusion, where the backend measures them separately; notifying the obser
 LONGEST_NAME = 60
 """Bytes of a name in a file's name: with three of them, and what surrounds them, it has fewer than 255."""
 
-RECURRENT = 3
-"""A voxel is recurrent where OP >= 3 (paper, Sensitivity to World-Space Association)."""
-
 
 @dataclass(frozen=True)
 class UnitName:
@@ -228,8 +225,9 @@ class UnitSummary:
             "taxonomy": self.taxonomy, "K": table.K, "voxel_size": table.voxel_size, "frames": self.frames,
             "points": table.points, "observations": table.observations, "voxels": table.voxels,
             "mean_op": table.mean_op,
-            **table.means.value, "recurrent_share": table.recurrent.share,
-            **{f"recurrent_{key}": value for key, value in table.recurrent.means.value.items()},
+            **{f"{key}_all": value for key, value in table.means.value.items()},
+            "recurrent_share": table.recurrent.share,
+            **{f"{key}_op3": value for key, value in table.recurrent.means.value.items()},
             "flicker_percent": self.flicker_percent, "fuse_ms_per_frame": self.fuse_ms_per_frame,
         }  # fmt: skip
 

@@ -22,10 +22,10 @@ from semstab.core.types import Float64
 from semstab.data.events import Events
 from semstab.data.evidence import stretches
 from semstab.data.frames import LeftOut
-from semstab.data.measures import dominant, mean, measures, vss
+from semstab.data.measures import RECURRENT, dominant, mean, measures, vss
 from semstab.data.parquet import Tile
 from semstab.data.records import EVENTS, FRAMES, OBSERVATIONS, OVERVIEW, SUMS, TRUTH, VOXELS, FrameQuality, Record
-from semstab.data.results import RECURRENT, STAGES, Agreement, ReducedScores, UnitName, UnitSummary, slug
+from semstab.data.results import STAGES, Agreement, ReducedScores, UnitName, UnitSummary, slug
 from semstab.data.videos import LonePicture
 from semstab.data.voxels import VoxelTable
 from semstab.datasets import Scene

@@ -16,8 +16,8 @@ import numpy.typing as npt
 from semstab.core.arrays import Rows
 from semstab.core.files import atomic_path
 from semstab.core.types import Float64
-from semstab.data.measures import ENTROPY, VSS
-from semstab.data.results import RECURRENT, STAGES, FrameReport
+from semstab.data.measures import ENTROPY, RECURRENT, VSS
+from semstab.data.results import STAGES, FrameReport
 
 
 @dataclasses.dataclass(frozen=True)

@@ -32,7 +32,7 @@ def calibrate_run(run: str | Path, *, precision: float = 0.95, confidence: float
         if record.truth_file is None:
             raise ConfigError(
                 f"{handle.where}: ground truth of {scene} was not fused;"
-                " run it with --statistics, on a scene that has it"
+                " run it on a scene that has it, without --no-truth"
             )
         maps.append(_with_truth(record, record.truth_file))
         sampled = min(sampled, share_of(record.summary.table.voxels))

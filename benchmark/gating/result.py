@@ -127,7 +127,12 @@ class Judgement:
 
     @property
     def values(self) -> str:
-        """'0.481 to 0.462, drop 0.019 [0.012, 0.026]'."""
+        """The numbers with their population: 'OP>=3: 0.481 to 0.462, drop 0.019 [0.012, 0.026]'."""
+        population = self.rule.measure.quantity.population
+        return f"{population}: {self._numbers}" if population else self._numbers
+
+    @property
+    def _numbers(self) -> str:
         ends = f"[{self.digits(self.interval.low)}, {self.digits(self.interval.high)}]"
         if self.counted:
             return f"{self.rule.change} {self.digits(self.interval.value)}"

@@ -29,9 +29,9 @@ from semstab.statistics.correctness import ACCURACY, ECE, MIOU
 
 # Rules are about the numbers that follow from the sums of a run; each has advice for runs that do not have it.
 
-TRUTH = "run it with --statistics, on a scene with ground truth"
+TRUTH = "run it on a scene with ground truth, without --no-truth"
 OBSERVATION_ACCURACY = Quantity(
-    key="observation_accuracy", title="Accuracy of observations", better="higher", needs="truth"
+    key="observation_accuracy", title="Accuracy of observations", better="higher", needs="truth", op=2
 )
 
 

@@ -13,8 +13,8 @@ import numpy as np
 from semstab.core.types import Float64, Int32, Int64, UInt8
 from semstab.data.evidence import stretches
 from semstab.data.information import by_group
-from semstab.data.measures import MeasureMeans, Voxels, bits, dominant, mean, measures, sbd
-from semstab.data.results import RECURRENT, Means, TableSummary
+from semstab.data.measures import RECURRENT, MeasureMeans, Voxels, bits, dominant, mean, measures, sbd
+from semstab.data.results import Means, TableSummary
 from semstab.data.voxels import VoxelTable
 from semstab.errors import ConfigError
 

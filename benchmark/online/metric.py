@@ -78,7 +78,14 @@ class State:
         alpha = math.nan
         if self.spots is not None and len(self.spots):
             alpha = min(value(sums_of_spots(self.spots), "alpha"), 1.0)
-        numbers = alpha, whole.recurrent[VSS], whole[SBD], mean(psa(sample)), self._flicker, whole.recurrent.share
+        numbers = (
+            alpha,
+            whole.recurrent[VSS],
+            whole.recurrent[SBD],
+            mean(psa(sample)),
+            self._flicker,
+            whole.recurrent.share,
+        )
         return dict(zip(Summary.NAMES, map(float, numbers), strict=True))
 
     def summary(self) -> Summary:
@@ -171,8 +178,8 @@ class TemporalStability:
         ...     predicted[:, :wrong] = 2
         ...     metric.update(predicted, depth, K, pose)
         >>> numbers = metric.compute()
-        >>> {name: round(float(numbers[name]), 2) for name in ("recurrent_vss", "recurrent_share")}
-        {'recurrent_vss': 0.93, 'recurrent_share': 1.0}
+        >>> {name: round(float(numbers[name]), 2) for name in ("vss_op3", "recurrent_share")}
+        {'vss_op3': 0.93, 'recurrent_share': 1.0}
     """
 
     higher_is_better = True
@@ -225,7 +232,7 @@ class TemporalStability:
             self._maps[name].add(frame)
 
     def compute(self) -> dict[str, float]:
-        """Return alpha, recurrent_vss, sbd (bits), psa, flicker (percent) and recurrent_share, means over sequences.
+        """Return alpha, vss_op3, sbd_op3 (bits), psa_op2, flicker (percent) and recurrent_share, means over sequences.
 
         A run of these frames gives the same numbers; a number is NaN where undefined, as before the first update.
         """

@@ -20,17 +20,15 @@ class Summary:
         alpha: Agreement of two views at the same spot beyond chance, at most 1: the number that the verdict rests on.
         alpha_low, alpha_high: Ends of its confidence interval.
         confidence: Confidence of that interval, 0 to 1.
-        recurrent_vss: The paper's VSS, of the voxels with OP >= 3.
-        sbd: The paper's SBD in bits, of the voxels with OP >= 2.
-        entropy: The paper's entropy, of all voxels.
-        psa: Probability that two frames agree, of the voxels with OP >= 2.
+        vss_op3, sbd_op3, entropy_op3: The paper's VSS, SBD in bits, and entropy, of the voxels with OP >= 3.
+        psa_op2: Probability that two frames agree, of the voxels with OP >= 2.
         flicker: Percent of the co-visible pixels whose label changes from frame to frame, motion compensated.
         recurrent_share: Share of the voxels with OP >= 3, 0 to 1.
         verdict: The level.
         probability: Probability that the level is right.
     """
 
-    NAMES: ClassVar = ("alpha", "recurrent_vss", "sbd", "psa", "flicker", "recurrent_share")
+    NAMES: ClassVar = ("alpha", "vss_op3", "sbd_op3", "psa_op2", "flicker", "recurrent_share")
 
     frames: int
     voxels: int
@@ -38,10 +36,10 @@ class Summary:
     alpha_low: float
     alpha_high: float
     confidence: float
-    recurrent_vss: float
-    sbd: float
-    entropy: float
-    psa: float
+    vss_op3: float
+    sbd_op3: float
+    entropy_op3: float
+    psa_op2: float
     flicker: float
     recurrent_share: float
     verdict: str
@@ -58,10 +56,10 @@ class Summary:
             alpha_low=alpha.low,
             alpha_high=alpha.high,
             confidence=alpha.level,
-            recurrent_vss=float(table.recurrent[VSS]),
-            sbd=float(table[SBD]),
-            entropy=float(table[ENTROPY]),
-            psa=statistics.agreement.psa.value,
+            vss_op3=float(table.recurrent[VSS]),
+            sbd_op3=float(table.recurrent[SBD]),
+            entropy_op3=float(table.recurrent[ENTROPY]),
+            psa_op2=statistics.agreement.psa.value,
             flicker=flicker,
             recurrent_share=table.recurrent.share,
             verdict=verdict.decisive,
@@ -70,5 +68,5 @@ class Summary:
 
     def scalars(self) -> dict[str, float]:
         """Return the numbers that are logged every epoch, by name."""
-        numbers = self.alpha, self.recurrent_vss, self.sbd, self.psa, self.flicker, self.recurrent_share
+        numbers = self.alpha, self.vss_op3, self.sbd_op3, self.psa_op2, self.flicker, self.recurrent_share
         return dict(zip(self.NAMES, numbers, strict=True))

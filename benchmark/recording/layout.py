@@ -16,7 +16,8 @@ import rerun.blueprint as rrb
 
 from semstab.core.types import Float64, UInt8
 from semstab.data.labels import Color, LabelSpace
-from semstab.data.results import RECURRENT, UnitName
+from semstab.data.measures import RECURRENT
+from semstab.data.results import UnitName
 from semstab.data.voxels import VoxelTable
 from semstab.engine.units import Plan
 from semstab.metrics import CATEGORIES, CATEGORY_COLORS

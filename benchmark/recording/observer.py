@@ -126,7 +126,8 @@ class GroupLog:
         silent = not_assessed(summary)
         note = self._map(unit.backend).finish(stream, table, factor, assessed=not silent)
         note += f"; {silent}" if silent else ""
-        means = (f"{m.symbol} {summary.table[m]:.{m.digits[0]}f} {m.unit}".rstrip() for m in measures())
+        recurrent = summary.table.recurrent
+        means = (f"{m.named} {recurrent[m]:.{m.digits[0]}f} {m.unit}".rstrip() for m in measures())
         text = (
             f"{unit.model}, {unit.backend}: {summary.table.voxels:,} voxels, mean OP {summary.table.mean_op:.2f},"
             f" {', '.join(means)} (K = {summary.table.K}){note}"

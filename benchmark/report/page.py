@@ -31,6 +31,7 @@ from semstab.report.saved_run import read_series
 from semstab.report.tables import tables
 from semstab.report.tables.table import relations
 from semstab.report.terminal import miou
+from semstab.statistics.correctness import MIOU
 from semstab.statistics.verdict import LIMITS
 
 MOST_NAMED = 3
@@ -153,9 +154,10 @@ def _numbers(
     few = f"fewer than {ENOUGH:,} voxels with OP ≥ 3"
     for measure in headlines():
         value = short(together.recurrent[measure], digits=measure.digits[0]) if enough else "-"
-        note = f"{measure.unit}, OP ≥ 3" if measure.unit else "OP ≥ 3"
-        yield measure.title, value, note if enough else few
-    yield "mIoU", mean([miou(record) for record in records], "{:.1f} %", 100), "of voxels seen twice or more"
+        note = measure.unit
+        yield measure.named, value, note if enough else few
+    right = [miou(record) for record in records]
+    yield MIOU.named, short(macro_mean(right), digits=MIOU.digits[0]), "of the fused labels"
     wrong = [stats.headline.wrong_of_consistent.value for stats in assessed]
     yield "consistent but wrong", mean(wrong, "{:.1f} %", 100), "of the consistent locations"
 
@@ -358,7 +360,7 @@ def _by_op(result: Result) -> Iterator[dict[str, str]]:
 
 def _sweeps(result: Result) -> Iterator[dict[str, str]]:
     """Yield alpha and the first headline measure by the settings of each sweep."""
-    first = [(f"{measure.title}, OP ≥ 3", over_recurrent(measure)) for measure in headlines()[:1]]
+    first = [(measure.named, over_recurrent(measure)) for measure in headlines()[:1]]
     for sweep in swept(result):
         for title, take in (("alpha", lambda p: p.alpha.value), *first):
             lines = []

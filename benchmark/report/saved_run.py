@@ -101,7 +101,7 @@ def load(folder: str | Path) -> Run:
     Returns:
         Data frames `summary` (a row a unit; the screen's flicker is `compensated_flicker_percent`, as `flicker_percent`
         counts the camera's motion, too; its 'two views see the same class' is `agreeing`, its VSS at OP >= 3
-        `recurrent_vss`) and `classes` (a row a class: alpha with its interval, share of the
+        `vss_op3`) and `classes` (a row a class: alpha with its interval, share of the
         disagreement). For a unit, which scene, model and backend name as far as that is needed, `table()`, its voxels;
         `series()`, a row a frame; `events()`, the log of a run with --events. `result`: all numbers, typed.
 

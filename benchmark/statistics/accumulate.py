@@ -13,8 +13,7 @@ from semstab.core.types import Float64, Int32, Int64, Mask
 from semstab.data.events import Events
 from semstab.data.evidence import ByEntry, Evidence
 from semstab.data.information import by_group
-from semstab.data.measures import dominant, entropy, vss
-from semstab.data.results import RECURRENT
+from semstab.data.measures import RECURRENT, dominant, entropy, vss
 from semstab.data.statistics import Interval
 from semstab.data.voxels import VoxelTable
 from semstab.metrics.correctness import BINS, confidence_bin
@@ -248,7 +247,8 @@ def _with_frameless_sums(
 
     These are of the measures, of SBD less that in random order, and of calibration of beliefs.
     """
-    values = {measure.key: measure.of(table) for measure in summed()}
+    recurrent = table.op >= RECURRENT
+    values = {measure.key: np.where(recurrent, measure.of(table), np.nan) for measure in summed()}
     measured = tuple(values)
     slices = layout(sums.K, truth=sums.truth, measured=measured)
     columns = np.zeros((cubes.count, width(slices)))

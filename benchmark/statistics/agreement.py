@@ -19,12 +19,12 @@ from semstab.data.measures import Quantity, entropy, vss
 from semstab.data.statistics import ClassAgreement
 from semstab.data.voxels import VoxelTable
 
-PSA = Quantity(key="psa", title="PSA", better="higher")
+PSA = Quantity(key="psa", title="PSA", better="higher", op=2)
 KAPPA = Quantity(key="kappa", title="Kappa", better="higher", digits=(2, 4))
 ALPHA = Quantity(key="alpha", title="Alpha", better="higher", digits=(3, 4))
 """The agreement of two views at the same spot beyond chance: the number that decides, see `docs/metrics.md`."""
 
-VOXEL_ALPHA = Quantity(key="voxel_alpha", title="Voxel alpha", better="higher", digits=(3, 4))
+VOXEL_ALPHA = Quantity(key="voxel_alpha", title="Voxel alpha", better="higher", digits=(3, 4), op=2)
 """Krippendorff's alpha of the voxels of a map, which depends on their size."""
 
 CONSISTENT = 0.8

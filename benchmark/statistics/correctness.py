@@ -13,8 +13,7 @@ import numpy as np
 
 from semstab.core.types import Float64, Int32, Int64, Mask
 from semstab.data.evidence import Evidence
-from semstab.data.measures import Quantity, dominant
-from semstab.data.results import RECURRENT
+from semstab.data.measures import RECURRENT, Quantity, dominant
 from semstab.data.statistics import UNKNOWN, Correctness, Interval, Quadrants, Reliability
 from semstab.data.voxels import VoxelTable
 from semstab.metrics import strata
@@ -26,10 +25,10 @@ from semstab.statistics.agreement import CONSISTENT, LIKELY, consistency_posteri
 from semstab.statistics.cluster_sums import mean_functional
 from semstab.statistics.intervals import estimate
 
-ACCURACY = Quantity(key="accuracy", title="Accuracy", better="higher", needs="truth")
-MIOU = Quantity(key="miou", title="mIoU", better="higher", needs="truth")
-ECE = Quantity(key="ece", title="ECE", better="lower", needs="truth")
-BRIER = Quantity(key="brier", title="Brier", better="lower", needs="truth")
+ACCURACY = Quantity(key="accuracy", title="Accuracy", better="higher", needs="truth", op=2)
+MIOU = Quantity(key="miou", title="mIoU", better="higher", needs="truth", op=2)
+ECE = Quantity(key="ece", title="ECE", better="lower", needs="truth", op=2)
+BRIER = Quantity(key="brier", title="Brier", better="lower", needs="truth", op=2)
 
 PURE = 0.5 + 1e-9
 """A voxel has a true class where more than this share of its ground truth evidence is of one class: exactly a half
@@ -197,11 +196,13 @@ def reliability(belief: Float64 | Evidence, label: Int64) -> tuple[Reliability, 
 
 
 def by_stratum(predictions: Predictions, op: Int32, known: Mask, edges: Sequence[int]) -> tuple[Correctness, ...]:
-    """Return the correctness of all voxels whose true class is known (n,), then of each stratum of OP (n,)."""
+    """Return the correctness of all voxels whose true class is known (n,), by stratum of OP (n,), then of OP >= 2."""
     sums = _prediction_sums_by_group(predictions, np.where(known, groups_of(op, edges), -1), len(edges) + 1)
     names = ["all", *(name for name, _, _ in strata(edges))]
     whole = functools.reduce(operator.add, sums)
-    return tuple(correctness_of(of_group, name) for of_group, name in zip([whole, *sums], names, strict=True))
+    repeated = prediction_sums(predictions, known & (op >= 2))
+    every = zip([whole, *sums, repeated], [*names, "OP>=2"], strict=True)
+    return tuple(correctness_of(of_group, name) for of_group, name in every)
 
 
 QUADRANTS = ("consistent_right", "consistent_wrong", "inconsistent_right", "inconsistent_wrong")

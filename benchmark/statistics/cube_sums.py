@@ -49,7 +49,7 @@ MEANS: Mapping[str, Functional] = {
 }
 """Means over the voxels with OP >= 2 where values are defined, and kappa."""
 
-OF_CLUSTERS = {"psa": "psa", "voxel_alpha": "voxel_alpha", "entropy": "entropy", "excess": "sbd_excess"}
+OF_CLUSTERS = {"psa": "psa", "voxel_alpha": "voxel_alpha", "entropy": "entropy_op2", "excess": "sbd_excess"}
 """Numbers of the same voxels that verdicts, gates and comparisons print, too, with their names in `FUNCTIONALS`."""
 
 OF_FLIPS = (mean_functional("flip_rate"), mean_functional("flip_null"), mean_functional("flip_excess", -1.0))

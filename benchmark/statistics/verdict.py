@@ -73,7 +73,8 @@ ACTED_ON, LEAST_FLIPS = ("stable", "usable"), 0.001
 
 NO_SPOTS = "no spots were sampled; give the observations of a `Sampler`"
 TOO_FEW_VOXELS = "its map has too few locations to act on; use smaller voxels, or frames that overlap more"
-STILL = "the camera stood still: all frames show one view"
+EMPTY = "no spot was sampled: no pixel has both depth and a label that counts; see exclude, masks and the depth range"
+STILL = "all frames show one view: the camera stood still, or moved by less than a sampled pixel shows (pixel_stride)"
 
 
 ALL = LabelledPairs()
@@ -169,6 +170,8 @@ def _missing(spots: SpotAgreement | None, voxels: int) -> str:
     """Return why there is no verdict; empty where there is one."""
     if spots is None:
         return NO_SPOTS
+    if not spots.views:
+        return EMPTY
     if spots.views < 2 <= spots.frames:
         return STILL
     if spots.spots < LEAST_SPOTS or spots.cubes < LEAST_CUBES:

@@ -10,7 +10,8 @@ import pytest
 from hypothesis import given
 
 from semstab.data.frames import Frame
-from semstab.data.results import RECURRENT, FrameReport
+from semstab.data.measures import RECURRENT
+from semstab.data.results import FrameReport
 from semstab.data.voxels import VoxelTable
 from semstab.errors import ConfigError, DataError
 from semstab.metrics import entropy, vss

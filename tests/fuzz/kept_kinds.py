@@ -58,7 +58,7 @@ def of_kept(folder: Path) -> Iterator[Kind]:
     files = (maps / "labels/halves/000.png", maps / "scores/halves/000.npz", maps / "labels/halves/predictions.json")
     for file in files:
         yield Kind(f"predicted {file.name}", (file,), lambda _: produced(flight, maps))
-    compare([f"{tiled}:a", f"{tiled}:b"], folder / "compared")
+    compare(f"{tiled}:a", f"{tiled}:b", out=folder / "compared")
     yield Kind("comparison.json", (folder / "compared/comparison.json",), lambda file: load_comparison(file.parent))
     yield Kind("recording.rrd", (tiled / "recording.rrd",), is_whole)
     series = min(tiled.glob("frames/*.csv"))

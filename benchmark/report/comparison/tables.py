@@ -116,13 +116,13 @@ COUNTED = {"better": "more", "worse": "fewer"}
 
 def _titled(quantity: Quantity) -> str:
     unit = f", {quantity.unit}" if quantity.unit else ""
-    return f"{quantity.title}{unit}"
+    return f"{quantity.named}{unit}"
 
 
 def _by_class(comparison: RunComparison) -> Table:
     measured = {row.measure for _, against in scopes(comparison) for row in against.by_class}
     shown = [quantity for quantity in IN_CLASSES if quantity.key in measured]
-    columns = (Column("class", "Class"), *(Column(q.key, q.title, 3, q.better, signed=True) for q in shown))
+    columns = (Column("class", "Class"), *(Column(q.key, q.named, 3, q.better, signed=True) for q in shown))
     worse = Column("worse", "Worse"), Column("better", "Better")
     groups = tuple(
         Group(heading(comparison, scope, against), _class_rows(against, shown)) for scope, against in scopes(comparison)

@@ -11,8 +11,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from semstab.core.types import Float64, Int64
-from semstab.data.measures import Measure, measures, op
-from semstab.data.results import RECURRENT
+from semstab.data.measures import RECURRENT, Measure, measures, op
 from semstab.data.statistics import Estimate
 from semstab.data.voxels import VoxelTable
 from semstab.report.figures.style import COLUMN, FAINT, INK, LETTERS, PAGE, canvas, color, legend_columns, mark_panel

@@ -9,7 +9,7 @@ from semstab.data.measures import measures
 from semstab.data.records import Record, Result
 from semstab.data.results import Agreement
 from semstab.report.means import Pooled, pooled
-from semstab.report.tables.stability import SBD_OVER, of_measures, settings
+from semstab.report.tables.stability import ALL_VOXELS, SBD_OVER, of_measures, settings
 from semstab.report.tables.table import Column, Group, Row, Table
 
 # The fusion implementations: the same frames through every backend, and the differences of the measures.
@@ -27,7 +27,7 @@ def fusion(result: Result) -> list[Table]:
         Column("backend", "Backend"),
         Column("voxels", "Voxels", 0),
         Column("mean_op", "Mean OP", 2),
-        *of_measures(compared=True),
+        *of_measures(over=ALL_VOXELS, compared=True),
         Column("recurrent_percent", "OP>=3 (%)", 2),
         Column("fuse_ms_per_frame", "ms per frame", 1, "lower"),
         Column("delta_voxels", "Voxels", 0, signed=True, over=DIFFERENCE),

@@ -17,7 +17,7 @@ from semstab.data.statistics import (
     Quadrants,
 )
 from semstab.metrics import macro_mean
-from semstab.report.tables.stability import settings
+from semstab.report.tables.stability import OF_ROW, settings
 from semstab.report.tables.statistics import INTERVALS, Number, assessed_records, by_scene, grouped
 from semstab.report.tables.table import Column, Group, Row, Table
 from semstab.statistics.correctness import ACCURACY, BRIER, ECE, MIOU
@@ -65,7 +65,7 @@ def _correct_by_stratum(result: Result) -> list[Table]:
     columns = (
         Column("persistence", "Persistence"),
         Column("voxels", "Voxels", 0),
-        *map(Column.of, RIGHT),
+        *(Column.of(quantity, over=OF_ROW) for quantity in RIGHT),
     )
     groups = tuple(Group(name, _stratum_rows(strata)) for name, strata in by_model.items() if strata)
     caption = (

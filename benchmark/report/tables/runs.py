@@ -21,8 +21,8 @@ COLUMNS = (
     SCENE, Column("model", "Model"), Column("verdict", "Verdict"), Column("probability_percent", "Probability (%)", 0),
     Column.of(ALPHA), Column("scope", "For"), Column("agree_percent", "Agree (%)", 1, "higher"),
     Column("flicker_percent", "Flicker (%)", 1, "lower"),
-    Column("recurrent_vss", "VSS, OP>=3", 3, "higher"),
-    Column("recurrent_sbd", "SBD, OP>=3", 4, "lower"), Column.of(MIOU),
+    Column("vss_op3", "VSS (OP>=3)", 3, "higher"),
+    Column("sbd_op3", "SBD (OP>=3)", 4, "lower"), Column.of(MIOU),
     Column("voxel_size", "Voxel (m)", 3), Column("frames", "Frames", 0),
 )  # fmt: skip
 

@@ -38,7 +38,7 @@ def _table(result: Result, sweep: Sweep) -> Table:
         Column("mean_op", "Mean OP", 2),
         Column("recurrent_percent", "OP>=3 (%)", 2),
         *of_measures(compared=True, over="All voxels"),
-        *of_measures(compared=True, prefix="recurrent_", over="OP>=3"),
+        *of_measures(compared=True, suffix="_op3", over="OP>=3"),
         Column("note", "Note"),
     )
     models = [name for name in result.models if complete_scenes(result, sweep.name, name)]
@@ -117,7 +117,7 @@ def reduced(result: Result) -> list[Table]:
     columns = (
         Column("scene", "Scene"),
         Column("vss", VSS.title, VSS.digits[0], VSS.better),
-        Column("recurrent_vss", f"{VSS.title}, OP>=3", VSS.digits[0], VSS.better),
+        Column("vss_op3", VSS.named, VSS.digits[0], VSS.better),
         Column.of(VOXEL_ALPHA),
     )
     groups = tuple(

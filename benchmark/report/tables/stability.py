@@ -18,9 +18,13 @@ SHARE = Column("share_percent", "Voxels (%)", 2)
 SBD_OVER = "Means of SBD (bits) run over the voxels seen twice or more."
 
 
-def of_measures(*, compared: bool = False, prefix: str = "", over: str = "") -> list[Column]:
-    """Return a column for each measure: the paper prints more decimals where it compares."""
-    return [Column.of(measure, compared=compared, prefix=prefix, over=over) for measure in measures()]
+ALL_VOXELS, OF_ROW = "All voxels", "Of these voxels"
+"""What stands over the columns of measures whose population is all voxels, or the one that the row names."""
+
+
+def of_measures(*, over: str, compared: bool = False, suffix: str = "") -> list[Column]:
+    """Return a column for each measure under its population `over`; the paper prints more decimals to compare."""
+    return [Column.of(measure, compared=compared, suffix=suffix, over=over) for measure in measures()]
 
 
 def settings(records: Sequence[Record]) -> str:
@@ -50,8 +54,8 @@ _COLUMNS = (
     Column.of(ALPHA),
     Column("once_percent", "Seen once (%)", 2),
     Column("recurrent_percent", "OP>=3 (%)", 2),
-    *(Column.of(measure, over="All voxels") for measure in _HEADLINES),
-    *(Column.of(measure, prefix="recurrent_", over="OP>=3") for measure in _HEADLINES),
+    *(Column.of(measure, over=ALL_VOXELS) for measure in _HEADLINES),
+    *(Column.of(measure, suffix="_op3", over="OP>=3") for measure in _HEADLINES),
     Column("flicker_percent", "Pixel flicker (%)", 2, "lower"),
     Column("compensated_flicker_percent", "Flicker (%)", 2, "lower"),
 )
@@ -97,7 +101,7 @@ def scenes(result: Result) -> list[Table]:
         VOXELS,
         Column("points", "Sampled Points", 0),
         Column("mean_op", "Mean OP", 2),
-        *of_measures(),
+        *of_measures(over=ALL_VOXELS),
     )
     groups = tuple(
         Group(name, tuple(_scene_row(record) for record in rows), _scene_total(rows) if len(rows) > 1 else None)
@@ -136,7 +140,7 @@ def persistence(result: Result) -> list[Table]:
     records = result.select()
     if not records:
         return []
-    columns = (Column("persistence", "Persistence"), VOXELS, SHARE, *of_measures())
+    columns = (Column("persistence", "Persistence"), VOXELS, SHARE, *of_measures(over=OF_ROW))
     groups = []
     for name, of_model in by_model(records).items():
         together = pooled(of_model)
@@ -160,7 +164,7 @@ def classes(result: Result) -> list[Table]:
     records = result.select()
     if not records:
         return []
-    columns = (Column("class", "Class"), VOXELS, *of_measures(), Column("note", "Note"))
+    columns = (Column("class", "Class"), VOXELS, *of_measures(over=ALL_VOXELS), Column("note", "Note"))
     groups = tuple(
         Group(name, tuple(_class_row(row) for row in pooled(rows).classes)) for name, rows in by_model(records).items()
     )
@@ -184,7 +188,7 @@ def cross_model(result: Result) -> list[Table]:
     records = comparable(result)
     if not records:
         return []
-    columns = (Column("over", "Means over"), VOXELS, SHARE, *of_measures(compared=True))
+    columns = (Column("over", "Means over"), VOXELS, SHARE, *of_measures(over=OF_ROW, compared=True))
     groups = tuple(Group(name, _comparison_rows(rows)) for name, rows in by_model(records).items())
     caption = (
         f"{settings(records)} In a macro mean each scene counts once; a pooled mean runs over the voxels of all scenes"

@@ -50,7 +50,7 @@ def temporal_agreement(result: Result) -> list[Table]:
         Column("views", "Views", 0),
         Column("labelled_percent", "Labelled (%)", 0, "higher"),
         REPEATED,
-        *map(Column.of, (VSS, PSA, KAPPA, VOXEL_ALPHA)),
+        *(Column.of(q, over="OP>=2") for q in (VSS, PSA, KAPPA, VOXEL_ALPHA)),
         Column("within", "within a frame", 3, "lower", over="Disagreement"),
         Column("between", "between frames", 3, "lower", over="Disagreement"),
         Column.of(FLIP_RATE),
@@ -91,7 +91,7 @@ def class_agreement(result: Result) -> list[Table]:
         Column.of(ALPHA),
         Column("counts_for_verdict", "Counts for verdict"),
         Column("unstable_percent", "Unstable (%)", 0, "lower"),
-        *map(Column.of, (KAPPA, VOXEL_ALPHA)),
+        *(Column.of(q, over="OP>=2") for q in (KAPPA, VOXEL_ALPHA)),
     )
     cells = [row[1:] for group in groups for row in group.rows]
     known = [k for k in range(len(columns)) if any(_has_content(row[k]) for row in cells)]
@@ -210,7 +210,7 @@ def _frame_rows(record: Record, outlying: OutlyingFrames) -> Iterator[Row]:
 def uncertainty(result: Result) -> list[Table]:
     """Return the entropy of the belief, within frames and between them."""
     columns = (
-        Column.of(ENTROPY),
+        Column.of(ENTROPY, over="OP>=2"),
         Column("within", "within frames", 4, "lower"),
         Column("between", "between frames", 4, "lower"),
         Column("within_percent", "within (%)", 0),

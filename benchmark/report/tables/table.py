@@ -45,10 +45,13 @@ class Column:
     over: str = ""
 
     @classmethod
-    def of(cls, quantity: Quantity, *, compared: bool = False, prefix: str = "", over: str = "") -> Column:
-        """Return the column of a measure, with the decimals of a summary or of a comparison."""
-        digits = quantity.digits[compared]
-        return cls(prefix + quantity.key, quantity.title, digits, quantity.better, over=over)
+    def of(cls, quantity: Quantity, *, compared: bool = False, suffix: str = "", over: str = "") -> Column:
+        """Return the column of a measure, with the decimals of a summary or of a comparison.
+
+        Its name holds its population, unless the heading `over` it does.
+        """
+        digits, title = quantity.digits[compared], quantity.title if over else quantity.named
+        return cls(quantity.key + suffix, title, digits, quantity.better, over=over)
 
     def number(self, value: float) -> str:
         """Return the rounded number; UNDEFINED where there is none."""

@@ -95,9 +95,10 @@ def several_models(result: Result, records: Sequence[Record], width: int) -> Ite
 
 def _wrong_lines(records: Sequence[Record]) -> Iterator[str]:
     """Yield the share of the consistent locations that are wrong, of each model; nothing without ground truth."""
-    shares = {record.unit.model: share_of_wrong(record.statistics) for record in records if record.statistics}
+    judged = [(record.unit.model, own) for record in records if (own := record.statistics) is not None]
+    shares = {model: share_of_wrong(own) for model, own in judged if own.verdict.level != "no verdict"}
     if known := [f"{model} {share}" for model, share in shares.items() if share]:
-        misleads = any(record.statistics.verdict.level == "misleading" for record in records if record.statistics)
+        misleads = any(own.verdict.level == "misleading" for _, own in judged)
         more = f"; more than {percent(DANGEROUS)} is MISLEADING: do not take agreement for truth" if misleads else ""
         yield from wrapped(f"of the consistent locations are wrong: {', '.join(known)}{more}")
 

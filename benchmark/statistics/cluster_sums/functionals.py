@@ -140,7 +140,7 @@ FUNCTIONALS: Mapping[str, Functional] = {
     "alpha": Functional(ALPHA_SUMS, alpha_of, -1.0, 1.0, "agreement", pairs=PAIRS, parts=SPOTS),
     "voxel_alpha": Functional(ALPHA_SUMS, alpha_of, -1.0, 1.0, "agreement", pairs=PAIRS),
     "vss": Functional(("vss", "recurrent"), ratio_of),
-    "entropy": Functional(("entropy", "voxels"), ratio_of, by_location=True),
+    "entropy_op2": Functional(("entropy", "voxels"), ratio_of, by_location=True),
     "accuracy": Functional(("right", "known"), ratio_of),
     "observation_accuracy": Functional(("observed_right", "observed"), ratio_of),
     "wrong_of_consistent": Functional(("consistent_wrong", "consistent"), ratio_of, by_location=True),
@@ -149,9 +149,9 @@ FUNCTIONALS: Mapping[str, Functional] = {
     "ece": Functional(("calibrated", "calibrated", "gap"), ece_of, scale="plain"),
 }
 """Numbers by key: alpha, of spots that two views saw or more; PSA, Krippendorff's alpha of voxels and entropy at
-OP >= 2, VSS at OP >= 3, SBD less that in random order where that is known; with ground truth the accuracy of the fused
-labels at OP >= 2 and of single observations, the wrong among the consistent locations at OP >= 3, mean intersection
-over union and expected calibration error at OP >= 2."""
+OP >= 2 (`entropy_op2`); VSS at OP >= 3; SBD minus SBD in random order if the order is known. With ground truth:
+accuracy of the fused labels at OP >= 2 and of single observations, the wrong among the consistent locations at OP >= 3,
+mean intersection over union and expected calibration error at OP >= 2."""
 
 BY_CLASS: Mapping[str, Functional] = {
     "alpha": Functional(CLASS_SUMS, class_alpha_of, -1.0, 1.0, "agreement", parts=SPOTS),
@@ -170,7 +170,7 @@ def summed() -> tuple[Measure, ...]:
 
 
 def mean_over_voxels(measure: Measure) -> Functional:
-    """Return the mean of a measure of the register over the voxels with OP >= 2 where it is defined."""
+    """Return the mean of a measure of the register over the voxels with OP >= 3 where it is defined."""
     scale: Scale = "share" if measure.largest == 1 else "plain"
     return Functional(of_measure(measure.key), ratio_of, 0.0, measure.largest, scale, by_location=True)
 
