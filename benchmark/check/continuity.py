@@ -55,6 +55,9 @@ MOST_STEPS = 3
 DISAGREE = 0.25
 """Share of the points by which labels of a frame agree less with those beside it than these with each other."""
 
+SEVERAL = 3
+"""Classes of the maps around one that looks wrong."""
+
 SAME_RATIO, ANOTHER_UNIT = 0.05, 1.2
 """Spread of the ratio of two depths, relative, up to which one of them is that many times too long, and the least
 ratio: a pose that is a little off looks alike."""
@@ -245,13 +248,16 @@ class Chain:
     def mislabelled(self) -> list[tuple[int, Pair]]:
         """Return the positions of frames whose labels agree with neither neighbour, while those agree; with these.
 
-        Maps of one class are named as such.
+        These have several classes: a network that sees nothing there, but something in between, flickers. Maps of one
+        class are named as such.
         """
         found = dict[int, Pair]()
         for a, between, c in self._around():
+            if any(self.maps[k].classes < SEVERAL for k in (a, c) if k in self.maps):
+                continue
             limit = self.agreement(a, c) - DISAGREE
             if all(max(self.agreement(a, b), self.agreement(b, c)) < limit for b in between):
-                found |= {b: found.get(b, (a, c)) for b in between if self.maps[b].classes > 1}
+                found |= {b: found.get(b, (a, c)) for b in between if not self.maps[b].single}
         return sorted(found.items())
 
     def agreement(self, a: int, b: int) -> float:
@@ -262,15 +268,17 @@ class Chain:
 
 @dataclass(frozen=True)
 class MapContent:
-    """What a label map holds: the share of its pixels that have a label, and the number of their classes.
+    """What a label map holds: the share of its pixels that have a label, and their classes.
 
     Attributes:
         labelled: Share of the pixels, 0 to 1.
-        classes: Number of the classes.
+        single: Whether all of these have one class.
+        classes: Number of the classes that 0.5 % or more of these have.
         name: Id of the most frequent class; -1 without labels.
     """
 
     labelled: float
+    single: bool
     classes: int
     name: int
 
@@ -281,7 +289,9 @@ class MapContent:
         counts = np.bincount(view.labels[view.labels != view.ignore_id].ravel())
         total = int(counts.sum())
         most = int(counts.argmax()) if total else -1
-        return cls(total / max(1, view.labels.size), int(np.count_nonzero(counts)), most)
+        return cls(
+            total / max(1, view.labels.size), np.count_nonzero(counts) == 1, int(np.sum(counts > 0.005 * total)), most
+        )
 
 
 def chained(views: Iterable[tuple[int, View | None]], configured: Convention) -> Chain:

@@ -27,7 +27,7 @@ REACH = 8
 ROLLING = 0.5
 """Share of the places that tell at which ids change: from then on they change from frame to frame."""
 
-LEAST_CLASSES = 3
+MANY = 4
 """A map of one class is remarkable where those around it have so many, and agree less with it than usual."""
 
 MOST_NAMED = 5
@@ -164,7 +164,7 @@ def remarks_on_maps(neighbours: Neighbours, chain: Chain) -> Iterator[str]:
         positions = sorted(group)
         yield (
             f"have one class, id {name}, in {len(positions)} of {len(maps)} frames ({_frames(positions, named)}), while"
-            f" the maps around have {LEAST_CLASSES} or more: are the files right? Predict them again"
+            f" the maps around have {MANY} or more: are the files right? Predict them again"
         )
 
 
@@ -173,7 +173,7 @@ def _agreement_with_others(chain: Chain, position: int) -> float:
     known = [
         link.agreement
         for pair, link in chain.links.items()
-        if position in pair and all(chain.maps[one].classes > 1 for one in pair if one != position)
+        if position in pair and not any(chain.maps[one].single for one in pair if one != position)
     ]
     told = [agreement for agreement in known if np.isfinite(agreement)]
     return float(np.median(told)) if told else math.nan
@@ -182,12 +182,12 @@ def _agreement_with_others(chain: Chain, position: int) -> float:
 def _of_one_class(maps: dict[int, MapContent]) -> Iterator[int]:
     """Yield the positions of maps of one class, where the nearest others before and after have several."""
     positions = sorted(maps)
-    single = {k for k in positions if maps[k].classes == 1}
+    single = {k for k in positions if maps[k].single}
     others = np.array([k for k in positions if k not in single])
     for k in sorted(single):
         at = int(np.searchsorted(others, k))
         beside = others[max(0, at - 1) : at + 1].tolist()
-        if beside and all(maps[one].classes >= LEAST_CLASSES for one in beside):
+        if beside and all(maps[one].classes >= MANY for one in beside):
             yield k
 
 
