@@ -258,7 +258,7 @@ def test_a_predictor_is_called_as_its_class_and_found_from_anywhere(file, monkey
     assert found.label_name == "Bright"
     resolved = found.resolved()
     assert resolved.model == f"{file}:Bright"
-    assert resolved.options == {"classes": None, "table": str(file.parent / "table.csv"), "above": 3}
+    assert resolved.options == {"classes": None, "threads": None, "table": str(file.parent / "table.csv"), "above": 3}
 
 
 # --- What it prints, and scores in half precision ---------------------------------------------------------------------
