@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from pathlib import Path
@@ -28,6 +29,21 @@ class OwnOptions(BaseModel):
     classes: list[str] | str | None = Field(
         None, description="names in the order of ids; or a file: a name a line, or a taxonomy's YAML; the code's own"
     )
+    threads: int | None = Field(None, ge=1, description="of torch on a CPU; the code's own where it has such an option")
+
+    @property
+    def of_labels(self) -> dict[str, Any]:
+        """The options of the code that may change its labels."""
+        return dict(self.model_extra or {})
+
+    def of_speed(self, code: Code) -> dict[str, Any]:
+        """Return those that change no label."""
+        return {"threads": self.threads} if self.threads is not None and code.has("threads") else {}
+
+    def limit_torch(self, code: Code) -> None:
+        """Give torch its threads, where the code has loaded it and does not do so itself."""
+        if self.threads is not None and not code.has("threads") and "torch" in sys.modules:
+            sys.modules["torch"].set_num_threads(self.threads)
 
 
 def own_maker(text: str) -> tuple[type[BaseModel], Callable[[Any], Model]]:
@@ -38,15 +54,17 @@ def own_maker(text: str) -> tuple[type[BaseModel], Callable[[Any], Model]]:
     code = Code.load(text, "model")
     cls: Any = code.target
     if not (isinstance(cls, type) and Model in cls.__mro__):
-        return OwnOptions, lambda options: OwnModel(code, dict(options.model_extra or {}), options.classes)
+        return OwnOptions, lambda options: OwnModel(code, options)
     own = getattr(cls, "Options", None)
     if isinstance(own, type) and issubclass(own, BaseModel):
         return own, lambda options: OfCode(guarded(text, lambda: cls(options)), code, {})
 
-    def make(options: BaseModel) -> Model:
-        extra = dict(options.model_extra or {})
-        code.accepts(extra)
-        return OfCode(guarded(text, lambda: cls(**extra)), code, extra)
+    def make(options: OwnOptions) -> Model:
+        given = options.of_labels | options.of_speed(code)
+        code.accepts(given)
+        model = OfCode(guarded(text, lambda: cls(**given)), code, options.of_labels)
+        options.limit_torch(code)
+        return model
 
     return OwnOptions, make
 
@@ -72,11 +90,12 @@ class OwnModel(Model):
     frame).
     """
 
-    def __init__(self, code: Code, options: Mapping[str, Any], classes: Sequence[str] | str | None) -> None:
-        self._code, self._options = code, options
+    def __init__(self, code: Code, given: OwnOptions) -> None:
+        self._code, self._options = code, given.of_labels
+        options = self._options | given.of_speed(code)
         made: Any = code.target
         if isinstance(code.target, type):
-            code.accepts(dict(options))
+            code.accepts(options)
             made = guarded(code.text, lambda: code.target(**options))
             self._call: Callable[..., Any] = getattr(made, "predict", made)
         else:
@@ -84,14 +103,15 @@ class OwnModel(Model):
         if not callable(self._call):
             raise ConfigError(f"{code.text}: has no method predict(image), and cannot be called with an image")
         self._made = made
-        self.label_space = _label_space(code, made, classes)
+        self.label_space = _label_space(code, made, given.classes)
         self.gives_scores = bool(getattr(made, "gives_scores", True))
         self.sequential = bool(getattr(made, "sequential", False))
         self.wants_geometry = bool(getattr(made, "wants_geometry", False))
         if self.sequential and not hasattr(made, "reset"):
             raise ConfigError(f"{code.text}: a sequential model needs a method reset(), called before each sequence")
         if not isinstance(code.target, type):
-            code.accepts(dict(options), *([None] * (1 + self.wants_geometry)))
+            code.accepts(options, *([None] * (1 + self.wants_geometry)))
+        given.limit_torch(code)
 
     def reset(self) -> None:
         """Forget all images."""

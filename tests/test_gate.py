@@ -61,6 +61,7 @@ def test_a_rule_is_read(text, key, change, below, limit, class_name, scene):
     ("alpha", "write [scene NAME:] [class NAME|*:] MEASURE [drop|rise] <|> NUMBER[%]"),
     ("alpha drop 0.02", "not understood"), ("alpha < 1e999", "too large"),
     ("alhpa drop < 0.02", "no measure 'alhpa'; did you mean 'alpha'?"),
+    ("alpha dorp < 0.02", "no change 'dorp'; did you mean 'drop'?"),
     ("recall > 0.6", "recall is of one class; write 'class NAME: recall > 0.6'"),
     ("class car: ece < 0.1", "ece is of all classes; leave 'class car:' out"),
     ("coverage > 0.9", "coverage is relative to a baseline"),

@@ -235,6 +235,22 @@ def test_identity_is_of_the_code_and_of_what_options_name(file, tmp_path):
     assert create(said, table=str(table)).identity() != usual
 
 
+def test_threads_change_no_key_and_are_those_of_torch_or_of_the_code(file, tmp_path, monkeypatch):
+    asked = list[int]()
+    monkeypatch.setitem(sys.modules, "torch", SimpleNamespace(set_num_threads=asked.append))
+    assert create(f"{file}:Bright", threads=2).identity() == create(f"{file}:Bright").identity()
+    assert asked == [2]
+    own = tmp_path / "own.py"
+    own.write_text(
+        "class Own:\n    classes = ['a', 'b']\n    def __init__(self, threads=1):\n        self.threads = threads\n"
+        "    def predict(self, image):\n        return image[..., 0] * 0 + self.threads - 2\n"
+    )
+    model = create(f"{own}:Own", threads=3)
+    assert model.predict([IMAGE])[0].labels.max() == 1
+    assert asked == [2]
+    assert model.identity() == create(f"{own}:Own").identity()
+
+
 def test_a_predictor_is_called_as_its_class_and_found_from_anywhere(file, monkeypatch):
     monkeypatch.chdir(file.parent)
     (file.parent / "table.csv").write_text("1")
@@ -242,7 +258,7 @@ def test_a_predictor_is_called_as_its_class_and_found_from_anywhere(file, monkey
     assert found.label_name == "Bright"
     resolved = found.resolved()
     assert resolved.model == f"{file}:Bright"
-    assert resolved.options == {"classes": None, "table": str(file.parent / "table.csv"), "above": 3}
+    assert resolved.options == {"classes": None, "threads": None, "table": str(file.parent / "table.csv"), "above": 3}
 
 
 # --- What it prints, and scores in half precision ---------------------------------------------------------------------

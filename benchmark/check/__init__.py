@@ -4,6 +4,7 @@ from semstab.check.geometry import Verdict
 from semstab.check.no_depth import with_invalid_depth
 from semstab.check.scene_check import (
     SCHEMA,
+    Ordered,
     SceneCheck,
     check,
     check_scene,
@@ -12,15 +13,17 @@ from semstab.check.scene_check import (
     refuse_unsound,
     require_sound,
 )
-from semstab.check.voxel_size import advise, with_voxel_size
+from semstab.check.voxel_size import advise, faces_in_surface, with_voxel_size
 
 __all__ = [
     "SCHEMA",
+    "Ordered",
     "SceneCheck",
     "Verdict",
     "advise",
     "check",
     "check_scene",
+    "faces_in_surface",
     "quick_check",
     "quick_sample",
     "refuse_unsound",

@@ -32,6 +32,11 @@ SIZES = tuple(m * 10.0**e for e in range(-3, 3) for m in (1, 2, 5))
 STAYS = 0.5
 """The suggested voxel size is the smallest in which this share of the points fall into the same voxel seen again."""
 
+PHASES = (0.25, 0.5, 0.75)
+IN_SURFACE = 0.85
+"""Faces of voxels lie in a surface where along an axis at most this part of the points stays in its voxel, compared
+with grids that are moved by these parts of a voxel."""
+
 PIXELS_ACROSS = 2
 """The suggested pixel stride leaves this many pixels along a voxel's edge, at the far end of the depths."""
 
@@ -121,6 +126,31 @@ class Seen:
     agree: Mask
 
 
+@dataclass(frozen=True)
+class Faces:
+    """Faces of voxels that lie in a surface, whose noise splits its points between two voxels.
+
+    Attributes:
+        voxel_size: Metres.
+        axes: Names of the axes that they are normal to.
+        stays: Share of the points that stay in their voxel when another frame sees them.
+        moved: The same with the grid half a voxel off along these axes.
+    """
+
+    voxel_size: float
+    axes: tuple[str, ...]
+    stays: float
+    moved: float
+
+    def __str__(self) -> str:
+        half, along = self.voxel_size / 2, " and ".join(self.axes)
+        return (
+            f"faces of voxels of {self.voxel_size:g} m lie in a surface (normal to {along}), whose noise splits its"
+            f" points: {self.stays:.0%} stay in their voxel when another frame sees them, {self.moved:.0%} with the"
+            f" grid half a voxel off; move the poses by {half:g} m along {along}"
+        )
+
+
 class Coverage:
     """The share of a scene that the views of a sample have in common under the configured convention."""
 
@@ -155,12 +185,31 @@ class Coverage:
 
         NaN where none does.
         """
-        seen = self._seen.values()
-        first, second = ([getattr(one, name) for one in seen] for name in ("first", "second"))
-        if not first:
-            return math.nan
-        same = np.floor(np.concatenate(first) / voxel_size) == np.floor(np.concatenate(second) / voxel_size)
-        return _mean(np.all(same, axis=1))
+        return _mean(np.all(self._same_along(voxel_size, np.zeros(3)), axis=1))
+
+    def faces(self, voxel_size: float) -> Faces | None:
+        """Return the axes along which faces of voxels lie in a surface; None where they do not, or most points stay.
+
+        Along them far fewer points stay than with the grid a quarter, a half or three quarters of a voxel off.
+        """
+        if not self.stays(voxel_size) < STAYS:
+            return None
+        here = self._same_along(voxel_size, np.zeros(3)).mean(axis=0)
+        moved = [self._same_along(voxel_size, np.full(3, phase)).mean(axis=0) for phase in PHASES]
+        axes = np.asarray(here < IN_SURFACE * np.mean(moved, axis=0))
+        if not axes.any():
+            return None
+        off = self._same_along(voxel_size, np.where(axes, 0.5, 0.0))
+        names = tuple(name for name, is_one in zip("xyz", axes.tolist(), strict=True) if is_one)
+        return Faces(voxel_size, names, self.stays(voxel_size), _mean(np.all(off, axis=1)))
+
+    def _same_along(self, voxel_size: float, phase: Float64) -> Mask:
+        """Return (n, 3) whether points seen again lie between the same faces of a grid moved by a part of a voxel."""
+        seen = [one for one in self._seen.values() if len(one.first)]
+        if not seen:
+            return np.zeros((0, 3), dtype=np.bool_)
+        first, second = (np.concatenate([getattr(one, name) for one in seen]) for name in ("first", "second"))
+        return np.asarray(np.floor(first / voxel_size + phase) == np.floor(second / voxel_size + phase))
 
     def _overlap(self, apart: tuple[int, int], pairs: Sequence[Pair]) -> Overlap:
         matches = [self._matches[pair] for pair in pairs]
@@ -251,10 +300,21 @@ class Stays(Protocol):
     def stays(self, voxel_size: float) -> float:
         """Return that share for a voxel size in metres; NaN where no point is seen again."""
 
+    def faces(self, voxel_size: float) -> Faces | None:
+        """Return the axes along which faces of voxels lie in a surface; None where they do not."""
+
 
 def suggested_size(coverage: Stays) -> float | None:
-    """Return the smallest voxel size in which points fall again, metres; None where frames do not see the same."""
-    return next((size for size in SIZES if coverage.stays(size) >= STAYS), None)
+    """Return the smallest voxel size in which points fall again, metres; None where frames do not see the same.
+
+    Where faces of voxels lie in a surface, the grid is taken half a voxel off: a larger voxel does not mend that.
+    """
+    return next((size for size in SIZES if _stays_off_faces(coverage, size) >= STAYS), None)
+
+
+def _stays_off_faces(coverage: Stays, size: float) -> float:
+    faces = coverage.faces(size)
+    return coverage.stays(size) if faces is None else faces.moved
 
 
 def suggest(coverage: Coverage, overlaps: Sequence[Overlap], frames: int, stride: int) -> Suggestion:
@@ -266,10 +326,12 @@ def suggest(coverage: Coverage, overlaps: Sequence[Overlap], frames: int, stride
     pixels = None if voxel_size is None else max(1, int(voxel_size / (PIXELS_ACROSS * footprint)))
     shared = {row.apart[0]: row.in_view for row in overlaps}
     times = max((n for n in shared if shared[n] >= SHARED and frames >= FRAMES_LEFT * n), default=1)
-    stays = math.nan if voxel_size is None else coverage.stays(voxel_size)
+    stays = math.nan if voxel_size is None else _stays_off_faces(coverage, voxel_size)
+    off = voxel_size is not None and stays != coverage.stays(voxel_size)
     return Suggestion(
         voxel_size=voxel_size,
-        voxel_size_reason=f"{stays:.0%} of the points stay in such a voxel when another frame sees them",
+        voxel_size_reason=f"{stays:.0%} of the points stay in such a voxel when another frame sees them"
+        f"{', where its faces lie in no surface' if off else ''}",
         pixel_stride=pixels,
         pixel_stride_reason=f"{PIXELS_ACROSS} pixels or more along a voxel's edge at {far:.3g} m",
         frame_stride=stride * times,

@@ -7,6 +7,8 @@ the agreement of labels that are reprojected from frame to frame, pair by pair.
 
 from __future__ import annotations
 
+import dataclasses
+import functools
 import itertools
 import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -22,13 +24,13 @@ from semstab.check.geometry import shifts_and_turns
 from semstab.check.registration import grey_levels
 from semstab.check.reprojection import Pair, Sample, View
 from semstab.core.arrays import evenly
-from semstab.core.types import Float64, Mask
+from semstab.core.types import Float64, Int64, Mask
 from semstab.data.labels import LabelSpace
 from semstab.datasets import Scene
 from semstab.errors import DataError
 from semstab.pixels.edges import depth_edges, image_edges, label_edges
 
-RUN = 5
+IN_A_RUN = 5
 """Frames in a row that are read together: labels may be those of a neighbour."""
 
 PIXELS = 2**17
@@ -53,6 +55,19 @@ WON = 0.8
 
 LEAST_FRAMES = 4
 LEAST_POINTS = 50
+
+FIRST_RUNS = 2
+"""Runs of frames that are read first."""
+
+MOST_ORDERED, ORDER_COLUMNS, ORDER_PIXELS = 200, 64, 200 * 640 * 480
+"""Frames whose maps are looked for among those of all others, their edges on a grid of so many columns; the pixels of
+all of them, ..."""
+
+QUICK_PIXELS = 44 * 640 * 480
+"""... and those of a quick check."""
+
+SAME_ORDER = 0.8
+"""Share of the maps that an order explains."""
 
 TELLING = 0.9
 """An alternative whose edges fit this part as well as the given ones cannot be told from them."""
@@ -113,11 +128,26 @@ class Alternative:
     change: Change = lambda labels, _: labels
 
 
+def shifted(step: int) -> Alternative:
+    """Return the mistake that each frame has the map of `step` frames before."""
+    side, sign = ("late", "+") if step > 0 else ("early", "-")
+    mend = f"give frame k the file of frame k {sign} {abs(step)}"
+    return Alternative(f"are {frames_of(abs(step))} {side}", mend, step=step)
+
+
+def frames_of(count: int) -> str:
+    """Return a number of frames in words.
+
+    >>> frames_of(1), frames_of(5)
+    ('one frame', '5 frames')
+    """
+    return "one frame" if count == 1 else f"{('two', 'three', 'four')[count - 2] if count < 5 else count} frames"
+
+
 def alternatives(width: int, height: int) -> tuple[Alternative, ...]:
     """Return the mistakes that are tried, for images of that size."""
     mistakes = [
-        Alternative("are one frame late", "give frame k the file of frame k + 1", step=1),
-        Alternative("are one frame early", "give frame k the file of frame k - 1", step=-1),
+        *map(shifted, (1, -1, 2, -2)),
         Alternative("are mirrored left to right", "mirror the files", change=lambda L, _: L[:, ::-1]),
         Alternative("are upside down", "mirror the files", change=lambda L, _: L[::-1]),
         Alternative("are turned by 180 degrees", "turn the files", change=lambda L, _: L[::-1, ::-1]),
@@ -158,15 +188,15 @@ def _scaled(labels: Ids, x: float, y: float, ignore: int) -> Ids:
 
 def runs_of(scene: Scene, indices: Sequence[int], model: str, count: int) -> list[list[int]]:
     """Return `count` runs of frames in a row, evenly spaced; of selected frames where the ones between lack labels."""
-    count = max(1, min(count, len(indices) // RUN))
-    starts = [indices[position] for position in evenly(max(1, len(indices) - RUN + 1), count)]
-    wanted, runs = [[*range(start, start + RUN)] for start in starts], []
+    count = max(1, min(count, len(indices) // IN_A_RUN))
+    starts = [indices[position] for position in evenly(max(1, len(indices) - IN_A_RUN + 1), count)]
+    wanted, runs = [[*range(start, start + IN_A_RUN)] for start in starts], []
     for run in wanted:
         if all(i < len(scene) and scene.tracked(i) and not scene.missing(i, [model]) for i in run):
             runs.append(run)
     if runs:
         return runs
-    return [[*indices[k : k + RUN]] for k in range(0, len(indices), RUN)][:count]
+    return [[*indices[k : k + IN_A_RUN]] for k in range(0, len(indices), IN_A_RUN)][:count]
 
 
 @dataclass(frozen=True, eq=False)
@@ -186,6 +216,17 @@ class Seen:
         """The labels (H, W)."""
         assert self.view.labels is not None
         return self.view.labels
+
+    @functools.cached_property
+    def edges(self) -> Float64 | None:
+        """The edges of the labels on the grid, of length 1; None where there are none."""
+        return _edges(self.labels, self.view.ignore_id)
+
+    def fit(self, edges: Float64 | None) -> float:
+        """Return the correlation of edges of labels with those of depth and of colour, their mean."""
+        if edges is None or not self.references:
+            return math.nan
+        return float(np.mean([np.sum(edges * reference) for reference in self.references]))
 
 
 def read(scene: Scene, index: int, model: str) -> Seen:
@@ -217,6 +258,96 @@ def _smooth(edges: Mask) -> Float64:
     smooth -= smooth.mean()
     normed: Float64 = smooth / max(math.sqrt(np.square(smooth).sum()), 1e-12)
     return normed
+
+
+def _edges(labels: Ids, ignore: int) -> Float64 | None:
+    edges = label_edges(labels, ignore)
+    return _smooth(edges) if edges.any() else None
+
+
+@dataclass(frozen=True, eq=False)
+class Shared:
+    """The pixels of two frames, by their places in a run, that see the same points: rows and columns in each."""
+
+    a: int
+    b: int
+    first: tuple[Int64, Int64]
+    second: tuple[Int64, Int64]
+    ignore: int
+
+    def agreement(self, maps: Mapping[int, Ids]) -> float:
+        """Return the share of the points whose labels agree; NaN where too few have some."""
+        first, second = maps[self.a][self.first], maps[self.b][self.second]
+        told = (first != self.ignore) & (second != self.ignore)
+        return float(np.mean(first[told] == second[told])) if told.sum() >= LEAST_POINTS else math.nan
+
+
+def shared_of(views: Mapping[int, View], pairs: Sequence[Pair]) -> list[Shared]:
+    """Return what pairs of frames see in common, where that is enough."""
+    sample, one = Sample(dict(views), pairs, Convention()), np.array([1.0])
+    found = []
+    for a, b in pairs:
+        matches = sample.matched((a, b), Convention(), one)
+        same = matches.error[0] < CONSISTENT
+        if same.sum() >= LEAST_POINTS:
+            first, second = (views[a].v[same], views[a].u[same]), (matches.v[0][same], matches.u[0][same])
+            found.append(Shared(a, b, first, second, views[a].ignore_id))
+    return found
+
+
+@dataclass(frozen=True, eq=False)
+class Tried:
+    """An alternative in the frames of a run for which it has a map.
+
+    Attributes:
+        maps: The map (H, W) of each, by its place in the run.
+        fits: The fit of the map as it is, and of this one, by the same places.
+    """
+
+    alternative: Alternative
+    maps: Mapping[int, Ids]
+    fits: Mapping[int, tuple[float, float]]
+
+
+class Run:
+    """Frames in a row, and all alternatives tried on them, once."""
+
+    def __init__(self, frames: Sequence[Seen]) -> None:
+        self.frames = frames
+
+    @functools.cached_property
+    def shared(self) -> list[Shared]:
+        """What each two of the frames see in common."""
+        return shared_of(self._views, [*itertools.combinations(self._views, 2)])
+
+    @functools.cached_property
+    def tried(self) -> list[Tried]:
+        """All alternatives."""
+        H, W = self.frames[0].labels.shape
+        return [self.trial(each) for each in alternatives(W, H)]
+
+    def trial(self, alternative: Alternative) -> Tried:
+        """Try one alternative."""
+        maps, fits = dict[int, Ids](), dict[int, tuple[float, float]]()
+        for k, seen in enumerate(self.frames):
+            if not 0 <= k + alternative.step < len(self.frames):
+                continue
+            source = self.frames[k + alternative.step]
+            other = alternative.change(source.labels, seen.view.ignore_id)
+            if other.shape == seen.labels.shape:
+                edges = source.edges if other is source.labels else _edges(other, seen.view.ignore_id)
+                maps[k], fits[k] = other, (seen.fit(seen.edges), seen.fit(edges))
+        return Tried(alternative, maps, fits)
+
+    def agreements(self, maps: Mapping[int, Ids]) -> list[tuple[float, float]]:
+        """Return for each pair of frames the share of common points whose labels agree, as given and by other maps."""
+        given = {k: self.frames[k].labels for k in maps}
+        pairs = [pair for pair in self.shared if pair.a in maps and pair.b in maps]
+        return [(pair.agreement(given), pair.agreement(maps)) for pair in pairs]
+
+    @property
+    def _views(self) -> dict[int, View]:
+        return {k: seen.view for k, seen in enumerate(self.frames)}
 
 
 # --- the comparison --------------------------------------------------------------------------------------------------
@@ -278,6 +409,11 @@ class Comparison:
         return by_agreement and not edges.other < edges.given
 
     @property
+    def is_doubt(self) -> bool:
+        """Return whether the alternative fits better, clearly or not."""
+        return self.edges.other >= BETTER * self.edges.given
+
+    @property
     def is_open(self) -> bool:
         """Return whether edges fit about as well under the alternative, so that nothing is told."""
         return not self.edges.other < TELLING * self.edges.given
@@ -291,84 +427,262 @@ class Comparison:
         return f"{self.alternative.says} ({text}): {self.alternative.mend}"
 
 
-def compare(runs: Sequence[Sequence[Seen]]) -> list[Comparison]:
+def compare(runs: Sequence[Run]) -> list[Comparison]:
     """Compare every alternative with the maps as they are."""
-    H, W = runs[0][0].labels.shape
-    return [_compared(each, runs) for each in alternatives(W, H)]
+    return [_compared(each, runs) for each in zip(*(run.tried for run in runs), strict=True)]
 
 
-def _compared(alternative: Alternative, runs: Sequence[Sequence[Seen]]) -> Comparison:
-    fits: list[tuple[float, float]] = []
-    agreements: list[tuple[float, float]] = []
-    for run in runs:
-        at = [k for k in range(len(run)) if 0 <= k + alternative.step < len(run)]
-        given = {k: run[k].labels for k in at}
-        other = {k: alternative.change(run[k + alternative.step].labels, run[k].view.ignore_id) for k in at}
-        if any(given[k].shape != other[k].shape for k in at):
+def counted(found: Comparison, runs: Sequence[Run]) -> Comparison:
+    """Return the comparison with maps as many frames late, or early, as fit best, where one of these was found."""
+    if not found.alternative.step:
+        return found
+    side = 1 if found.alternative.step > 0 else -1
+    others = [shifted(side * count) for count in range(1, IN_A_RUN)]
+    return max((_compared([run.trial(each) for run in runs], runs) for each in others), key=_fit_of)
+
+
+def _fit_of(comparison: Comparison) -> float:
+    return -math.inf if math.isnan(comparison.edges.other) else comparison.edges.other
+
+
+def _compared(tried: Sequence[Tried], runs: Sequence[Run]) -> Comparison:
+    fits = [both for each in tried for both in each.fits.values()]
+    agreements = [both for each, run in zip(tried, runs, strict=True) for both in run.agreements(each.maps)]
+    return Comparison(tried[0].alternative, _contrast(fits), _contrast(agreements))
+
+
+def _contrast(rows: Sequence[tuple[float, float]]) -> Contrast:
+    return Contrast.of(*zip(*rows, strict=True)) if rows else Contrast.of((), ())
+
+
+# --- from a frame on -------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class Turn:
+    """A frame from which on maps are otherwise: of their fits as given and otherwise the better one changes there."""
+
+    at: int
+    before: Contrast
+    after: Contrast
+
+    @classmethod
+    def of(cls, given: Sequence[float], other: Sequence[float]) -> Turn:
+        """Find the place at which the sum of the better fits is largest."""
+        gain = np.nan_to_num(np.subtract(other, given))
+        sums = [gain[k:].sum() - gain[:k].sum() for k in range(len(gain), -1, -1)]
+        at = len(gain) - int(np.argmax(sums))  # the last one of several
+        return cls(at, Contrast.of(other[:at], given[:at]), Contrast.of(given[at:], other[at:]))
+
+    @property
+    def is_one(self) -> bool:
+        """Return whether maps fit clearly better as given before it, and otherwise after it."""
+        return all(
+            side.is_clear and side.other >= max(LEAST_FIT, BETTER * side.given) for side in (self.before, self.after)
+        )
+
+
+def from_a_frame_on(scene: Scene, model: str, runs: Sequence[Run]) -> str | None:
+    """Return the finding where maps fit as they are up to a frame, and otherwise from it on."""
+    for tried in zip(*(run.tried for run in runs), strict=True):
+        rows = [row for each, run in zip(tried, runs, strict=True) for row in _rows(each, run)]
+        if len(rows) < 2 * LEAST_FRAMES:
             continue
-        fits += [(_fit(run[k], given[k]), _fit(run[k], other[k])) for k in at]
-        agreements += _agreements({k: run[k].view for k in at}, given, other)
-    return Comparison(alternative, *(Contrast.of(*zip(*rows, strict=True)) if rows else Contrast.of((), ())
-                                     for rows in (fits, agreements)))  # fmt: skip
+        turn = Turn.of([given for _, given, _ in rows], [other for *_, other in rows])
+        if turn.is_one:
+            alternative = tried[0].alternative
+            last, first = rows[turn.at - 1][0], rows[turn.at][0]
+            index = _located(scene, model, alternative, last, first)
+            before, after = turn.before, turn.after
+            says, mend = alternative.says, alternative.mend
+            if alternative.step:
+                says, mend = (
+                    f"are {'late' if alternative.step > 0 else 'early'}",
+                    "give each frame the map of its own image",
+                )
+            return (
+                f"{says} from frame {scene.frame_name(index)} on (their edges correlate {after.other:.2f}"
+                f" with those of depth and colour there, {after.given:.2f} now; before it {before.other:.2f} as they"
+                f" are): {mend}"
+            )
+    return None
 
 
-def _fit(seen: Seen, labels: Ids) -> float:
-    """Return the correlation of the edges of labels with those of depth and of colour, their mean."""
-    edges = label_edges(labels, seen.view.ignore_id)
-    if not edges.any() or not seen.references:
-        return math.nan
-    own = _smooth(edges)
-    return float(np.mean([np.sum(own * reference) for reference in seen.references]))
+def _rows(tried: Tried, run: Run) -> list[tuple[int, float, float]]:
+    """Return for each frame of a run its index, and the fit of its map as given and otherwise."""
+    return [(run.frames[k].view.index, given, other) for k, (given, other) in tried.fits.items()]
 
 
-def _agreements(
-    views: Mapping[int, View], given: Mapping[int, Ids], other: Mapping[int, Ids]
-) -> list[tuple[float, float]]:
-    """Return for each pair of frames the share of common points whose labels agree, as given and otherwise."""
-    pairs: list[Pair] = [(a, b) for a, b in itertools.combinations(views, 2)]
-    sample, one = Sample(dict(views), pairs, Convention()), np.array([1.0])
-    rows = []
-    for a, b in pairs:
-        matches = sample.matched((a, b), Convention(), one)
-        same = matches.error[0] < CONSISTENT
-        if same.sum() < LEAST_POINTS:
-            continue
-        first, second = (views[a].v[same], views[a].u[same]), (matches.v[0][same], matches.u[0][same])
-        ignore = views[a].ignore_id
-        rows.append(tuple(_agreement(maps[a][first], maps[b][second], ignore) for maps in (given, other)))
-    return rows  # type: ignore[return-value]
+def _located(scene: Scene, model: str, alternative: Alternative, last: int, first: int) -> int:
+    """Return the index of the frame from which on maps are otherwise, between two that are known."""
+    while first - last > 2 * IN_A_RUN:
+        middle = (last + first) // 2
+        run = Run([*_readable(scene, range(middle - IN_A_RUN // 2, middle + IN_A_RUN // 2 + 1), model)])
+        gains = [other - given for given, other in run.trial(alternative).fits.values()]
+        if not np.isfinite(gains).any():
+            return first
+        if float(np.nansum(gains)) > 0:
+            first = middle
+        else:
+            last = middle
+    span = range(max(0, last - IN_A_RUN), min(len(scene), first + IN_A_RUN + 1))
+    run = Run([*_readable(scene, span, model)])
+    rows = _rows(run.trial(alternative), run)
+    if not rows:
+        return first
+    at = Turn.of([given for _, given, _ in rows], [other for *_, other in rows]).at
+    return rows[min(at, len(rows) - 1)][0]
 
 
-def _agreement(first: Ids, second: Ids, ignore: int) -> float:
-    told = (first != ignore) & (second != ignore)
-    return float(np.mean(first[told] == second[told])) if told.sum() >= LEAST_POINTS else math.nan
+# --- another order ---------------------------------------------------------------------------------------------------
+
+
+def in_another_order(scene: Scene, indices: Sequence[int], model: str, pixels: int) -> str | None:
+    """Return the finding where the maps are those of these frames, but in another order: reversed, late, shuffled.
+
+    Each frame gets the map whose edges fit its depth and colour best, each map once. That is right where labels then
+    agree clearly better between frames, which the edges do not know.
+    """
+    from scipy.optimize import linear_sum_assignment
+
+    first = next(_readable(scene, indices[:1], model), None)
+    if first is None:
+        return None
+    count = min(MOST_ORDERED, max(IN_A_RUN, pixels // first.whole.size))
+    chosen = [indices[k] for k in evenly(len(indices), count)]
+    frames = [*_readable(scene, chosen, model)]
+    frames = [seen for seen in frames if seen.references and seen.labels.shape == frames[0].labels.shape]
+    if len(frames) < 2 * IN_A_RUN:
+        return None
+    n = len(frames)
+    own = np.stack([_coarse(seen.references) for seen in frames])
+    none = np.zeros_like(frames[0].references[0])
+    maps = np.stack([_coarse((none if seen.edges is None else seen.edges,)) for seen in frames])
+    fits = own @ maps.T
+    order = np.asarray(linear_sum_assignment(-fits)[1])
+    moved = order != np.arange(n)
+    if moved.mean() < 0.5 or fits[np.arange(n), order].mean() < max(LEAST_FIT, BETTER * float(np.diag(fits).mean())):
+        return None
+    near = [(a, b) for a in range(n) for b in range(a + 1, min(n, a + 4))]
+    given = {k: seen.labels for k, seen in enumerate(frames)}
+    other = {k: frames[order[k]].labels for k in range(n)}
+    pairs = shared_of({k: seen.view for k, seen in enumerate(frames)}, near)
+    agreement = _contrast([(pair.agreement(given), pair.agreement(other)) for pair in pairs])
+    if not (agreement.is_clear and 1 - agreement.other <= FEWER * (1 - agreement.given)):
+        return None
+    text = (
+        f"(their edges correlate {fits[np.arange(n), order].mean():.2f} with those of depth and colour so,"
+        f" {np.diag(fits).mean():.2f} now; {agreement.other:.0%} agree between frames, {agreement.given:.0%} now)"
+    )
+    return f"{_order(order, frames, scene)} {text}: give each frame the map of its own image"
+
+
+def _order(order: Int64, frames: Sequence[Seen], scene: Scene) -> str:
+    """Return what the order of the maps is: map `order[k]` is that of frame k."""
+    n, k = len(order), np.arange(len(order))
+    steps, counts = np.unique(order - k, return_counts=True)
+    if np.mean(np.abs(order + k - (n - 1)) <= 1) >= SAME_ORDER:
+        return "are in reversed order: the first frame has the map of the last one"
+    whole = frames[-1].view.index - frames[0].view.index == n - 1
+    if whole and counts.max() >= SAME_ORDER * (n - abs(int(steps[counts.argmax()]))):
+        step = int(steps[counts.argmax()])
+        return f"are {frames_of(abs(step))} {'late' if step > 0 else 'early'}"
+    at = int(np.flatnonzero(order != k)[0])
+    of, to = (scene.frame_name(frames[one].view.index) for one in (int(order[at]), at))
+    return f"are in another order than the frames (the map of frame {of} is that of frame {to}, and so on)"
+
+
+def _coarse(edges: Sequence[Float64]) -> Float64:
+    """Return (cells,) the mean of maps of edges on a coarse grid, without its mean, of length 1."""
+    import cv2
+
+    H, W = edges[0].shape
+    size = (min(W, ORDER_COLUMNS), max(1, round(H * min(W, ORDER_COLUMNS) / W)))
+    mean = np.mean([cv2.resize(each, size, interpolation=cv2.INTER_AREA) for each in edges], axis=0).ravel()
+    mean = mean - mean.mean()
+    coarse: Float64 = mean / max(float(np.linalg.norm(mean)), 1e-12)
+    return coarse
 
 
 # --- findings --------------------------------------------------------------------------------------------------------
 
 
 def check_labels(
-    scene: Scene, indices: Sequence[int], model: str, space: LabelSpace | None, runs: int
+    scene: Scene,
+    indices: Sequence[int],
+    model: str,
+    space: LabelSpace | None,
+    runs: int,
+    *,
+    thorough: bool = True,
 ) -> LabelFindings:
     """Compare the label maps of a model with depth, colour and each other, in `runs` times five frames.
 
-    Frames that cannot be read are passed over.
+    Two of them come first; the others are read where these do not show that the maps are right, or, unless `thorough`,
+    where they fit better another way. Then frames are read to find maps in another order. Frames
+    that cannot be read are passed over.
     """
-    read_runs = [[*_readable(scene, run, model)] for run in runs_of(scene, indices, model, runs)]
-    read_runs = [run for run in read_runs if len(run) > 1]
-    frames = [seen for run in read_runs for seen in run]
+    known = dict[int, Run]()
+    few = _findings(scene, indices, model, space, min(runs, FIRST_RUNS), known)
+    if few.clear or not (thorough or few.doubted):
+        return few.found
+    whole = _findings(scene, indices, model, space, runs, known)
+    if whole.clear or whole.found.wrong:
+        return whole.found
+    pixels = ORDER_PIXELS if thorough else QUICK_PIXELS
+    if (other := in_another_order(scene, indices, model, pixels)) is None:
+        return whole.found
+    return dataclasses.replace(whole.found, wrong=(f"labels of {model} {other}",), open=None)
+
+
+@dataclass(frozen=True)
+class _Findings:
+    """What some runs show.
+
+    Attributes:
+        clear: Whether maps as they are fit clearly better than any other way.
+        doubted: Whether another way fits better, however few frames show it.
+    """
+
+    found: LabelFindings
+    clear: bool = False
+    doubted: bool = False
+
+
+def _findings(
+    scene: Scene, indices: Sequence[int], model: str, space: LabelSpace | None, count: int, known: dict[int, Run]
+) -> _Findings:
+    """Return what some runs show; those that are read are kept in `known`, by their first frames."""
+    wanted = runs_of(scene, indices, model, count)
+    for run in wanted:
+        if run[0] not in known:
+            known[run[0]] = Run([*_readable(scene, run, model)])
+    runs = [known[run[0]] for run in wanted if len(known[run[0]].frames) > 1]
+    frames = [seen for run in runs for seen in run.frames]
     if len(frames) < 2 or any(seen.labels.shape != frames[0].labels.shape for seen in frames):
-        return LabelFindings(model)
+        return _Findings(LabelFindings(model))
     texts = id_remarks(
-        [seen.labels for seen in frames], frames[0].view.ignore_id, space, [run[0].whole for run in read_runs]
+        [seen.labels for seen in frames], frames[0].view.ignore_id, space, [run.frames[0].whole for run in runs]
     )
     remarks = tuple(f"labels of {model} {text}" for text in texts)
-    if (same := _identical(read_runs)) is not None:
-        return LabelFindings(model, (f"labels of {model} {same}",), remarks)
-    comparisons = compare(read_runs)
+    if (same := _identical(runs)) is not None:
+        return _Findings(LabelFindings(model, (f"labels of {model} {same}",), remarks), clear=True)
+    comparisons = compare(runs)
+    if (turned := from_a_frame_on(scene, model, runs)) is not None:
+        return _Findings(LabelFindings(model, (f"labels of {model} {turned}",), remarks), doubted=True)
     better = sorted((each for each in comparisons if each.is_better), key=lambda each: -each.edges.other)
-    wrong = tuple(f"labels of {model} {each}" for each in better[:1])
-    return LabelFindings(model, wrong, remarks, None if wrong else _open(comparisons))
+    wrong = tuple(f"labels of {model} {counted(each, runs)}" for each in better[:1])
+    return _Findings(
+        LabelFindings(model, wrong, remarks, None if wrong else _open(comparisons)),
+        clear=not better and all(map(_is_right, runs)),
+        doubted=any(each.is_doubt for each in comparisons),
+    )
+
+
+def _is_right(run: Run) -> bool:
+    """Return whether maps of a run fit better as they are than in any other way."""
+    fits = [_contrast([*each.fits.values()]) for each in run.tried]
+    return all(each.other < TELLING * each.given for each in fits)
 
 
 def _readable(scene: Scene, run: Sequence[int], model: str) -> Iterator[Seen]:
@@ -379,9 +693,9 @@ def _readable(scene: Scene, run: Sequence[int], model: str) -> Iterator[Seen]:
             return
 
 
-def _identical(runs: Sequence[Sequence[Seen]]) -> str | None:
+def _identical(runs: Sequence[Run]) -> str | None:
     """Return the finding where all maps are the same, of several classes, though the camera moves."""
-    frames = [seen for run in runs for seen in run]
+    frames = [seen for run in runs for seen in run.frames]
     first = frames[0].labels
     if len(frames) < LEAST_FRAMES or len(np.unique(first)) < 2:
         return None
@@ -390,9 +704,9 @@ def _identical(runs: Sequence[Sequence[Seen]]) -> str | None:
     return f"are the same map in all {len(frames)} frames that were read, though the camera moves: predict them again"
 
 
-def _moves(run: Sequence[Seen]) -> bool:
-    views = {k: seen.view for k, seen in enumerate(run)}
-    shifts, turns = shifts_and_turns(Sample(views, [(0, len(run) - 1)], Convention()))
+def _moves(run: Run) -> bool:
+    views = {k: seen.view for k, seen in enumerate(run.frames)}
+    shifts, turns = shifts_and_turns(Sample(views, [(0, len(views) - 1)], Convention()))
     return bool(shifts.max() > MOVES or turns.max() > TURNS)
 
 

@@ -278,6 +278,9 @@ class ScanSample:
         agree: Mask = (first == second)[known]
         return agree
 
+    def faces(self, voxel_size: float) -> None:
+        """Return that faces of voxels are not looked for: rings of a scan do not lie in them."""
+
     def stays(self, voxel_size: float) -> float:
         """Return the share of the points met that lie in the same voxel as the nearest of the other scan."""
         first, second = self._in_world

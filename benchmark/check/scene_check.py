@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from semstab.check.continuity import Neighbours, with_continuity
+from semstab.check.continuity import Chain, Neighbours, with_continuity
 from semstab.check.conventions import Reading, reading
 from semstab.check.coverage import (
     FUSED_FRAMES,
@@ -26,6 +26,7 @@ from semstab.check.coverage import (
 from semstab.check.geometry import Verdict, assess, shifts_and_turns
 from semstab.check.histogram import Histogram, Tally
 from semstab.check.intrinsics import with_intrinsics
+from semstab.check.label_order import remarks_on_maps, wrong_ids
 from semstab.check.labels import LabelFindings, check_labels
 from semstab.check.mistakes import with_mistakes
 from semstab.check.no_depth import with_invalid_depth
@@ -68,6 +69,10 @@ MOST_VOXELS = 2**20
 
 VOXEL_FACTORS = (0.5, 1.0, 2.0)
 """Voxel sizes for which the distribution of OP is reported, relative to the configured or the suggested one."""
+
+
+Ordered = Mapping[str, tuple[Neighbours, Chain]]
+"""Frames in order, by the model whose labels they have."""
 
 
 @dataclass(frozen=True)
@@ -187,10 +192,10 @@ def check_scene(scene: Scene, config: Config, told: Sequence[str] = ()) -> Scene
     )
     sample, how = inspection.sample(config.dataset.options), inspection.reading(config.dataset.options)
     verdict = inspection.verdict(config.dataset.options, thorough=True)
-    findings, others = tuple[LabelFindings, ...](), tuple[str, ...]()
+    findings = tuple[LabelFindings, ...]()
     if verdict.state != "unsound":
-        findings = tuple(label_findings(scene, indices, models, LABEL_RUNS))
-        others = tuple(inspection.misplaced_maps(config.dataset.options, models[1:]))
+        chained = {} if first is None or inspection.chained is None else {first: inspection.chained}
+        findings = tuple(label_findings(scene, indices, models, config.dataset.options, chained, thorough=True))
     checked = SceneCheck(
         scene=scene.name,
         frames=len(scene),
@@ -208,7 +213,6 @@ def check_scene(scene: Scene, config: Config, told: Sequence[str] = ()) -> Scene
         notes=(
             *told,
             *verdict.remarks,
-            *others,
             *(line for each in findings for line in each.remarks),
             *notes(scene, [inspection.views[at] for at in sorted(inspection.views)], inspection.tally.model),
             *begun,
@@ -289,31 +293,85 @@ def quick_check(scene: Scene, indices: Sequence[int], options: Mapping[str, Any]
 
 
 def quick_sample(
-    scene: Scene, indices: Sequence[int], options: Mapping[str, Any] | None = None
-) -> tuple[Verdict, Sample | None]:
-    """Return the verdict of `quick_check`, and the frames that it looked at; None where there are not two."""
+    scene: Scene, indices: Sequence[int], options: Mapping[str, Any] | None = None, model: str | None = None
+) -> tuple[Verdict, Sample | None, Ordered]:
+    """Return the verdict of `quick_check`, the frames that it looked at, and frames in order by label source.
+
+    There is no sample where there are not two frames. Frames in order have the labels of `model`, whose files are read.
+    """
     verdict, sample = Verdict("unclear", "it takes two frames to tell whether depth and poses agree"), None
+    ordered: Ordered = {}
     if scene.of_scans:
         scans = quick_sample_of_scans(scene, indices)
-        return with_sweep(assess_scans(scans), scans), None
+        return with_sweep(assess_scans(scans), scans), None, ordered
     for count, points, thorough in ((1, QUICK_POINTS, False), (CLUSTERS, POINTS, True)):
         inspection = Inspection(scene, indices, None, clusters(len(indices), count), points, passing_over=True)
         if len(inspection.views) < 2:
             continue
         sample = inspection.sample(options or {})
-        verdict = inspection.verdict(options or {}, thorough=thorough)
+        verdict = inspection.verdict(options or {}, thorough=thorough, labels_of=model)
+        if model is not None and inspection.chained is not None:
+            ordered = {model: inspection.chained}
         if verdict.state in ("sound", "imprecise"):
             break
-    return verdict, sample
+    return verdict, sample, ordered
 
 
-def label_findings(scene: Scene, indices: Sequence[int], models: Sequence[str], runs: int) -> Iterator[LabelFindings]:
-    """Yield what label maps show to be wrong with them, for each model that has files of its own; nothing of scans."""
+def label_findings(
+    scene: Scene,
+    indices: Sequence[int],
+    models: Sequence[str],
+    options: Mapping[str, Any] | None = None,
+    known: Ordered | None = None,
+    *,
+    thorough: bool,
+) -> Iterator[LabelFindings]:
+    """Yield what label maps show to be wrong with them, for each model that has files of its own; nothing of scans.
+
+    Args:
+        scene: The scene.
+        indices: Indices of the selected frames.
+        models: Label sources.
+        options: The dataset's, for the convention of the poses.
+        known: Frames in order with their labels, by model, where they were compared already.
+        thorough: Whether as many frames are compared as `check` does.
+    """
     for model in () if scene.of_scans else models:
         space = None
         with contextlib.suppress(DataError):
             space = scene.label_space(model)
-        yield check_labels(scene, indices, model, space, runs)
+        found = check_labels(scene, indices, model, space, LABEL_RUNS, thorough=thorough)
+        if scene.surface is None:
+            with contextlib.suppress(DataError):
+                chained = (known or {}).get(model) or chain_of(scene, indices, model, options or {}, thorough=thorough)
+                found = with_order(found, *chained)
+        yield found
+
+
+def chain_of(
+    scene: Scene, indices: Sequence[int], model: str, options: Mapping[str, Any], *, thorough: bool
+) -> tuple[Neighbours, Chain]:
+    """Return the frames of a scene in order, with the labels of a model.
+
+    Raises:
+        DataError: If the first frame cannot be read.
+    """
+    first = reader(scene, model)(indices[0])
+    how = reading(scene, first, options, None)
+    neighbours = Neighbours(scene, indices, model, how.convention)
+    return neighbours, neighbours.chain(neighbours.spread(how.size, thorough=thorough))
+
+
+def with_order(found: LabelFindings, neighbours: Neighbours, chain: Chain) -> LabelFindings:
+    """Return findings with those of label maps from frame to frame."""
+    wrong = found.wrong
+    if not wrong and (text := wrong_ids(neighbours, chain)) is not None:
+        wrong = (f"labels of {found.model} {text}",)
+    remarks = [f"labels of {found.model} {text}" for text in remarks_on_maps(neighbours, chain)]
+    single = [] if wrong else neighbours.said_of_labels(chain)
+    return dataclasses.replace(
+        found, wrong=wrong, remarks=(*found.remarks, *remarks, *single), open=None if wrong else found.open
+    )
 
 
 def require_sound(scene: Scene, indices: Sequence[int], options: Mapping[str, Any] | None = None) -> Verdict:
@@ -344,6 +402,7 @@ class Inspection:
         groups: Positions in `indices` of frames that are compared with each other.
         points: About how many points are reprojected in all.
         fused: Number of frames, evenly spaced, that are also held in memory for fusion.
+        chained: Frames in order, once a verdict compared them.
         passing_over: Leave out frames that cannot be read, instead of raising what reading them raises.
         with_color: Whether to read also the size of a colour image: intrinsics may be for that.
     """
@@ -364,6 +423,7 @@ class Inspection:
         self.tally = Tally(source or "")
         self.views: dict[int, View] = {}
         self.fused = evenly(len(indices), fused)
+        self.chained: tuple[Neighbours, Chain] | None = None
         self._first: Frame | None = None
         self.farthest: tuple[float, Frame, tuple[int, int]] | None = None
         self._pairs = pairs_within(groups)
@@ -412,8 +472,11 @@ class Inspection:
         pairs = [pair for pair in self._pairs if pair[0] in views and pair[1] in views]
         return Sample(views, pairs, self.reading(options).convention)
 
-    def verdict(self, options: Mapping[str, Any], *, thorough: bool) -> Verdict:
-        """Assess depth by reprojection from frame to frame, and depth that is cast at a surface by the images."""
+    def verdict(self, options: Mapping[str, Any], *, thorough: bool, labels_of: str | None = None) -> Verdict:
+        """Assess depth by reprojection from frame to frame, and depth that is cast at a surface by the images.
+
+        Frames in order are read with the labels of `labels_of`, by default those of `source`.
+        """
         sample = self.sample(options)
         if self.scene.surface is not None:
             return assess_surface(match_images(self.scene, sample.views, sample.pairs), len(sample.views))
@@ -426,15 +489,14 @@ class Inspection:
         verdict = with_precision(verdict, sample)
         if self.scene.made and not thorough:
             return verdict  # rendering its frames takes longer than fusing them
-        neighbours = Neighbours(self.scene, self.indices, self.source, how.convention, self.views)
-        return with_continuity(verdict, neighbours, neighbours.spread(how.size, thorough=thorough))
-
-    def misplaced_maps(self, options: Mapping[str, Any], models: Sequence[str]) -> Iterator[str]:
-        """Yield a line on single label maps of other models that do not agree with those of the frames beside them."""
-        how = self.reading(options)
-        for model in models if self.scene.surface is None else ():
-            neighbours = Neighbours(self.scene, self.indices, model, how.convention)
-            yield from neighbours.said_of_labels(neighbours.chain(neighbours.spread(how.size, thorough=True)))
+        if verdict.mend:
+            return verdict
+        source = labels_of or self.source
+        known = self.views if source == self.source else None
+        neighbours = Neighbours(self.scene, self.indices, source, how.convention, known)
+        chain = neighbours.chain({*neighbours.spread(how.size, thorough=thorough), *neighbours.striking()})
+        self.chained = neighbours, chain
+        return with_continuity(verdict, neighbours, chain)
 
     def depth(self) -> Depth:
         """Return the depth of all frames that were read."""
@@ -458,10 +520,12 @@ def _with_coverage(checked: SceneCheck, inspection: Inspection, sample: Sample, 
     size = config.voxel_size
     if not config.sets_voxel_size and suggestion is not None and suggestion.voxel_size is not None:
         size = suggestion.voxel_size
+    faces = None if noise is None else coverage.faces(size)
     fused = [_persistence(views, coverage, size * factor, stride) for factor in VOXEL_FACTORS]
     return dataclasses.replace(
         checked,
         refused=tuple(filter(None, (inspection.too_far(size),))),
+        notes=checked.notes if faces is None else (*checked.notes, str(faces)),
         overlaps=tuple(overlaps),
         noise=noise,
         fused_frames=len(views),

@@ -5,31 +5,37 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 from semstab.check.registration import REGISTERED_FRAMES, notes
-from semstab.check.scene_check import POINTS, Inspection, label_findings
+from semstab.check.scene_check import POINTS, Inspection, Ordered, label_findings
 from semstab.config import Config
 from semstab.datasets import Scene
 from semstab.predict.dataset import NAME as PREDICTED
 
-LABEL_RUNS = 2
-"""Number of runs of five frames in which label maps are compared with depth, colour and each other."""
 
-
-def scene_notes(scene: Scene, indices: Sequence[int], model: str, config: Config) -> tuple[str, ...]:
+def scene_notes(
+    scene: Scene, indices: Sequence[int], model: str, config: Config, known: Ordered | None = None
+) -> tuple[str, ...]:
     """Return what looks wrong in depth and labels of a model, or its images, but may be right; in the words of `check`.
 
     Labels that the run predicts are those of the images, which are compared with the depth before any is predicted. A
-    scene without files, simulated or in a program's memory, has no notes, nor has one of scans.
+    scene without files, simulated or in a program's memory, has no notes, nor has one of scans. `known` are frames in
+    order that `quick_sample` compared.
 
     Raises:
         DataError: If a frame cannot be read.
     """
     if scene.folder is None or scene.of_scans:
         return ()
-    predicted = config.dataset.name == PREDICTED
-    inspection = Inspection(scene, indices, None if predicted else model, (), POINTS, fused=REGISTERED_FRAMES)
+    stored = stored_labels(scene, model, config)
+    inspection = Inspection(scene, indices, stored, (), POINTS, fused=REGISTERED_FRAMES)
     views = [inspection.views[at] for at in sorted(inspection.views)]
-    findings = [] if predicted else label_findings(scene, indices, [model], LABEL_RUNS)
+    options = config.dataset.options
+    findings = [] if stored is None else label_findings(scene, indices, [model], options, known, thorough=False)
     return (
         *(line for each in findings for line in (*each.wrong, *each.remarks)),
         *notes(scene, views, model),
     )
+
+
+def stored_labels(scene: Scene, model: str, config: Config) -> str | None:
+    """Return the model where its labels are files; None where the run predicts them, or the scene has no files."""
+    return None if scene.folder is None or scene.of_scans or config.dataset.name == PREDICTED else model

@@ -51,6 +51,14 @@ def advise(sample: Sample | None, config: Config) -> VoxelAdvice | None:
     return None if math.isnan(stays) else VoxelAdvice(config.voxel_size, stays, suggested_size(coverage), chosen=False)
 
 
+def faces_in_surface(sample: Sample | None, config: Config) -> list[str]:
+    """Return the line on faces of voxels of the configured size that lie in a surface, if they do."""
+    if sample is None or not sample.pairs or _is_made(config):
+        return []
+    faces = Coverage(sample).faces(config.voxel_size)
+    return [] if faces is None else [str(faces)]
+
+
 def _is_made(config: Config) -> bool:
     """Return whether the scenes are simulated, also where models predict on their images."""
     dataset = config.dataset

@@ -108,7 +108,7 @@ def measure_videos(config: Config, out: Path, execution: Execution, *, quiet: bo
     for line, file in (("report  ", out / "report.html"), ("viewer  semstab-bench view ", out / "recording.rrd")):
         if file.exists():
             lines.append(f"  {line}{file}")
-    print_lines([*lines, f"  more    {out}"], quiet=quiet)
+    print_lines([*lines, f"  files   {out}"], quiet=quiet)
 
 
 def executor_of(jobs: int, scheduler: str | None) -> Executor:

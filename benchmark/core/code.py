@@ -75,6 +75,13 @@ class Code:
         file = self.module.__file__
         return "" if file is None else file_digest(Path(file)).hex()
 
+    def has(self, option: str) -> bool:
+        """Return whether the call names this option; compiled code has no signature."""
+        try:
+            return option in inspect.signature(self.target).parameters
+        except ValueError:
+            return False
+
     def accepts(self, options: dict[str, Any], *more: Any) -> None:
         """Check the call with `more` and these options.
 

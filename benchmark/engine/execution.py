@@ -11,8 +11,17 @@ from collections import deque
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
-from semstab.check import Verdict, advise, quick_sample, refuse_unsound, with_invalid_depth, with_voxel_size
-from semstab.check.scene_notes import scene_notes
+from semstab.check import (
+    Ordered,
+    Verdict,
+    advise,
+    faces_in_surface,
+    quick_sample,
+    refuse_unsound,
+    with_invalid_depth,
+    with_voxel_size,
+)
+from semstab.check.scene_notes import scene_notes, stored_labels
 from semstab.config import Config
 from semstab.configure import resolve
 from semstab.core.process import trim_malloc
@@ -181,12 +190,15 @@ class _Execution:
         """Check the geometry and the voxel size of each scene of missing units; those report errors of reading."""
         fused = {(unit.name.scene, unit.name.model): unit.task for unit in reversed(missing) if not unit.regions}
         tasks = {scene: task for (scene, _), task in fused.items()}
-        verdicts: dict[str, Verdict] = {}
+        verdicts, faces, ordered = dict[str, Verdict](), dict[str, list[str]](), dict[str, Ordered]()
         for task in reversed(tasks.values()):
             with contextlib.suppress(DataError):
-                verdicts[task.scene.name], sample = quick_sample(task.scene, task.indices, config.dataset.options)
+                name, options = task.scene.name, config.dataset.options
+                stored = stored_labels(task.scene, task.model, config)
+                verdicts[name], sample, ordered[name] = quick_sample(task.scene, task.indices, options, stored)
+                faces[name] = faces_in_surface(sample, config)
                 if (advice := advise(sample, config)) is not None:
-                    self.units.advice[task.scene.name] = advice
+                    self.units.advice[name] = advice
         for scene, verdict in verdicts.items():
             refuse_unsound(tasks[scene].scene, verdict)
             self._observers.tell(
@@ -196,6 +208,7 @@ class _Execution:
         for (scene, model), task in fused.items():
             if scene in verdicts:
                 with contextlib.suppress(DataError):
-                    found = scene_notes(task.scene, task.indices, model, config)
+                    found = scene_notes(task.scene, task.indices, model, config, ordered.get(scene))
+                    found = (*found, *faces.get(scene, []))
                     left_out = [self._gaps[scene]] if scene in self._gaps else []
                     self.units.notes[scene, model] = (*left_out, *verdicts[scene].remarks, *found)

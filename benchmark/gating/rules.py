@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import dataclasses
+import difflib
 import math
 import re
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Literal
+from typing import Literal, get_args
 
 from semstab.comparison.quantities import (
     COVERAGE,
@@ -160,6 +161,9 @@ def parse(text: str) -> Rule:
     result = RULE.fullmatch(text)
     if result is None:
         raise ConfigError(f"rule '{text}': not understood; write {GRAMMAR}, e.g. 'alpha drop < 0.02'")
+    if (meant := _change_meant(result["measure"])) is not None:
+        word, change_word = meant
+        raise ConfigError(f"rule '{text}': no change '{word}'; did you mean '{change_word}'?")
     measure = measure_named(result["measure"], f"rule '{text}'")
     limit = float(result["limit"])
     if result["percent"] and measure.quantity.unit != "%":
@@ -173,6 +177,14 @@ def parse(text: str) -> Rule:
     )
     _check_rule(rule)
     return rule
+
+
+def _change_meant(name: str) -> tuple[str, str] | None:
+    """Return the last word after a measure's name, which is no change, and the change that is meant; None else."""
+    measure, _, word = name.rpartition(" ")
+    names = {_plain(each) for known in gate_measures() for each in (known.name, known.quantity.title, *known.also)}
+    near = difflib.get_close_matches(word.lower(), get_args(Change), n=1)
+    return (word, near[0]) if near and _plain(measure) in names and _plain(name) not in names else None
 
 
 def _check_rule(rule: Rule) -> None:

@@ -501,7 +501,9 @@ class FileScene(Scene):
         return read
 
     def _stored_pose(self, source: FrameSource) -> Poses:
-        return read_pose(source.pose_file) if source.pose is None else source.pose
+        """Return the pose (4, 4) as it is stored; NaN where its rotation is zeros: tracking was lost."""
+        stored = read_pose(source.pose_file) if source.pose is None else source.pose
+        return stored if stored[:3, :3].any() else np.full((4, 4), np.nan)
 
     def _color_file(self, source: FrameSource) -> Path | None:
         return source.color if source.color is not None and self._folders.has(source.color) else None

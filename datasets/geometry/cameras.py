@@ -114,13 +114,15 @@ def to_camera_to_world(T: Poses, convention: str, axes: str, where: str) -> Pose
 def from_quaternions(translations: Poses, quaternions: Poses, path: Path) -> Poses:
     """Return (n, 4, 4) of translations (n, 3) and quaternions (n, 4), order x y z w; NaN where one is not finite.
 
+    A quaternion of zeros says that tracking was lost, as one that is not finite does.
+
     Raises:
         DataError: For a quaternion that is not of length 1; the message names the file and the pose, counted from 1.
     """
     from scipy.spatial.transform import Rotation
 
     T = np.full((len(translations), 4, 4), np.nan)
-    finite = np.isfinite(translations).all(axis=1) & np.isfinite(quaternions).all(axis=1)
+    finite = np.isfinite(translations).all(axis=1) & np.isfinite(quaternions).all(axis=1) & quaternions.any(axis=1)
     with np.errstate(over="ignore"):
         lengths = np.linalg.norm(quaternions[finite], axis=1)
     if (wrong := np.abs(lengths - 1) > UNIT_TOLERANCE).any():
