@@ -25,9 +25,9 @@ from semstab.online.summary import Summary
 EXACT = ("vss_op3", "psa_op2", "recurrent_share")
 """What is the same however frames are shared out among processes."""
 
-ABOUT = 0.05
-"""Alpha differs by less: a process asks its own frames at spots that they found, not those of others, so that alpha is
-of other spots, and of the pairs of views within each process alone."""
+ABOUT = 0.08
+"""Alpha differs by less (by .05 in 40 random partitions of ten frames): a process asks its own frames at spots that they
+found, not at the spots of others, so that alpha is of other spots, and of the pairs of views within each process."""
 
 
 @pytest.fixture(scope="module", name="flights")

@@ -17,6 +17,7 @@ from posed_config import configure, dataset_of
 from posed_scene import fails
 
 import semstab
+from semstab.core.files import SEAL, write_sealed
 from semstab.data.frames import Frame, Intrinsics
 from semstab.data.labels import LabelSpace
 from semstab.data.tiles import Tiles
@@ -164,7 +165,10 @@ def test_what_cannot_be_relabelled_is_refused(fused, tmp_path):
     fails(ConfigError, "holds maps that were not predicted here", relabel, fused / "run", tmp_path)
     shutil.copytree(fused / "run", tmp_path / "run")
     manifest = tmp_path / "run/manifest.json"
-    manifest.write_text(manifest.read_text().replace('"scene/a": "', '"scene/a": "other'))
+    edited = manifest.read_text().replace('"scene/a": "', '"scene/a": "other')
+    manifest.write_text(edited)
+    fails(DataError, "has changed since the run wrote it", relabel, tmp_path / "run", tmp_path / "out")
+    write_sealed(manifest, {key: value for key, value in json.loads(edited).items() if key != SEAL})
     fails(DataError, "has changed since it was fused; run it again", relabel, tmp_path / "run", tmp_path / "out")
     # ScanNet's colour camera sees more than its depth camera, and label maps are the colour image's
     labels, color = np.arange(48, dtype=np.uint8).reshape(6, 8) % 3, np.zeros((6, 8, 3), np.uint8)
