@@ -26,8 +26,8 @@ EXACT = ("vss_op3", "psa_op2", "recurrent_share")
 """What is the same however frames are shared out among processes."""
 
 ABOUT = 0.08
-"""Alpha differs by less (by .05 in 40 random partitions of ten frames): a process asks its own frames at spots that they
-found, not at the spots of others, so that alpha is of other spots, and of the pairs of views within each process."""
+"""Alpha differs by less (by .05 in 40 random partitions of ten frames): a process asks its own frames at spots that
+they found, not at others' spots, so that alpha is of other spots, and of the pairs of views within each process."""
 
 
 @pytest.fixture(scope="module", name="flights")

@@ -212,7 +212,7 @@ def root(
 COMMANDS: Mapping[Callable[..., None], tuple[str, str]] = {
     run: ("run --data flight --out now", "run --data flight --model net --frames ::2 --out thinned"),
     study: ("study mine.yaml --out sweep", "study mine.yaml --only voxel_size --jobs 2"),
-    benchmark: ("benchmark city@1 --predict net.py:Net", "benchmark mine@1.yaml --data flight --submit net.semstab"),
+    benchmark: ("benchmark city@1 --predict net.py:Net", "benchmark mine@1.yaml --data flight"),
     predict: (
         "predict --model colour-clusters --data flight", "predict --model net.py:Net --data flight --name mine",
     ),
