@@ -259,7 +259,7 @@ def test_the_tables_of_a_study_have_the_numbers_of_its_units(studied) -> None:
 
 def test_agreement_stands_beside_the_sweep(studied) -> None:
     found, _ = studied
-    rows = [row for row in rows_of(found, "sensitivity_agreement_depth_noise") if row["model"] == "a"]
+    rows = [row for row in rows_of(found, "sensitivity_depth_noise") if row["model"] == "a"]
     (still,), noisy = (found.select("depth_noise", model="a", value=value) for value in (0, 0.05))
     assert rows[0]["psa"] == still.statistics.agreement.psa.value
     alphas = [record.statistics.headline.alpha.value for record in noisy]

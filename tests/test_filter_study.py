@@ -125,7 +125,7 @@ def test_the_folder_and_the_terminal_hold_what_to_use(done):
     table = text[text.index("Use --filter") :]
     assert "ema-warped:0.6" in table
     folder, _ = done
-    rows = json.loads((folder / "out/tables/filters.json").read_text())
+    rows = json.loads((folder / "out/tables/tables.json").read_text())["filters"]
     page = (folder / "out/report.html").read_text()
     assert "Use --filter ema-warped:0.6 over net" in page
     (found,) = filter_studies(load_result(folder / "out"))

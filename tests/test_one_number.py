@@ -106,7 +106,7 @@ def test_tables_have_the_numbers_of_the_record_in_csv_and_json(run, tmp_path):
     }
     for table, named in columns.items():
         rows = rows_of_csv(tmp_path / "tables" / f"{table}.csv")
-        content = json.loads((tmp_path / "tables" / f"{table}.json").read_text(encoding="utf-8"))["rows"]
+        content = json.loads((tmp_path / "tables/tables.json").read_text(encoding="utf-8"))[table]["rows"]
         for record in result.select() if len(result.scenes) == 1 else ():
             numbers = numbers_of(record)
             mine = [row for row in (*rows, *content) if row["model"] == record.unit.model]

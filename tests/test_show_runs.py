@@ -47,8 +47,10 @@ def test_each_model_of_each_run_has_a_row_with_the_numbers_of_its_run(folder) ->
     assert "runs.png" in said
     with Image.open(folder / "all/runs.png") as image:
         assert image.size[0] > 2 * image.size[1] > 100
-    content = json.loads((folder / "all/tables/runs.json").read_text())
-    assert len(content["rows"]) == 4
+    content = json.loads((folder / "all/tables/tables.json").read_text())
+    assert len(content["runs"]["rows"]) == 4
+    bench("show", "fine", "coarse", "--out", "runs.tex", cwd=folder)
+    assert (folder / "runs.tex").read_text().count(r"\toprule") == 1
 
 
 def test_a_folder_above_runs_stands_for_them_and_names_stay_apart(folder) -> None:
@@ -62,6 +64,22 @@ def test_a_folder_above_runs_stands_for_them_and_names_stay_apart(folder) -> Non
     }
 
 
+def test_tables_of_a_run_are_written_on_demand(folder) -> None:
+    before = {path.name for path in (folder / "fine/tables").iterdir()}
+    assert "tables.json" in before
+    assert {name.partition(".")[2] for name in before} == {"csv", "json"}
+    assert "uncertainty.csv" not in before
+    assert bench("show", "fine", "uncertainty", "--out", "u.csv", cwd=folder).stdout == "u.csv\n"
+    assert (folder / "u.csv").read_text().startswith("model,scene,")
+    bench("show", "fine", "classes", "comparison", "--out", "some.md", cwd=folder)
+    assert (folder / "some.md").read_text().count("### ") > 2
+    bench("show", "fine", "--out", "all.tex", cwd=folder)
+    assert (folder / "all.tex").read_text().count(r"\label{tab:") > len(before)
+    bench("show", "fine", "--figures", "png", "--out", "drawn", cwd=folder)
+    assert (folder / "drawn/persistence.png").is_file()
+    assert not (folder / "fine/figures").exists()
+
+
 def test_one_run_and_its_tables_are_as_before(folder) -> None:
     assert "tables  overview" in bench("show", "fine", cwd=folder).stdout
     assert bench("show", "fine", "overview", cwd=folder).stdout.startswith("Overview")
@@ -73,7 +91,8 @@ def test_one_run_and_its_tables_are_as_before(folder) -> None:
         (("fine", "coarse", "overview"), "'overview' is neither a table of several runs nor a folder"),
         (("fine", "wall"), "wall: there is no finished run here; give folders of --out, or the folder above them"),
         (("fine", "./fine"), "fine: is named twice"),
-        (("fine", "--out", "x"), "--out is for the table of several runs"),
+        (("fine", "--out", "x"), "x: tables are written as .csv, .md, .tex, .json"),
+        (("fine", "--out", "x.csv"), "x.csv: a CSV file has one table; choose one of overview"),
         (("wall",), "wall: there is no finished run here"),
     ],
 )  # fmt: skip

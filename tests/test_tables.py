@@ -25,8 +25,20 @@ from semstab.core.files import write_text
 from semstab.data.measures import SBD, VSS
 from semstab.data.records import ImageSpace, RegionFlicker, Result
 from semstab.metrics import entropy, op, sbd, vss
+from semstab.errors import ConfigError
 from semstab.report.means import ENOUGH, Spread, complete_scenes, describe, levels, pooled, swept
-from semstab.report.tables import Column, Group, Table, tables, to_csv, to_json, to_latex, to_markdown, write_tables
+from semstab.report.tables import (
+    Column,
+    Group,
+    Table,
+    save_as,
+    tables,
+    to_csv,
+    to_json,
+    to_latex,
+    to_markdown,
+    write_tables,
+)
 from semstab.report.tables.table import to_terminal
 from semstab.statistics import Estimate
 from semstab.testing import checks
@@ -63,19 +75,18 @@ def test_the_walls_tables_are_as_in_the_golden_file(tables_of_walls, suffix):
 
 def test_a_study_of_everything_has_every_table(tables_of_walls):
     assert [table.name for table in tables_of_walls] == [
-        "overview", "verdicts", "flicker", "flicker_by_scene", "scenes", "persistence", "classes", "temporal_agreement",
+        "overview", "verdicts", "flicker", "scenes", "persistence", "classes", "temporal_agreement",
         "correlogram", "class_agreement", "drift", "frames", "uncertainty", "ceiling", "correctness", "quadrants",
-        "cross_model", "sensitivity_voxel_size",
-        "sensitivity_agreement_voxel_size", "sensitivity_depth_noise", "sensitivity_agreement_depth_noise",
-        "sensitivity_frame_count", "sensitivity_agreement_frame_count", "voxel_sizes", "fusion", "agreement",
+        "cross_model", "sensitivity_voxel_size", "sensitivity_depth_noise", "sensitivity_frame_count", "voxel_sizes",
+        "fusion", "agreement",
     ]  # fmt: skip
 
 
-def test_nothing_has_no_table_and_one_scene_no_total_and_no_second_flicker_table():
+def test_nothing_has_no_table_and_one_scene_no_total():
     assert tables(study()) == []
     found = study(record(voxels((1, 1, SURE))))
     assert [row["scene"] for row in rows_of(found, "scenes")] == ["s"]
-    assert "flicker_by_scene" not in [table.name for table in tables(found)]
+    assert [row["scene"] for row in rows_of(found, "flicker")] == ["s"]
 
 
 def test_drift_that_few_places_tell_of_is_not_shown(walls):
@@ -157,25 +168,27 @@ def test_a_comparison_needs_one_taxonomy_and_two_models():
     assert {row["voxels"] for row in rows[::3]} == {7}
 
 
-def test_flicker_is_the_macro_mean_of_the_scenes_and_regions_stand_in_its_tables_only():
+def test_flicker_has_the_macro_mean_of_the_scenes_and_regions_are_in_its_table_only():
     images = (ImageSpace(20.0, 8.0, 0.5, 0.9), ImageSpace(30.0, math.nan, 0.7, 0.8))
     found = study(*(record(voxels((1, 1, SURE)), scene=f"s{k}", image_space=image) for k, image in enumerate(images)))
-    (row,) = rows_of(found, "flicker")
+    *scenes, row = rows_of(found, "flicker")
+    assert [(of["scene"], of["flicker_percent"]) for of in scenes] == [("s0", 20), ("s1", 30)]
+    assert row["scene"] == "Mean"
     assert row["flicker_percent"] == 25
     assert row["compensated_flicker_percent"] == 8
     assert row["compensated_share_percent"] == pytest.approx(60)
     assert row["vc8"] == pytest.approx(0.85)
     assert math.isnan(row["vc16"])
-    assert [row["scene"] for row in rows_of(found, "flicker_by_scene")] == ["s0", "s1"]
     found = study(
         record(voxels((1, 1, SURE)), image_space=ImageSpace(20.0, 8.0, 0.5)),
         regions=(RegionFlicker("s", "raw SAM", 21.64, 10.0, 0.5), RegionFlicker("t", "raw SAM", 23.0, math.nan, 0.7)),
     )
-    row = rows_of(found, "flicker")[1]
-    assert (row["method"], row["flicker_percent"], row["compensated_flicker_percent"]) == ("raw SAM", 22.32, 10.0)
+    rows = rows_of(found, "flicker")
+    assert [row["scene"] for row in rows] == ["s", "s", "t", "Mean"]
+    row = rows[-1]
+    assert (row["model"], row["flicker_percent"], row["compensated_flicker_percent"]) == ("raw SAM", 22.32, 10.0)
     assert math.isnan(row["vc8"])
     assert "raw SAM" in table_of(found, "flicker").caption
-    assert [row["scene"] for row in rows_of(found, "flicker_by_scene")] == ["s", "s", "t"]
     assert "raw SAM" not in {row["model"] for row in rows_of(found, "scenes")}
 
 
@@ -322,14 +335,32 @@ def test_latex_compiles_without_overfull_lines(tables_of_walls, tmp_path):
     assert not [points for points in wide if int(points) > 5]
 
 
-def test_tables_are_written_in_four_formats(walls, tmp_path):
+def test_a_run_writes_a_dozen_tables_as_csv_and_all_of_them_as_json(walls, tmp_path):
     write_text(tmp_path / "tables/of_a_dropped_sweep.csv", "")
     paths = write_tables(walls, tmp_path)
     assert sorted(paths) == sorted((tmp_path / "tables").iterdir())
-    assert {path.suffix for path in paths} == {".csv", ".md", ".tex", ".json"}
-    content = json.loads((tmp_path / "tables" / "persistence.json").read_text())
-    assert content["rows"][0]["persistence"] == "OP=1"
-    assert content["rows"][0]["sbd"] is None
+    *texts, content = paths
+    assert len(texts) == 12 < len(tables(walls))
+    assert [path.suffix for path in texts] == [".csv"] * 12
+    found = json.loads(content.read_text())
+    assert [*found] == [path.stem for path in texts]
+    assert {"overview", "verdicts", "classes", "frames"} <= found.keys()
+    assert found["persistence"]["rows"][0]["persistence"] == "OP=1"
+    assert found["persistence"]["rows"][0]["sbd"] is None
+
+
+def test_tables_are_written_on_demand_in_the_format_of_the_suffix(walls, tmp_path):
+    made = [table_of(walls, name) for name in ("overview", "drift")]
+    for suffix, write in WRITERS.items():
+        path = tmp_path / f"one.{suffix}"
+        assert save_as(made[:1], path) == path
+        assert path.read_text(encoding="utf-8") == write(made[0])
+    assert save_as(made, tmp_path / "both.tex").read_text().count(r"\begin{table") == 2
+    assert [*json.loads(save_as(made, tmp_path / "both.json").read_text())] == ["overview", "drift"]
+    for name, said in {"both.csv": "choose one of overview, drift", "x.xlsx": ".csv, .md, .tex, .json"}.items():
+        with pytest.raises(ConfigError, match=re.escape(said)):
+            save_as(made, tmp_path / name)
+        assert not (tmp_path / name).exists()
 
 
 def test_print_leaves_out_columns_without_a_value_and_files_keep_them():

@@ -95,7 +95,7 @@ def test_a_run_writes_what_it_found(tmp_path) -> None:
     assert {record["model"] for record in summary["records"]} == {"right", "flips"}
     assert (out / "summary.json").stat().st_size < 10_000
     assert (out / "tables/flicker.csv").read_text().count("\n") == 3
-    assert {path.stem for path in (out / "tables").glob("*.md")} == {"flicker", "frames", "video_measures"}
+    assert {path.stem for path in (out / "tables").glob("*.csv")} == {"flicker", "frames", "video_measures"}
     page = (out / "report.html").read_text()
     assert "Least flicker first" in page
     assert "flips, 0005: alone at" in page

@@ -8,12 +8,15 @@ import sys
 import textwrap
 from enum import StrEnum
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from semstab.cli.options import OwnCode, own_defaults, print_lines, say
 from semstab.errors import ConfigError, DataError
+
+if TYPE_CHECKING:
+    from semstab.report.tables import Table
 
 
 class FigureFormat(StrEnum):
@@ -32,7 +35,9 @@ def show(
     what: Annotated[list[str] | None, typer.Argument(
         metavar="[RUN|TABLE]...", help="Further runs, for one table of all; or tables, by the beginning of their names."
     )] = None,
-    out: Annotated[Path | None, typer.Option(help="Write the table of several runs and a figure here.")] = None,
+    out: Annotated[Path | None, typer.Option(
+        help="Write the tables into this file: .csv, .json, .md or .tex; or figures, or several runs, into this folder."
+    )] = None,
     figures: Annotated[FigureFormat | None, typer.Option(help="Draw the figures for a paper into RUN/figures.")] = None,
 ) -> None:  # fmt: skip
     """Print the answer of a finished run, or its tables, without computing; of several runs one table of all."""
@@ -40,7 +45,7 @@ def show(
     from semstab.data.records import is_run
     from semstab.engine.folder import load_result
     from semstab.report.comparison.own_models import own_models
-    from semstab.report.tables import tables
+    from semstab.report.tables import save_as, tables
     from semstab.report.tables.table import to_terminal
     from semstab.report.terminal import failure_lines, print_answer
 
@@ -48,8 +53,6 @@ def show(
     if further or (run.is_dir() and not is_run(run)):
         _show_several(run, further, [word for word in what or () if Path(word) not in further], out, figures)
         return
-    if out is not None:
-        raise ConfigError("--out is for the table of several runs; the tables of one are in its folder")
     result = load_result(run)
     for line in failure_lines(result):
         say(f"failed: {line}")
@@ -61,16 +64,21 @@ def show(
     if figures is not None:
         from semstab.report.figures import write_figures
 
-        print_lines(map(str, write_figures(result, run, svg=figures is FigureFormat.svg)))
-    elif not what:
+        print_lines(map(str, write_figures(result, run, out, svg=figures is FigureFormat.svg)))
+    elif not what and out is None:
         print_answer(result, Console(), out=run)
         listed = f"tables  {', '.join([*by_name, COMPARISON] if len(result.models) > 1 else by_name)}"
         print_lines(textwrap.wrap(listed, 80, initial_indent="  ", subsequent_indent=" " * 10))
+    chosen: dict[str, Table] = {}
     for name in what or ():
-        matching = [table for key, table in by_name.items() if key.startswith(name)]
+        matching = {key: table for key, table in by_name.items() if key.startswith(name)}
         if not matching:
             raise ConfigError(f"{run}: no table '{name}'; the tables are {', '.join(by_name)}")
-        print_lines(f"{to_terminal(table)}\n" for table in matching)
+        chosen |= {name: matching[name]} if out is not None and name in matching else matching
+    if out is not None and figures is None:
+        print_lines([str(save_as([*(chosen if what else by_name).values()], out))])
+    else:
+        print_lines(f"{to_terminal(table)}\n" for table in chosen.values())
 
 
 def _show_several(
@@ -78,7 +86,7 @@ def _show_several(
 ) -> None:
     """Print one table of several runs, and write it with its figure where that is wanted."""
     from semstab.report.figures.runs import runs_figure
-    from semstab.report.tables import save_tables
+    from semstab.report.tables import FORMATS, save_as, save_tables
     from semstab.report.tables.runs import found_runs, runs_table
     from semstab.report.tables.table import to_terminal
 
@@ -87,7 +95,9 @@ def _show_several(
     results = found_runs([run, *further])
     table = runs_table(results)
     print_lines([to_terminal(table)])
-    if out is not None:
+    if out is not None and out.suffix in FORMATS:
+        print_lines([str(save_as([table], out))])
+    elif out is not None:
         written = save_tables([table], out)
         print_lines(map(str, [*written, *runs_figure(results).save(out, svg=figures is FigureFormat.svg)]))
 

@@ -32,15 +32,16 @@ if TYPE_CHECKING:
 __all__ = ["Figure", "Views", "figures", "write_figures"]
 
 
-def write_figures(result: Result, folder: str | Path, *, svg: bool = False) -> list[Path]:
-    """Write FOLDER/figures/NAME.png, and .svg on request, for every figure that the result has records for.
+def write_figures(result: Result, folder: str | Path, out: Path | None = None, *, svg: bool = False) -> list[Path]:
+    """Write OUT/NAME.png, and .svg on request, for every figure that the result has records for; return the paths.
 
-    Figures that are there already are removed. Returns the paths.
+    Without `out` they are written into FOLDER/figures, where earlier figures are removed.
     """
-    target = Path(folder) / "figures"
+    target = out or Path(folder) / "figures"
     drawn = sorted(figures(result, folder), key=lambda figure: figure.unit)  # those of a unit read its voxels once
     written = [path for figure in drawn for path in figure.save(target, svg=svg)]
-    keep_only(written, target)
+    if out is None:
+        keep_only(written, target)
     return written
 
 

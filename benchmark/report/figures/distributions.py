@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass
 from functools import reduce
 from typing import TYPE_CHECKING
 
@@ -27,6 +26,9 @@ if TYPE_CHECKING:
 BINS = 1000
 """The number of bins of a measure between 0 and its largest value; a further bin, the first, holds 0 alone."""
 
+EDGES = np.append(-1.0, np.arange(BINS + 1) / BINS + 1e-9)
+"""The ends of these bins, as shares of the largest value."""
+
 
 def _op_bounds() -> Int64:
     """Return the lowest OP of each bin: single values up to 8, then steps of about a quarter."""
@@ -38,77 +40,46 @@ def _op_bounds() -> Int64:
 
 OP_BOUNDS = _op_bounds()
 
-
-@dataclass(frozen=True, eq=False)
-class MeasureByOP:
-    """A measure's voxels by OP and value: counts (OP bins, 1 + BINS), sums (OP bins,); `largest` ends the last bin.
-
-    The values are distances from the best value: 1 - VSS for a measure that is better when high.
-    """
-
-    counts: Int64
-    sums: Float64
-    largest: float
-
-    @classmethod
-    def of(cls, values: Float64, bins: Int64, largest: float) -> MeasureByOP:
-        """Return the histogram of values (n,) in OP bins (n,); undefined values do not count."""
-        defined = ~np.isnan(values)
-        values, bins = values[defined], bins[defined]
-        column = np.ceil(values / largest * BINS - 1e-6).clip(0, BINS).astype(np.int64)
-        cells = np.bincount(bins * (BINS + 1) + column, minlength=len(OP_BOUNDS) * (BINS + 1))
-        sums = np.bincount(bins, weights=values, minlength=len(OP_BOUNDS)).astype(np.float64)
-        return cls(cells.reshape(len(OP_BOUNDS), BINS + 1), sums, largest)
-
-    def __add__(self, other: MeasureByOP) -> MeasureByOP:
-        return MeasureByOP(self.counts + other.counts, self.sums + other.sums, self.largest)
-
-    @property
-    def values(self) -> Float64:
-        """Return (1 + BINS,) the upper end of each bin."""
-        return np.arange(BINS + 1) / BINS * self.largest
-
-    @property
-    def voxels(self) -> Int64:
-        """Return (OP bins,) the number of voxels where the measure is defined."""
-        total: Int64 = self.counts.sum(axis=1)
-        return total
-
-    def ecdf(self, lowest_op: int = 1) -> Float64:
-        """Return (1 + BINS,) the share of the voxels with at least that OP whose value is at most that of the bin."""
-        counts = self.counts[np.searchsorted(OP_BOUNDS, lowest_op) :].sum(axis=0)
-        share: Float64 = counts.cumsum() / max(1, counts.sum())
-        return share
-
-    def mean(self) -> Float64:
-        """Return (OP bins,) the mean by OP; NaN where there are no voxels."""
-        mean: Float64 = np.where(self.voxels > 0, self.sums / np.maximum(1, self.voxels), np.nan)
-        return mean
-
-    def quantile(self, q: float) -> Float64:
-        """Return (OP bins,) the value that a share q of the voxels does not exceed, by OP; NaN where there are none."""
-        reached = self.counts.cumsum(axis=1) >= q * self.voxels[:, None]
-        return np.where(self.voxels > 0, self.values[reached.argmax(axis=1)], np.nan)
+Histograms = Mapping[Measure, Float64]
+"""Counts (OP bins, 1 + BINS) of the voxels of a unit, or of several, by OP and distance from a measure's best value."""
 
 
-Histograms = Mapping[str, MeasureByOP]
-"""The histogram of each measure, by its key, of the voxels of a unit or of several units together."""
-
-
-def lacking(measure: Measure, value: Float64) -> Float64:
+def distance(measure: Measure, value: Float64) -> Float64:
     """Return the distance of values from the best value; applied twice it returns the values."""
     return value if measure.better == "lower" else measure.largest - value
 
 
 def histograms(table: VoxelTable) -> Histograms:
-    """Return the histograms of a unit."""
-    bins = np.searchsorted(OP_BOUNDS, op(table), side="right") - 1
-    return {m.key: MeasureByOP.of(lacking(m, m.of(table)), bins, m.largest) for m in measures()}
+    """Return the histograms of a unit, without undefined values."""
+    seen, bounds = op(table), np.append(OP_BOUNDS, np.inf)
+    shares = {m: distance(m, m.of(table)) / m.largest for m in measures()}
+    return {m: np.histogram2d(seen, share, [bounds, EDGES])[0] for m, share in shares.items()}
 
 
 def together(units: Iterable[Histograms]) -> Histograms:
     """Return the voxels of several units pooled."""
-    return reduce(lambda a, b: {key: one + b[key] for key, one in a.items()}, units)
+    return reduce(lambda a, b: {measure: one + b[measure] for measure, one in a.items()}, units)
+
+
+def upper_ends(measure: Measure) -> Float64:
+    """Return (1 + BINS,) the upper ends of the bins."""
+    return np.arange(BINS + 1) / BINS * measure.largest
+
+
+def ecdf(counts: Float64, lowest_op: int = 1) -> Float64:
+    """Return (1 + BINS,) the share of the voxels with at least that OP whose value is at most the bin's upper end."""
+    sums = counts[np.searchsorted(OP_BOUNDS, lowest_op) :].sum(axis=0)
+    share: Float64 = sums.cumsum() / max(1, sums.sum())
+    return share
+
+
+def by_op(measure: Measure, counts: Float64) -> tuple[Float64, Float64, Float64]:
+    """Return mean and quartiles of the values (OP bins,), half a bin too far off at most; NaN without voxels."""
+    voxels, ends = counts.sum(axis=1), upper_ends(measure)
+    middles = np.append(0.0, (ends[1:] + ends[:-1]) / 2)
+    mean = counts @ middles / np.where(voxels > 0, voxels, np.nan)
+    low, high = (ends[(counts.cumsum(axis=1) >= q * voxels[:, None]).argmax(axis=1)] for q in (0.25, 0.75))
+    return distance(measure, mean), distance(measure, low), distance(measure, high)
 
 
 def op_position() -> Float64:
@@ -123,7 +94,7 @@ INFORMATIVE = 0.99
 """The axes of the ECDFs end where this share of the voxels of every curve is reached."""
 
 
-def draw_ecdf(scenes: Mapping[str, Histograms], ends: Mapping[str, float]) -> Figure:
+def draw_ecdf(scenes: Mapping[str, Histograms], ends: Mapping[Measure, float]) -> Figure:
     """Return the ECDF of each measure's distance from the best value, in each scene and in all recurrent voxels.
 
     `ends` are the ends of the x axes.
@@ -133,12 +104,10 @@ def draw_ecdf(scenes: Mapping[str, Histograms], ends: Mapping[str, float]) -> Fi
     panels = figure.subplots(math.ceil(len(shown) / 2), 2, squeeze=False).ravel()
     everything = together(scenes.values())
     for axes, letter, measure in zip(panels, LETTERS, shown, strict=False):
-        _draw_curves(
-            axes, {name: histograms[measure.key] for name, histograms in scenes.items()}, everything[measure.key]
-        )
+        _draw_curves(axes, measure, {name: counts[measure] for name, counts in scenes.items()}, everything[measure])
         label = measure.title if measure.better == "lower" else f"{measure.largest:g} - {measure.title}"
         unit = f" ({measure.unit})" if measure.unit else ""
-        axes.set(xlabel=label + unit, ylabel="share of voxels", xlim=(0, 1.03 * ends[measure.key]), ylim=(0.0, 1.02))
+        axes.set(xlabel=label + unit, ylabel="share of voxels", xlim=(0, 1.03 * ends[measure]), ylim=(0.0, 1.02))
         mark_panel(axes, letter, f"{label}, voxels with OP ≥ {measure.lowest_op}" if measure.lowest_op > 1 else label)
     for axes in panels[len(shown) :]:
         axes.set_axis_off()
@@ -147,33 +116,25 @@ def draw_ecdf(scenes: Mapping[str, Histograms], ends: Mapping[str, float]) -> Fi
     return figure
 
 
-def _draw_curves(axes: Axes, scenes: Mapping[str, MeasureByOP], everything: MeasureByOP) -> None:
+def _draw_curves(axes: Axes, measure: Measure, scenes: Mapping[str, Float64], everything: Float64) -> None:
     """Draw one curve a scene, and a dashed one of all recurrent voxels, where there are any."""
-    for k, (name, histogram) in enumerate(scenes.items()):
-        axes.step(histogram.values, histogram.ecdf(), where="post", color=color(k), label=f"{name}, all voxels")
-    recurrent = everything.ecdf(RECURRENT)
+    ends = upper_ends(measure)
+    for k, (name, counts) in enumerate(scenes.items()):
+        axes.step(ends, ecdf(counts), where="post", color=color(k), label=f"{name}, all voxels")
+    recurrent = ecdf(everything, RECURRENT)
     if recurrent[-1]:
-        axes.step(
-            everything.values,
-            recurrent,
-            "k--",
-            where="post",
-            linewidth=1.0,
-            label="voxels with OP ≥ 3" + (", all scenes" if len(scenes) > 1 else ""),
-        )
+        label = "voxels with OP ≥ 3" + (", all scenes" if len(scenes) > 1 else "")
+        axes.step(ends, recurrent, "k--", where="post", linewidth=1.0, label=label)
 
 
-def informative(units: Iterable[Histograms]) -> dict[str, float]:
+def informative(units: Iterable[Histograms]) -> dict[Measure, float]:
     """Return the end of the x axis of each measure, so that every scene's curve is seen up to its last percent."""
-
-    def end(histogram: MeasureByOP) -> float:
-        reached = histogram.ecdf() >= INFORMATIVE
-        return float(histogram.values[reached.argmax()]) if reached.any() else histogram.largest
-
-    ends: dict[str, float] = {}
+    ends: dict[Measure, float] = {}
     for scene in units:
-        for key, histogram in scene.items():
-            ends[key] = max(ends.get(key, 0.06 * histogram.largest), end(histogram))
+        for measure, counts in scene.items():
+            reached = ecdf(counts) >= INFORMATIVE
+            end = float(upper_ends(measure)[reached.argmax()]) if reached.any() else measure.largest
+            ends[measure] = max(ends.get(measure, 0.06 * measure.largest), end)
     return ends
 
 
@@ -203,13 +164,11 @@ def draw_persistence(models: Mapping[str, Histograms]) -> Figure:
 
 
 def _draw_column(rows: Panels, histograms: Histograms, shade: str) -> None:
-    voxels = next(iter(histograms.values())).voxels
+    voxels = next(iter(histograms.values())).sum(axis=1)
     present = voxels > 0
     x, few = op_position()[present], voxels[present] < ENOUGH
     for axes, measure in zip(rows[:-1], measures(), strict=True):
-        histogram = histograms[measure.key]
-        curves = (histogram.mean(), histogram.quantile(0.25), histogram.quantile(0.75))
-        mean, *ends = (lacking(measure, curve[present]) for curve in curves)
+        mean, *ends = (curve[present] for curve in by_op(measure, histograms[measure]))
         axes.fill_between(x, *ends, color=shade, alpha=0.2, linewidth=0.8)
         axes.plot(x, mean, color=shade, marker="o", markersize=3)
         axes.plot(x[few], mean[few], color=shade, marker="o", markersize=3, markerfacecolor="white", linewidth=0)

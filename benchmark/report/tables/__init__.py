@@ -1,4 +1,4 @@
-"""Make the study's tables: CSV, Markdown and LaTeX are rounded as in the paper, JSON has full precision."""
+"""Make the tables of a run or a study: CSV, Markdown and LaTeX are rounded as in the paper, JSON has full precision."""
 
 from __future__ import annotations
 
@@ -8,6 +8,7 @@ from pathlib import Path
 
 from semstab.core.files import keep_only, write_json, write_text
 from semstab.data.records import Result
+from semstab.errors import ConfigError
 from semstab.report.filter_study import of_interest
 from semstab.report.tables.backends import agreement, compared, fusion
 from semstab.report.tables.correctness import ceiling, correctness, correlogram
@@ -29,10 +30,12 @@ from semstab.report.tables.table import TEXT_WRITERS, Cell, Column, Group, Table
 from semstab.report.tables.video_measures import video_measures
 
 __all__ = [
+    "FORMATS",
     "Cell",
     "Column",
     "Group",
     "Table",
+    "save_as",
     "save_tables",
     "tables",
     "to_csv",
@@ -49,6 +52,18 @@ BUILDERS = (
 )  # fmt: skip
 """The functions that make tables, in the paper's order; without numbers for its tables a function returns none."""
 
+WRITTEN = (
+    "filters", "findings", "overview", "verdicts", "scenes", "persistence", "classes", "class_agreement",
+    "temporal_agreement", "flicker", "ranges", "frames", "correctness", "video_measures", "sensitivity", "fusion",
+    "agreement",
+)  # fmt: skip
+"""The beginnings of the names of the tables that a run writes, the most wanted first; `show` has the others."""
+
+MOST_WRITTEN = 12
+
+FORMATS = (*(f".{suffix}" for suffix in TEXT_WRITERS), ".json")
+"""The suffixes of files that hold tables."""
+
 
 def tables(result: Result) -> list[Table]:
     """Return every table that the study has records for, in the paper's order."""
@@ -61,19 +76,34 @@ def tables(result: Result) -> list[Table]:
 
 
 def write_tables(result: Result, folder: str | Path) -> list[Path]:
-    """Write FOLDER/tables/NAME.{csv,md,tex,json} for every table, remove all other tables; return the paths."""
-    return save_tables(tables(result), folder)
+    """Write the tables that users of a run open, at most MOST_WRITTEN, as `save_tables` does; return the paths."""
+    made = tables(result)
+    wanted = dict.fromkeys(table.name for name in WRITTEN for table in made if table.name.startswith(name))
+    names = [*wanted][:MOST_WRITTEN]
+    return save_tables([table for table in made if table.name in names], folder)
 
 
 def save_tables(made: Sequence[Table], folder: str | Path) -> list[Path]:
-    """Write tables that are made already, as `write_tables` does; return the paths."""
-    written = []
-    for table in made:
-        stem = Path(folder) / "tables" / table.name
-        for suffix, write in TEXT_WRITERS.items():
-            written.append(stem.with_suffix(f".{suffix}"))
-            write_text(written[-1], write(table))
-        written.append(stem.with_suffix(".json"))
-        write_json(written[-1], to_json(table))
-    keep_only(written, Path(folder) / "tables")
+    """Write FOLDER/tables/NAME.csv of each table, and tables.json with all; remove other tables; return the paths."""
+    target = Path(folder) / "tables"
+    written = [save_as([table], target / f"{table.name}.csv") for table in made]
+    written.append(save_as(made, target / "tables.json"))
+    keep_only(written, target)
     return written
+
+
+def save_as(made: Sequence[Table], path: Path) -> Path:
+    """Write tables into one file, in the format of its suffix: .csv (one table), .json (by name), .md, .tex.
+
+    Raises:
+        ConfigError: If there is no such format, or several tables in a CSV file.
+    """
+    if path.suffix not in FORMATS:
+        raise ConfigError(f"{path}: tables are written as {', '.join(FORMATS)}")
+    if path.suffix == ".csv" and len(made) != 1:
+        raise ConfigError(f"{path}: a CSV file has one table; choose one of {', '.join(table.name for table in made)}")
+    if path.suffix == ".json":
+        write_json(path, {table.name: to_json(table) for table in made})
+    else:
+        write_text(path, "\n".join(map(TEXT_WRITERS[path.suffix[1:]], made)))
+    return path

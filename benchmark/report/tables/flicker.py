@@ -48,20 +48,16 @@ def flicker_tables(methods: Mapping[str, Mapping[str, ImageSpace]], what: str) -
     """Return flicker of each model by scene, and of all scenes; `what` explains the numbers."""
     if not methods:
         return []
-    macro = tuple((name, *_numbers(scenes.values())) for name, scenes in methods.items())
-    columns, caption = (
-        (Column("method", "Method"), *_NUMBERS),
-        f"{what} The numbers are macro means: each scene counts once.",
-    )
-    tables = [Table("flicker", "Flicker in image space", caption, columns, (Group("", macro),), by="")]
-    if any(len(scenes) > 1 for scenes in methods.values()):
-        groups = tuple(
-            Group(name, tuple((scene, *_numbers([numbers])) for scene, numbers in scenes.items()))
-            for name, scenes in methods.items()
+    groups = tuple(
+        Group(
+            name,
+            tuple((scene, *_numbers([numbers])) for scene, numbers in scenes.items()),
+            ("Mean", *_numbers(scenes.values())) if len(scenes) > 1 else None,
         )
-        columns = (Column("scene", "Scene"), *_NUMBERS)
-        tables.append(Table("flicker_by_scene", "Flicker in image space, by scene", what, columns, groups))
-    return tables
+        for name, scenes in methods.items()
+    )
+    caption = f"{what} The mean is a macro mean: each scene counts once."
+    return [Table("flicker", "Flicker in image space", caption, (Column("scene", "Scene"), *_NUMBERS), groups)]
 
 
 def _by_method(result: Result) -> dict[str, dict[str, ImageSpace]]:

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 
 from semstab.data.measures import VSS, measures
 from semstab.data.records import Record, Result
 from semstab.report.means import (
     ENOUGH,
     Level,
+    Pooled,
     Sweep,
     by_model,
     complete_scenes,
@@ -25,12 +27,31 @@ from semstab.statistics.agreement import ALPHA, PSA, VOXEL_ALPHA
 
 
 def sensitivity(result: Result) -> list[Table]:
-    """Return one table for each sweep (paper, Sensitivity to World-Space Association), and one with agreement."""
-    pairs = [(_table(result, sweep), _agreement_table(result, sweep)) for sweep in swept(result)]
-    return [table for pair in pairs for table in pair if table is not None]
+    """Return one table for each sweep (paper, Sensitivity to World-Space Association)."""
+    return [_table(result, sweep) for sweep in swept(result)]
+
+
+AGREEMENT = (
+    " PSA, alpha and SBD excess are macro means of the scenes, of the voxels seen twice or more. PSA is the share of"
+    " pairs of frames that agree about a voxel. Alpha is the agreement of two views at the same spot beyond chance. SBD"
+    " excess is SBD minus the SBD of the same observations in random order (bits). These three do not depend on how"
+    " often a voxel was seen, but the set of voxels seen twice changes along the sweep."
+)
+_AGREEMENT: tuple[Callable[[Pooled], float], ...] = (
+    lambda p: p.psa.value,
+    lambda p: p.alpha.value,
+    lambda p: p.excess_drift,
+)
 
 
 def _table(result: Result, sweep: Sweep) -> Table:
+    models = [name for name in result.models if complete_scenes(result, sweep.name, name)]
+    by_model = {name: levels(result, sweep.name, name) for name in models}
+    assessed = any(level.assessed for of_model in by_model.values() for level in of_model)
+    agreement = (
+        *(Column.of(quantity, compared=True) for quantity in (PSA, ALPHA)),
+        Column("sbd_excess", "SBD excess", 4, signed=True),
+    )
     columns = (
         Column("value", sweep.header),
         Column("repeats", "Repeats", 0),
@@ -39,11 +60,12 @@ def _table(result: Result, sweep: Sweep) -> Table:
         Column("recurrent_percent", "OP>=3 (%)", 2),
         *of_measures(compared=True, over="All voxels"),
         *of_measures(compared=True, suffix="_op3", over="OP>=3"),
+        *(agreement if assessed else ()),
         Column("note", "Note"),
     )
-    models = [name for name in result.models if complete_scenes(result, sweep.name, name)]
     groups = tuple(
-        Group(name, tuple(_sweep_row(sweep, level) for level in levels(result, sweep.name, name))) for name in models
+        Group(name, tuple(_sweep_row(sweep, level, assessed=assessed) for level in of_model))
+        for name, of_model in by_model.items()
     )
     scenes = dict.fromkeys(scene for name in models for scene in complete_scenes(result, sweep.name, name))
     caption = (
@@ -51,10 +73,12 @@ def _table(result: Result, sweep: Sweep) -> Table:
         f" standard deviation over the repeats, each with a seed of its own. {SBD_OVER} The note 'few' marks fewer than"
         f" {ENOUGH:,} recurrent voxels."
     )
+    if assessed:
+        caption += AGREEMENT
     return Table(f"sensitivity_{sweep.name}", f"Sensitivity to {sweep.title}", caption, columns, groups)
 
 
-def _sweep_row(sweep: Sweep, level: Level) -> Row:
+def _sweep_row(sweep: Sweep, level: Level, *, assessed: bool) -> Row:
     spread = level.spread if len(level.repeats) > 1 else level.mean
     return (
         sweep.text(level.value),
@@ -64,45 +88,8 @@ def _sweep_row(sweep: Sweep, level: Level) -> Row:
         spread(lambda p: 100 * p.recurrent.share),
         *(spread(over_all(measure)) for measure in measures()),
         *(spread(over_recurrent(measure)) for measure in measures()),
+        *([spread(take) for take in _AGREEMENT] if assessed else []),
         "" if level.mean(lambda p: p.recurrent.voxels) >= ENOUGH else "few",
-    )
-
-
-def _agreement_table(result: Result, sweep: Sweep) -> Table | None:
-    """Return the table of agreement; None where the units have no statistics."""
-    columns = (
-        Column("value", sweep.header),
-        Column("mean_op", "Mean OP", 2),
-        Column("vss", "VSS, all voxels", VSS.digits[1], VSS.better),
-        *(Column.of(quantity, compared=True) for quantity in (PSA, ALPHA)),
-        Column("sbd_excess", "SBD excess", 4, signed=True),
-    )
-    by_model = {name: levels(result, sweep.name, name) for name in result.models}
-    known = {name: rows for name, rows in by_model.items() if any(level.assessed for level in rows)}
-    if not known:
-        return None
-    groups = tuple(Group(name, tuple(_agreement_row(sweep, level) for level in rows)) for name, rows in known.items())
-    caption = (
-        "VSS is pooled over the voxels of all scenes. The other numbers are of the voxels seen twice or more, and are"
-        " macro means of the scenes. PSA is the share of pairs of frames that agree about a voxel. Alpha is the"
-        " agreement of two views at the same spot beyond chance. SBD excess is SBD less that of the same observations"
-        " in random order (bits), over the voxels where that is known. These three do not depend on how often a voxel"
-        " was seen, but the set of voxels seen twice changes along the sweep. ± is the standard deviation over the"
-        " repeats."
-    )
-    title = f"Agreement against {sweep.title}"
-    return Table(f"sensitivity_agreement_{sweep.name}", title, caption, columns, groups)
-
-
-def _agreement_row(sweep: Sweep, level: Level) -> Row:
-    spread = level.spread if len(level.repeats) > 1 else level.mean
-    return (
-        sweep.text(level.value),
-        level.mean(lambda p: p.mean_op),
-        spread(over_all(VSS)),
-        spread(lambda p: p.psa.value),
-        spread(lambda p: p.alpha.value),
-        spread(lambda p: p.excess_drift),
     )
 
 
