@@ -30,7 +30,7 @@ def run(
     """Fuse, measure and compare what the configuration selects, without printing; it may be a dict or a YAML file.
 
     A folder `out`, whose finished units of an earlier start are reused, gets the summary, voxels, time series and,
-    unless `report` is False, tables, figures and report.html.
+    unless `report` is False, tables and report.html.
 
     Args:
         config: Settings, or a YAML file with them.
@@ -38,7 +38,7 @@ def run(
         executor: Executor of the work; this process by default.
         observers: Objects that are notified of each step.
         command: The command line, for the manifest.
-        report: Whether tables, figures and report.html are written.
+        report: Whether tables and report.html are written.
         overwrite: Whether the results of another run in the folder may be replaced.
 
     Returns:
@@ -88,7 +88,7 @@ def run_study(
         executor: Executor of the work; this process by default.
         observers: Objects that are notified of each step.
         command: The command line, for the manifest.
-        report: Whether tables, figures and report.html are written.
+        report: Whether tables and report.html are written.
         overwrite: Whether the results of another run in the folder may be replaced.
 
     Returns:

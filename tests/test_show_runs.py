@@ -65,19 +65,21 @@ def test_a_folder_above_runs_stands_for_them_and_names_stay_apart(folder) -> Non
 
 
 def test_tables_of_a_run_are_written_on_demand(folder) -> None:
-    before = {path.name for path in (folder / "fine/tables").iterdir()}
+    bench("--data", "wall", "--voxel-size", 0.2, "--out", "whole", cwd=folder, report=True)
+    before = {path.name for path in (folder / "whole/tables").iterdir()}
+    assert len([path for path in (folder / "whole").rglob("*") if path.is_file()]) <= 40
     assert "tables.json" in before
     assert {name.partition(".")[2] for name in before} == {"csv", "json"}
     assert "uncertainty.csv" not in before
-    assert bench("show", "fine", "uncertainty", "--out", "u.csv", cwd=folder).stdout == "u.csv\n"
+    assert bench("show", "whole", "uncertainty", "--out", "u.csv", cwd=folder).stdout == "u.csv\n"
     assert (folder / "u.csv").read_text().startswith("model,scene,")
-    bench("show", "fine", "classes", "comparison", "--out", "some.md", cwd=folder)
+    bench("show", "whole", "classes", "comparison", "--out", "some.md", cwd=folder)
     assert (folder / "some.md").read_text().count("### ") > 2
-    bench("show", "fine", "--out", "all.tex", cwd=folder)
+    bench("show", "whole", "--out", "all.tex", cwd=folder)
     assert (folder / "all.tex").read_text().count(r"\label{tab:") > len(before)
-    bench("show", "fine", "--figures", "png", "--out", "drawn", cwd=folder)
+    bench("show", "whole", "--figures", "png", "--out", "drawn", cwd=folder)
     assert (folder / "drawn/persistence.png").is_file()
-    assert not (folder / "fine/figures").exists()
+    assert not (folder / "whole/figures").exists()
 
 
 def test_one_run_and_its_tables_are_as_before(folder) -> None:

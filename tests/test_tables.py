@@ -24,8 +24,8 @@ from semstab.config import BACKENDS, SHARED
 from semstab.core.files import write_text
 from semstab.data.measures import SBD, VSS
 from semstab.data.records import ImageSpace, RegionFlicker, Result
-from semstab.metrics import entropy, op, sbd, vss
 from semstab.errors import ConfigError
+from semstab.metrics import entropy, op, sbd, vss
 from semstab.report.means import ENOUGH, Spread, complete_scenes, describe, levels, pooled, swept
 from semstab.report.tables import (
     Column,

@@ -103,36 +103,6 @@ def dot_chart(rows: Mapping[str, Sequence[tuple[int, str, Estimate]]], x_label: 
     return _svg(parts, height, x_label)
 
 
-POINTS_HEIGHT, LABEL = 320, 13
-"""Height of a chart of points, and the least height between the names of two of them."""
-
-
-def point_chart(points: Sequence[tuple[str, float, Estimate]], x_label: str, y_label: str) -> str:
-    """Return a chart of named points, (name, x, y with its interval) each; those that are not known are left out."""
-    known = [each for each in points if math.isfinite(each[1]) and math.isfinite(each[2].value)]
-    ys = [v for _, _, y in known for v in (y.value, y.low, y.high)]
-    x = Scale.over([value for _, value, _ in known], LEFT + 14, WIDTH - RIGHT - 14, margin=0.06)
-    y = Scale.over(ys, POINTS_HEIGHT - BOTTOM - 6, TOP + 6, margin=0.04)
-    x_ticks, y_ticks = ({tick: number(tick) for tick in axis.ticks(6)} for axis in (x, y))
-    parts = [*_frame(x, y, x_ticks, y_ticks, x_label, y_label, height=POINTS_HEIGHT)]
-    taken = list[tuple[float, float]]()
-    for k, (name, own, estimate) in enumerate(sorted(known, key=lambda each: -each[2].value)):
-        at, height = x(own), y(estimate.value)
-        if math.isfinite(estimate.low) and math.isfinite(estimate.high):
-            parts.append(f'<path class="line {_class(k)}" d="M{at:.1f} {y(estimate.low):.1f}V{y(estimate.high):.1f}"/>')
-        parts.append(_mark(at, height, k, f"{name}: {_with_ends(estimate)}"))
-        left = at > (LEFT + WIDTH) / 2
-        side = at - 7 if left else at + 7
-        near = [other for beside, other in taken if abs(at - beside) < WIDTH / 2]
-        steps = (height + sign * k * LABEL / 2 for k in range(len(known) * 4) for sign in (1, -1))
-        height = next(own for own in steps if all(abs(own - other) >= LABEL for other in near))
-        taken.append((at, height))
-        anchor = "end" if left else "start"
-        place = f'x="{side:.1f}" y="{height + 4:.1f}" text-anchor="{anchor}"'
-        parts.append(f'<text class="dot {_class(k)}" {place}>{html.escape(name)}</text>')
-    return _svg(parts, POINTS_HEIGHT, f"{y_label} by {x_label}")
-
-
 def thinned(line: Line) -> Line:
     """Return the line; a line of more than POINTS points is reduced to the means of its parts."""
     if len(line.x) <= POINTS:
