@@ -73,6 +73,7 @@ def test_tables_of_a_run_are_written_on_demand(folder) -> None:
     assert "uncertainty.csv" not in before
     assert bench("show", "whole", "uncertainty", "--out", "u.csv", cwd=folder).stdout == "u.csv\n"
     assert (folder / "u.csv").read_text().startswith("model,scene,")
+    assert bench("show", "whole", "comparison", "--out", "c.csv", cwd=folder).stdout == "c.csv\n"
     bench("show", "whole", "classes", "comparison", "--out", "some.md", cwd=folder)
     assert (folder / "some.md").read_text().count("### ") > 2
     bench("show", "whole", "--out", "all.tex", cwd=folder)

@@ -228,7 +228,7 @@ COMMANDS: Mapping[Callable[..., None], tuple[str, str]] = {
     export: ("export new --to map.ply", "export new --to voxels.csv --min-op 3"),
     relabel: ("relabel new --out fused", "relabel new --out steady --category stable"),
     conform: ("conform './fuse'", "conform './fuse' --only pinhole"),
-    show: ("show new", "show new overview --out overview.tex", "show old new --out glance"),
+    show: ("show new overview --out overview.tex", "show old new --out glance"),
     view: ("view new", "view new/recording.rrd"),
     list_: ("list", "list --check"),
 }  # fmt: skip

@@ -74,7 +74,8 @@ def show(
         matching = {key: table for key, table in by_name.items() if key.startswith(name)}
         if not matching:
             raise ConfigError(f"{run}: no table '{name}'; the tables are {', '.join(by_name)}")
-        chosen |= {name: matching[name]} if out is not None and name in matching else matching
+        one = out is not None and out.suffix == ".csv" and name in matching
+        chosen |= {name: matching[name]} if one else matching
     if out is not None and figures is None:
         print_lines([str(save_as([*(chosen if what else by_name).values()], out))])
     else:
