@@ -1,55 +1,84 @@
-"""The benchmark scripts run and print their tables, at a size where their figures mean nothing."""
+"""The cases of performance/ run and print their tables, at a size where their figures mean nothing."""
 
 from __future__ import annotations
 
-import argparse
 import contextlib
 import importlib
 import io
 import json
 import logging
-import runpy
+import os
 import subprocess
 import sys
 from pathlib import Path
+from typing import Literal
 
+import bench
+import cases
 import pytest
 
-BENCHMARKS = Path(__file__).parents[1] / "benchmarks"
+ROOT = Path(__file__).parents[1]
+
 SMALL = {
     "fusion": ("96x54", "--sizes 96x54 --rounds 1 --conditions", "noise 0.3 %"),
-    "random_scenes": ("worst", "--sizes 96x54 --scenes 1 --noise 0.3 --many 1 --rounds 1"),
-    "scaling": ("96x54", "--size 96x54 --voxels 1000 5000"),
+    "random-scenes": ("worst", "--sizes 96x54 --scenes 1 --noise 0.3 --many 1 --rounds 1"),
     "casting": ("96x54", "--size 96x54 --triangles 200 --rounds 1"),
-    "end_to_end": ("96x54", "--size 96x54 --frames 2 --runs 1 --noise 0 --voxel-size 1 --backend numpy --depth png"),
+    "end-to-end": ("96x54", "--size 96x54 --frames 2 --runs 1 --noise 0 --voxel-size 1 --backend numpy --depth png"),
+    "recording": ("ratio", "--size 96x54 --frames 2 --runs 1 --backend numpy"),
     "gpu": ("96x54", "--device CPU:0 --sizes 96x54 --classes 3 --voxels 9000 --rounds 2 --copied-megabytes 1 "
             "--cpu-backends numba"),
-    "spots": ("96x54, 0.3 %", "--sizes 96x54 --rounds 1 --warm 2 --frames 3"),
+    "scores": ("96x54", "--sizes 96x54 --classes 3 --types float16 --rounds 1"),
+    "scans": ("np.unique alone", "--points 2000 --scans 2 --rounds 1 --backends numba"),
     "statistics": ("all statistics", "--frames 4 --size 64x48 --voxel-size 0.2"),
+    "growth": ("exponent", "--size 96x54 --frames 1 --voxels 4000 --classes 2 --times 1 2 --growing voxels "
+               "--figure growth.png"),
+    "filters": ("ms", "--size 32x24 --classes 3 --frames 5"),
+    "tiles": ("the same", "--frames 3 --tile-size 64"),
 }  # fmt: skip
 
 
 @pytest.mark.parametrize("name", SMALL)
-def test_a_benchmark_prints_its_table_and_writes_it(name, tmp_path, capsys, monkeypatch) -> None:
+def test_a_case_prints_its_table_and_writes_it(name, tmp_path, capsys, monkeypatch) -> None:
     text, words, *more = SMALL[name]
-    script, file = BENCHMARKS / f"bench_{name}.py", tmp_path / "figures.json"
-    monkeypatch.syspath_prepend(str(BENCHMARKS))
-    monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr(logging.getLogger("semstab"), "setLevel", lambda level: None)  # it would stay for other tests
-    monkeypatch.setattr(sys, "argv", [str(script), *words.split(), *more, "--json", str(file)])
-    runpy.run_path(str(script), run_name="__main__")
+    file = tmp_path / "figures.json"
+    called([name, *words.split(), *more, "--json", str(file)], tmp_path, monkeypatch)
     assert text in capsys.readouterr().out
     assert json.loads(file.read_text())
+    assert name != "growth" or (tmp_path / "growth.png").stat().st_size
 
 
-def test_the_benchmark_of_whole_runs_prints_its_tables() -> None:
-    """In a process of its own, as it sets the threads of numba, which can be done but once."""
-    words = ["--frames", "2", "--size", "32x24", "--voxel-size", "0.8", "--runs", "1"]
-    command = [sys.executable, str(BENCHMARKS / "bench_run.py"), *words]
-    done = subprocess.run(command, capture_output=True, text=True, check=False)
-    assert done.returncode == 0, done.stderr
-    assert "as it is" in done.stdout
-    assert "with --statistics" in done.stdout
+@pytest.mark.parametrize(("folder", "entry"), [("performance", "bench"), ("simulations", "simulate")])
+def test_the_help_of_an_entry_names_its_cases_and_each_case_has_a_module(folder, entry) -> None:
+    command = [sys.executable, str(ROOT / folder / f"{entry}.py"), "--help"]
+    said = subprocess.run(command, capture_output=True, text=True, check=True).stdout
+    lines = {line.split()[0]: line for line in said.splitlines() if line.startswith("  ")}
+    cases = importlib.import_module(entry).CASES
+    assert set(lines) == set(cases)
+    assert all(line.split()[1:] for line in lines.values())
+
+
+def options(
+    kind: Literal["x", "y"] | None = None,
+    trials: int = 3,
+    only: str = "",
+    noise: tuple[float, ...] = (0.0,),
+    record: bool = False,
+    class_: str = "a",
+):
+    raise AssertionError
+
+
+def test_the_parameters_of_a_case_are_its_options() -> None:
+    parser = cases.parser_of(options, "case", "")
+    given = ["--trials", "5", "--noise", "0.5", "1", "--record", "--class", "b"]
+    assert vars(parser.parse_args(given)) == {
+        "trials": 5,
+        "only": "",
+        "noise": [0.5, 1.0],
+        "record": True,
+        "class_": "b",
+    }
+    assert vars(parser.parse_args([]))["noise"] == (0.0,)
 
 
 TRUNCATING = """
@@ -75,29 +104,24 @@ print(json.dumps({"ms": [1.0] * int(frames), "bytes": 0, "peak_bytes": 0}))
 """A program that fuses by truncation towards zero, and keeps the last label."""
 
 
-def called(name: str, words: list[str], monkeypatch) -> None:
-    """Call a script's main in this process."""
+def called(words: list[str], folder: Path, monkeypatch) -> None:
+    """Call the entry in this process, which is left as it was."""
+    monkeypatch.chdir(folder)
     monkeypatch.setattr(logging.getLogger("semstab"), "setLevel", lambda level: None)  # it would stay for other tests
-    monkeypatch.setattr(sys, "argv", [name, *words])
-    imported(name, monkeypatch).main()
-
-
-def imported(name: str, monkeypatch):
-    monkeypatch.syspath_prepend(str(BENCHMARKS))
-    return importlib.import_module(name)
+    monkeypatch.setattr(os, "sched_setaffinity", lambda *_: None)
+    bench.main(words)
 
 
 def test_the_benchmark_of_rivals_compares_a_program_of_the_user(tmp_path, capsys, monkeypatch) -> None:
     """Two of our own programs, which import most, run in this process; the third one and the rival are processes."""
-    rivals = imported("bench_rivals", monkeypatch)
+    rivals = importlib.import_module("timed.rivals")
     start = rivals.run
 
     def run(command, files):
-        if command[-1] not in ("open3d", "images"):
+        if command[-2] not in ("open3d", "images"):
             return start(command, files)
-        size = argparse.Namespace(size="64x48", frames=2, classes=7, voxel_size=0.2)
         with contextlib.redirect_stdout(io.StringIO()) as said:
-            rivals.fuse(command[-1], *files, size)
+            rivals.fuse(command[-2], *files, "64x48", 2, 7, 0.2)
         return json.loads(said.getvalue())
 
     monkeypatch.setattr(rivals, "run", run)
@@ -106,32 +130,11 @@ def test_the_benchmark_of_rivals_compares_a_program_of_the_user(tmp_path, capsys
     (tmp_path / "COMMIT").write_text("abc123\n")
     words = ["--size", "64x48", "--frames", "2", "--voxel-size", "0.2", "--json", str(file)]
     words += ["--rival", f"last={sys.executable} {program}", "--commit", f"last={tmp_path}"]
-    called("bench_rivals", words, monkeypatch)
+    called(["rivals", *words], tmp_path, monkeypatch)
     assert "last: abc123" in capsys.readouterr().out
-    rows = {row["name"]: row for row in json.loads(file.read_text())["rows"]}
+    rows = {row["implementation"]: row for row in json.loads(file.read_text())["rows"]}
     ours, images, last = rows["semstab numba"], rows["semstab numba, depth images"], rows["last"]
     assert ours["missing"] == ours["extra"] == ours["label_differs"] == 0
     assert images["voxels"] == pytest.approx(ours["voxels"], rel=0.02)
     assert last["missing"] > 0  # the noise of a wall at 0 reaches below it
     assert 0 < last["label_differs"] < 0.5
-
-
-def test_the_benchmark_of_growth_prints_its_exponents_and_draws_them(tmp_path, capsys, monkeypatch) -> None:
-    words = [
-        "--size",
-        "96x54",
-        "--frames",
-        "1",
-        "--voxels",
-        "4000",
-        "--classes",
-        "2",
-        "--times",
-        "1",
-        "2",
-        "--growing",
-        "voxels",
-    ]
-    called("bench_growth", [*words, "--figure", str(tmp_path / "growth.png")], monkeypatch)
-    assert "exponent" in capsys.readouterr().out
-    assert (tmp_path / "growth.png").stat().st_size
