@@ -18,7 +18,8 @@ import numpy as np
 from flights import Flight, fly, sums_of, world
 from scipy.optimize import brentq
 
-from semstab.comparison.differences import LEVEL, sums_difference
+from semstab.comparison.differences import sums_difference
+from semstab.data.statistics import CONFIDENCE
 from semstab.gating.evaluation import bounded
 from semstab.gating.result import verdict
 from semstab.gating.rules import parse
@@ -74,5 +75,5 @@ def found(flight: Flight, ease: float, trials: int, *, elsewhere: bool) -> list[
             sums_of(fly(flight, own, rng, at), over, flight) for own, at in zip(scenes, (EASE, ease), strict=True)
         )
         change = sums_difference("psa", new, old)
-        hits += change.p_value < LEVEL and change.value < 0, verdict(RULE, bounded(RULE, new, old)) == "fails"
+        hits += change.p_value < 1 - CONFIDENCE and change.value < 0, verdict(RULE, bounded(RULE, new, old)) == "fails"
     return [f"{hit:.2f}" for hit in hits / trials]

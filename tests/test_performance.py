@@ -70,8 +70,9 @@ def options(
 
 def test_the_parameters_of_a_case_are_its_options() -> None:
     parser = cases.parser_of(options, "case", "")
-    given = ["--trials", "5", "--noise", "0.5", "1", "--record", "--class", "b"]
+    given = ["--kind", "y", "--trials", "5", "--noise", "0.5", "1", "--record", "--class", "b"]
     assert vars(parser.parse_args(given)) == {
+        "kind": "y",
         "trials": 5,
         "only": "",
         "noise": [0.5, 1.0],
