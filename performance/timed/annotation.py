@@ -8,6 +8,7 @@ voxels that the regions show, which a label of the place mends; wrong voxels hav
 
 from __future__ import annotations
 
+import contextlib
 from pathlib import Path
 
 import cv2
@@ -96,9 +97,12 @@ def at_random(images, areas, rng, *, edges):
 def main(run: Path, model: str = "fcn", scores: str = "fcn-scores", most: int = 50):
     result = semstab.load_result(run)
     record, soft = (result.record(model=name) for name in (model, scores))
-    (task, _), (soft_task, _) = (task_of(run, own, result.manifest["inputs"]) for own in (record, soft))
-    tasks = annotation_tasks(Chosen(result, record, columns=("op",)), task, most)
-    images = Images(task, soft_task, Chosen(result, record, columns=("op",)).first.table.voxel_size)
+    with contextlib.ExitStack() as open_tasks:
+        task, soft_task = (
+            open_tasks.enter_context(task_of(run, own, result.manifest["inputs"]))[0] for own in (record, soft)
+        )
+        tasks = annotation_tasks(Chosen(result, record, columns=("op",)), task, most)
+        images = Images(task, soft_task, Chosen(result, record, columns=("op",)).first.table.voxel_size)
     masks = []
     for one in tasks:
         mask = np.zeros(one.size[::-1], np.uint8)

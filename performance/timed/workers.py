@@ -28,6 +28,8 @@ UNWATCHED = {"DASK_DISTRIBUTED__WORKER__PROFILE__ENABLED": "False"}
 """Dask looks 100 times a second where each thread is: 2 % of a core for each worker, which one worker has beside it."""
 
 PORT = 8786
+LOADED = "semstab.engine.frame_loop"
+"""What a worker loads for its first job, which is no part of what is measured."""
 
 
 @contextlib.contextmanager
@@ -39,11 +41,10 @@ def cluster(count: int, folder: Path) -> Iterator[tuple[str, list[int]]]:
     started = [start("distributed.cli.dask_scheduler", "--host", "127.0.0.1", "--port", str(PORT), folder=folder)]
     try:
         time.sleep(3)
-        own = ("--nthreads", "1", "--no-nanny", "--local-directory", str(folder / "dask"))
+        own = ("--nthreads", "1", "--no-nanny", "--local-directory", str(folder / "dask"), "--preload", LOADED)
         started += [start("distributed.cli.dask_worker", address, *own, folder=folder) for _ in range(count)]
         with Client(address, set_as_default=False) as client:
             client.wait_for_workers(count, timeout=60)
-            client.run(_import)
         yield address, [process.pid for process in started[1:]]
     finally:
         for process in reversed(started):
@@ -56,11 +57,6 @@ def start(module: str, *words: str, folder: Path) -> subprocess.Popen[bytes]:
     with (folder / "dask.log").open("a") as log:
         command = [sys.executable, "-m", module, "--no-dashboard", *words]
         return subprocess.Popen(command, stdout=log, stderr=log, env=os.environ | ONE_THREAD | UNWATCHED)
-
-
-def _import() -> None:
-    """What a worker loads for its first job, which is no part of what is measured."""
-    import semstab.engine.frame_loop  # noqa: F401
 
 
 def cpu_seconds(pid: int) -> float:
