@@ -1,7 +1,7 @@
 """Do thresholds from which labels are acted on keep what they promise?
 
-    python simulations/acceptance.py simulated [--trials 100] [--seed 0] [--precision 0.9]
-    python simulations/acceptance.py halves RUN [--precision 0.9]
+    python simulations/simulate.py acceptance simulated [--trials 100] [--seed 0] [--precision 0.9]
+    python simulations/simulate.py acceptance halves RUN [--precision 0.9]
 
 Simulated: thresholds are calibrated on one scene, and how often labels with so much evidence are right is counted over
 all other scenes of the same kind. Broken is the share of the thresholds that promise more than that; at most 1 -
@@ -11,8 +11,9 @@ Both print a table in Markdown.
 
 from __future__ import annotations
 
-import argparse
+from typing import Literal
 
+import cases
 import numpy as np
 from flights import Flight, World, fly, log_of, table_of, world
 
@@ -97,29 +98,18 @@ def _held(commit: AcceptanceThresholds, held: tuple[VoxelTable, Truth]) -> list[
     return [", ".join(names) or "none", f"{commit.left:.2f}", f"{(decided >= 0).mean():.2f}", f"{right:.3f}"]
 
 
-def main() -> None:
-    """Print the table."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("study", choices=["simulated", "halves"])
-    parser.add_argument("run", nargs="?")
-    parser.add_argument("--trials", type=int, default=100)
-    parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--precision", type=float, default=0.9)
-    arguments = parser.parse_args()
-    if arguments.study == "halves":
-        head = ["scene", "axis", "calibrated", "classes", "left", "left of the other half", "right there"]
-        rows = halves(arguments.run, arguments.precision)
+def main(
+    study: Literal["simulated", "halves"],
+    run: tuple[str, ...],
+    trials: int = 100,
+    seed: int = 0,
+    precision: float = 0.9,
+) -> None:
+    if study == "halves":
+        cases.head(["scene", "axis", "calibrated", "classes", "left", "left of the other half", "right there"])
+        rows = (cells for one in run for cells in halves(one, precision))
     else:
-        head = ["condition", "threshold found", "left of the map", "broken"]
-        rows = (
-            [name, *simulated(flight, arguments.trials, arguments.seed, arguments.precision)]
-            for name, flight in conditions()
-        )
-    print("|", " | ".join(head), "|")
-    print("|", " | ".join("---" for _ in head), "|")
+        cases.head(["condition", "threshold found", "left of the map", "broken"])
+        rows = ([name, *simulated(flight, trials, seed, precision)] for name, flight in conditions())
     for row in rows:
-        print("|", " | ".join(row), "|", flush=True)
-
-
-if __name__ == "__main__":
-    main()
+        cases.row(row)

@@ -1,7 +1,7 @@
 """Does alpha move with the pixels that are looked at, and does its level hold where one class is nearly all?
 
-    python simulations/alpha.py strides [--scenes 3] [--seed 0]
-    python simulations/alpha.py shares [--scenes 12] [--flights 16] [--seed 0]
+    python simulations/simulate.py alpha strides [--scenes 3] [--seed 0]
+    python simulations/simulate.py alpha shares [--scenes 12] [--flights 16] [--seed 0]
 
 Flights of `pictures.py`, with errors of eight kinds. `strides` prints alpha and its level with every pixel, and with
 every second and third one of each axis. `shares` flies scenes again and again of which one class covers nearly all: an
@@ -11,8 +11,8 @@ print a table in Markdown. What alpha should be is known exactly in other scenes
 
 from __future__ import annotations
 
-import argparse
 from dataclasses import replace
+from typing import Literal
 
 import numpy as np
 from levels import level_of, stated
@@ -103,19 +103,8 @@ def shares(scenes: int, flights: int, seed: int) -> None:
         )
 
 
-def main() -> None:
-    """Print the tables."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("table", choices=["strides", "shares"])
-    parser.add_argument("--scenes", type=int)
-    parser.add_argument("--flights", type=int, default=16)
-    parser.add_argument("--seed", type=int, default=0)
-    arguments = parser.parse_args()
-    if arguments.table == "strides":
-        strides(arguments.scenes or 3, arguments.seed)
+def main(table: Literal["strides", "shares"], scenes: int | None = None, flights: int = 16, seed: int = 0) -> None:
+    if table == "strides":
+        strides(scenes or 3, seed)
     else:
-        shares(arguments.scenes or 12, arguments.flights, arguments.seed)
-
-
-if __name__ == "__main__":
-    main()
+        shares(scenes or 12, flights, seed)

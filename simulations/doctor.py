@@ -1,6 +1,6 @@
 """How often does `check` find a planted mistake in labels, time or intrinsics, and how often one that is not there?
 
-    python simulations/doctor.py [--scenes 20] [--seed 0] [--only TEXT] [--situations]
+    python simulations/simulate.py doctor [--scenes 20] [--seed 0] [--only TEXT] [--situations]
 
 Each scene is a room of a size of its own with 12 boxes of 7 classes at random places, and a camera that walks about and
 turns at random: 30 frames of 96 x 72 pixels with 0.5 % noise of depth. Labels are wrong in 5 % of the pixels and at
@@ -11,12 +11,12 @@ something else is said. With --situations the table is of what begins at a frame
 
 from __future__ import annotations
 
-import argparse
 import functools
 import re
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 
+import cases
 import cv2
 import numpy as np
 
@@ -387,27 +387,16 @@ def print_situations(seeds: Sequence[int], only: str) -> None:
         print(f"| {each.name} | {sum(found)} | {sum(in_run)} | {placed} | {other} |", flush=True)
 
 
-def main() -> None:
-    """Print the table."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--scenes", type=int, default=20)
-    parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--only", default="")
-    parser.add_argument("--situations", action="store_true")
-    arguments = parser.parse_args()
-    seeds = range(arguments.seed, arguments.seed + arguments.scenes)
-    if arguments.situations:
-        print_situations(seeds, arguments.only)
+def main(scenes: int = 20, seed: int = 0, only: str = "", situations: bool = False) -> None:
+    seeds = range(seed, seed + scenes)
+    if situations:
+        print_situations(seeds, only)
         return
-    scenes = [scene(seed) for seed in seeds]
-    print(f"| planted | found in {len(scenes)} | something else said |\n|---|---:|---:|")
+    rooms = [scene(seed) for seed in seeds]
+    cases.head(["planted", f"found in {scenes}", "something else said"])
     for mistake in MISTAKES:
-        if arguments.only in mistake.name:
-            lines = [[*said(mistake.plant(frames))] for frames in scenes]
+        if only in mistake.name:
+            lines = [[*said(mistake.plant(frames))] for frames in rooms]
             found = sum(any(mistake.said in line for line in each) for each in lines)
             other = sum(any(mistake.said not in line for line in each) for each in lines)
-            print(f"| {mistake.name} | {found} | {other} |", flush=True)
-
-
-if __name__ == "__main__":
-    main()
+            cases.row([mistake.name, str(found), str(other)])

@@ -1,6 +1,6 @@
 """How often does a frame stand out where none is bad, and are the bad ones found?
 
-    python simulations/frames.py [--trials 100] [--seed 0]
+    python simulations/simulate.py frames [--trials 100] [--seed 0]
 
 Each trial makes a scene of its own: a floor of 2 to 12 classes, which a camera flies over on a random course, at a
 random height and tilt, 12 to 40 times. Labels are wrong in blobs: at places that are hard for all frames, and anew in
@@ -12,11 +12,11 @@ every third frame (`simulations/planted.py`).
 
 from __future__ import annotations
 
-import argparse
 import dataclasses
 from collections.abc import Iterator
 from dataclasses import dataclass
 
+import cases
 import cv2
 import numpy as np
 from flights import field
@@ -131,24 +131,16 @@ def named(made: Made, bad: bool, rng: np.random.Generator) -> tuple[set[int], se
     return planted, {each.frame for each in found.frames}
 
 
-def main() -> None:
-    """Print the table."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--trials", type=int, default=100)
-    parser.add_argument("--seed", type=int, default=0)
-    arguments = parser.parse_args()
-    print("| scenes | trials | any innocent frame named | all bad frames and no other | of the bad frames named |")
-    print("|---|---|---|---|---|")
+def main(trials: int = 100, seed: int = 0) -> None:
+    cases.head(
+        ["scenes", "trials", "any innocent frame named", "all bad frames and no other", "of the bad frames named"]
+    )
     for name, uneven, bad in CONDITIONS:
         innocent = exact = found = planted = 0
-        for trial in range(arguments.trials):
-            rng = np.random.default_rng([arguments.seed, trial, bad])
-            truth, own = named(Made.drawn(np.random.default_rng([arguments.seed, trial]), uneven), bad, rng)
+        for trial in range(trials):
+            rng = np.random.default_rng([seed, trial, bad])
+            truth, own = named(Made.drawn(np.random.default_rng([seed, trial]), uneven), bad, rng)
             innocent, exact = innocent + bool(own - truth), exact + (own == truth)
             found, planted = found + len(own & truth), planted + len(truth)
         share = f"{found / planted:.3f}" if planted else "-"
-        print(f"| {name} | {arguments.trials} | {innocent} | {exact} | {share} |", flush=True)
-
-
-if __name__ == "__main__":
-    main()
+        cases.row([name, str(trials), str(innocent), str(exact), share])

@@ -1,6 +1,6 @@
 """How often does a gate err, and how much does it take to be decided?
 
-    python simulations/gate.py [--trials 200] [--seed 0] [--only TEXT] [--scope "these frames"]
+    python simulations/simulate.py gate [--trials 200] [--seed 0] [--only TEXT] [--scope "these frames"]
 
 Two models on the same frames of the same scene find the same places hard, with --scope "other scenes" each its own.
 Scenes, frames and errors are drawn anew for each trial. Prints a table in Markdown of the rule 'alpha drop < margin' at
@@ -10,14 +10,15 @@ margin is the loss that all trials of the second pair have together.
 
 from __future__ import annotations
 
-import argparse
 import dataclasses
 from collections.abc import Iterator
+from typing import Literal
 
+import cases
 import numpy as np
 from flights import Flight, World, fly, number_of, sums_of, totals_of, world
 
-from semstab.core.types import OTHER_SCENES, THESE_FRAMES, THIS_SCENE, Scope
+from semstab.core.types import OTHER_SCENES, THIS_SCENE, Scope
 from semstab.data.statistics import Interval
 from semstab.gating.evaluation import bounded
 from semstab.gating.result import verdict
@@ -72,21 +73,13 @@ HEAD = [
 ]  # fmt: skip
 
 
-def main() -> None:
-    """Print the table."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--trials", type=int, default=200)
-    parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--only", default="")
-    parser.add_argument("--scope", choices=[THESE_FRAMES, THIS_SCENE, OTHER_SCENES], default=THIS_SCENE)
-    arguments = parser.parse_args()
-    print("|", " | ".join(HEAD), "|")
-    print("|", " | ".join("---" for _ in HEAD), "|")
+def main(
+    trials: int = 200,
+    seed: int = 0,
+    only: str = "",
+    scope: Literal["these frames", "this scene", "other scenes"] = THIS_SCENE,
+) -> None:
+    cases.head(HEAD)
     for name, flight in conditions():
-        if arguments.only in name:
-            row = rates(flight, arguments.trials, arguments.seed, arguments.scope)
-            print("|", " | ".join([name, *(f"{x:.3f}" for x in row)]), "|", flush=True)
-
-
-if __name__ == "__main__":
-    main()
+        if only in name:
+            cases.row([name, *(f"{x:.3f}" for x in rates(flight, trials, seed, scope))])

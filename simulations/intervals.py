@@ -1,8 +1,8 @@
 """How often do intervals of voxel alpha, PSA, accuracy and numbers by location hold what they are about?
 
-    python simulations/intervals.py this-scene [--trials 300] [--seed 0]
-    python simulations/intervals.py other-scenes [--trials 300] [--seed 0]
-    python simulations/intervals.py locations [--trials 300] [--seed 0]
+    python simulations/simulate.py intervals this-scene [--trials 300] [--seed 0]
+    python simulations/simulate.py intervals other-scenes [--trials 300] [--seed 0]
+    python simulations/simulate.py intervals locations [--trials 300] [--seed 0]
 
 Alpha, which is of spots, is in `exact_coverage.py`. Prints a table in Markdown. The target of an interval is the number
 that very many flights have together: over the same scene for 'this scene' and numbers by location, over all scenes for
@@ -11,11 +11,12 @@ the others.
 
 from __future__ import annotations
 
-import argparse
 import dataclasses
 import math
 from collections.abc import Iterator, Sequence
+from typing import Literal
 
+import cases
 import numpy as np
 from flights import Flight, fly, number_of, sums_of, totals_of, world
 
@@ -162,18 +163,7 @@ STUDIES = {
 }
 
 
-def main() -> None:
-    """Print the table."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("study", choices=STUDIES)
-    parser.add_argument("--trials", type=int, default=300)
-    parser.add_argument("--seed", type=int, default=0)
-    arguments = parser.parse_args()
-    print("|", " | ".join(HEAD), "|")
-    print("|", " | ".join("---" for _ in HEAD), "|")
-    for row in STUDIES[arguments.study](arguments.trials, arguments.seed):
-        print("|", " | ".join(row.cells()), "|", flush=True)
-
-
-if __name__ == "__main__":
-    main()
+def main(study: Literal["this-scene", "other-scenes", "locations"], trials: int = 300, seed: int = 0) -> None:
+    cases.head(HEAD)
+    for row in STUDIES[study](trials, seed):
+        cases.row(row.cells())

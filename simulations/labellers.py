@@ -1,6 +1,6 @@
 """What do verdicts make of labellers that agree with themselves for the wrong reasons?
 
-    python simulations/labellers.py [--scene scene0] [--frames 20] [--width 384]
+    python simulations/simulate.py labellers [--scene scene0] [--frames 20] [--width 384]
 
 Runs the simulated labellers of the city (datasets/city/labellers.py) without ground truth, as users do, and with it.
 Prints a table in Markdown.
@@ -8,10 +8,11 @@ Prints a table in Markdown.
 
 from __future__ import annotations
 
-import argparse
 import tempfile
 from collections.abc import Iterator
 from pathlib import Path
+
+import cases
 
 import semstab
 from semstab.datasets.city.options import MODELS
@@ -62,16 +63,7 @@ def rows(scene: str, frames: int, width: int) -> Iterator[list[str]]:
             ]  # fmt: skip
 
 
-def main() -> None:
-    """Print the table."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--scene", default="scene0")
-    parser.add_argument("--frames", type=int, default=20)
-    parser.add_argument("--width", type=int, default=384)
-    arguments = parser.parse_args()
-    for cells in (HEAD, ["---"] * len(HEAD), *rows(arguments.scene, arguments.frames, arguments.width)):
-        print("|", " | ".join(cells), "|", flush=True)
-
-
-if __name__ == "__main__":
-    main()
+def main(scene: str = "scene0", frames: int = 20, width: int = 384) -> None:
+    cases.head(HEAD)
+    for cells in rows(scene, frames, width):
+        cases.row(cells)

@@ -1,6 +1,6 @@
 """Copies of a posed folder whose label source has a known fault, to see whether a gate finds it.
 
-    python simulations/planted.py SCENE OUT [--source fcn] [--class bunny_book] [--to kleenex]
+    python simulations/simulate.py planted SCENE OUT [--source fcn] [--class bunny_book] [--to kleenex]
 
 Writes OUT/third (the class is labelled as another one in every third frame), OUT/first (in the first third of the
 frames), OUT/flip (2 % of the pixels, drawn at random, have a random class) and OUT/blocks (in every third frame, from
@@ -10,7 +10,6 @@ ground truth.
 
 from __future__ import annotations
 
-import argparse
 import os
 import shutil
 from collections.abc import Callable
@@ -73,19 +72,7 @@ def faults(names: list[str], wrong: str, to: str) -> dict[str, Fault]:
     }
 
 
-def main() -> None:
-    """Write the copies."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("scene", type=Path)
-    parser.add_argument("out", type=Path)
-    parser.add_argument("--source", default="fcn")
-    parser.add_argument("--class", dest="wrong", default="bunny_book")
-    parser.add_argument("--to", default="kleenex")
-    arguments = parser.parse_args()
-    names = yaml.safe_load((arguments.scene / "scene.yaml").read_text())["classes"]
-    for name, fault in faults(names, arguments.wrong, arguments.to).items():
-        plant(arguments.scene, arguments.out / name / arguments.scene.name, arguments.source, fault)
-
-
-if __name__ == "__main__":
-    main()
+def main(scene: Path, out: Path, source: str = "fcn", class_: str = "bunny_book", to: str = "kleenex") -> None:
+    names = yaml.safe_load((scene / "scene.yaml").read_text())["classes"]
+    for name, fault in faults(names, class_, to).items():
+        plant(scene, out / name / scene.name, source, fault)

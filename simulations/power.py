@@ -1,6 +1,6 @@
 """How many frames does it take to find a loss, and how often is one found where there is none?
 
-    python simulations/power.py [--trials 100] [--only TEXT]
+    python simulations/simulate.py power [--trials 100] [--only TEXT]
 
 Two models fly the same frames over the same scene (flights.py) and err independently of each other, at the same hard
 places or at places half of which are others; the new one agrees less by so many points of PSA in the mean of scenes.
@@ -10,15 +10,16 @@ Prints a table in Markdown: the share of flights in which each does.
 
 from __future__ import annotations
 
-import argparse
 import dataclasses
 import itertools
 
+import cases
 import numpy as np
 from flights import Flight, fly, sums_of, world
 from scipy.optimize import brentq
 
-from semstab.comparison.differences import LEVEL, sums_difference
+from semstab.comparison.differences import sums_difference
+from semstab.data.statistics import CONFIDENCE
 from semstab.gating.evaluation import bounded
 from semstab.gating.result import verdict
 from semstab.gating.rules import parse
@@ -40,23 +41,18 @@ def psa_at(ease: float, kind: str) -> float:
     return float(np.mean(found))
 
 
-def main() -> None:
-    """Print the table."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--trials", type=int, default=100)
-    parser.add_argument("--only", default="")
-    arguments = parser.parse_args()
+def main(trials: int = 100, only: str = "") -> None:
     names = [
         f"{'no loss' if not loss else f'{100 * loss:g} points'}: {by}" for loss in LOSSES for by in ("compare", "gate")
     ]
-    print("| frames | " + " | ".join(names) + " |\n|---|" + "---|" * len(names))
-    for kind in (kind for kind in KINDS if arguments.only in kind):
+    cases.head(["frames", *names])
+    for kind in (kind for kind in KINDS if only in kind):
         eases = [EASE if not loss else ease_of(kind, loss) for loss in LOSSES]
         for frames, elsewhere in itertools.product(FRAMES, (False, True)):
             flight = Flight(SIDE, 2.0, EASE, frames, frames, kind)
-            cells = [part for ease in eases for part in found(flight, ease, arguments.trials, elsewhere=elsewhere)]
+            cells = [part for ease in eases for part in found(flight, ease, trials, elsewhere=elsewhere)]
             where = "at other places" if elsewhere else "at the same places"
-            print(f"| {frames}, {kind}, {where} | " + " | ".join(cells) + " |", flush=True)
+            cases.row([f"{frames}, {kind}, {where}", *cells])
 
 
 def ease_of(kind: str, loss: float) -> float:
@@ -79,9 +75,5 @@ def found(flight: Flight, ease: float, trials: int, *, elsewhere: bool) -> list[
             sums_of(fly(flight, own, rng, at), over, flight) for own, at in zip(scenes, (EASE, ease), strict=True)
         )
         change = sums_difference("psa", new, old)
-        hits += change.p_value < LEVEL and change.value < 0, verdict(RULE, bounded(RULE, new, old)) == "fails"
+        hits += change.p_value < 1 - CONFIDENCE and change.value < 0, verdict(RULE, bounded(RULE, new, old)) == "fails"
     return [f"{hit:.2f}" for hit in hits / trials]
-
-
-if __name__ == "__main__":
-    main()

@@ -1,6 +1,6 @@
 """Alpha by range of labels that are worse the farther away.
 
-    python simulations/ranges.py SEQUENCES [--voxel-size 0.2]
+    python simulations/simulate.py ranges SEQUENCES [--voxel-size 0.2]
 
 SEQUENCES is a folder in SemanticKITTI's layout with ground truth. Labels are the true ones; of the points at range r a
 share of (r - 10 m) / 40 m, at most 80 %, is drawn at random from nine classes. Alpha and the strata are printed.
@@ -8,9 +8,9 @@ share of (r - 10 m) / 40 m, at most 80 %, is drawn at random from nine classes. 
 
 from __future__ import annotations
 
-import argparse
 import dataclasses
 
+import cases
 import numpy as np
 
 from semstab.backends import create
@@ -21,17 +21,12 @@ DRAWN = (0, 8, 10, 12, 13, 14, 15, 16, 17)
 """car, road, sidewalk, building, fence, vegetation, trunk, terrain and pole, among the 19 classes."""
 
 
-def main() -> None:
-    """Print the table."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("sequences")
-    parser.add_argument("--voxel-size", type=float, default=0.2)
-    arguments = parser.parse_args()
-    dataset = open_dataset("semantickitti", {"root": arguments.sequences})
+def main(sequences: str, voxel_size: float = 0.2) -> None:
+    dataset = open_dataset("semantickitti", {"root": sequences})
     scene, rng = dataset.scene(dataset.scenes[0]), np.random.default_rng(0)
     mapping = scene.label_space("gt").mapping_to(scene.label_space("gt"))
     K = len(mapping.target)
-    backend, sampler = create("numba", voxel_size=arguments.voxel_size, num_classes=K, history=True), Sampler(K)
+    backend, sampler = create("numba", voxel_size=voxel_size, num_classes=K, history=True), Sampler(K)
     for index in range(len(scene)):
         frame = scene.frame(index, "gt")
         labels = mapping.labels(frame.predicted, scene.frame_name(index))
@@ -44,10 +39,6 @@ def main() -> None:
     print(f"alpha {found.headline.alpha.text()}")
     assert found.ranges is not None
     print(found.ranges.text)
-    print("| range m | observations % | alpha |\n|---|---:|---:|")
+    cases.head(["range m", "observations %", "alpha"])
     for row in found.ranges.strata:
-        print(f"| {row.low:g} to {row.high:g} | {100 * row.share:.1f} | {row.alpha.text()} |")
-
-
-if __name__ == "__main__":
-    main()
+        cases.row([f"{row.low:g} to {row.high:g}", f"{100 * row.share:.1f}", row.alpha.text()])

@@ -1,9 +1,9 @@
 """Does disagreement tell which labels are wrong, and how many, without ground truth?
 
-    python simulations/risk.py made [--scenes 3] [--seed 0]
-    python simulations/risk.py city [--frames 20] [--width 288]
-    python simulations/risk.py runs RUN ...
-    python simulations/risk.py runs RUN ... --signs [--scores MODEL]
+    python simulations/simulate.py risk made [--scenes 3] [--seed 0]
+    python simulations/simulate.py risk city [--frames 20] [--width 288]
+    python simulations/simulate.py risk runs RUN ...
+    python simulations/simulate.py risk runs RUN ... --signs [--scores MODEL]
 
 Places are the voxels of a map that were seen three times or more and have a true class; the label of one is its
 dominant class. `made` takes flights of `pictures.py`, with errors of eight kinds at four rates, `city` the simulated
@@ -22,12 +22,13 @@ The images of the run are read again; scores may be those of another label sourc
 
 from __future__ import annotations
 
-import argparse
 import math
 import tempfile
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
+from typing import Literal
 
+import cases
 import numpy as np
 from alpha import RATES
 from pictures import KINDS, K, Views, frames, predicted, scene
@@ -202,40 +203,31 @@ def percent(parts: Iterable[np.ndarray]) -> str:
     return f"{100 * values.mean():.1f}" if len(values) and not np.isnan(values).any() else "-"
 
 
-def main() -> None:
-    """Print the table."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("study", choices=["made", "city", "runs"])
-    parser.add_argument("run", nargs="*", metavar="RUN[:MODEL]")
-    parser.add_argument("--scenes", type=int, default=3)
-    parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--frames", type=int, default=20)
-    parser.add_argument("--width", type=int, default=288)
-    parser.add_argument("--signs", action="store_true", help="of runs: what else tells that a label is wrong")
-    parser.add_argument(
-        "--scores", metavar="MODEL", help="with --signs: the label source of the run whose scores count"
-    )
-    arguments = parser.parse_args()
-    if arguments.signs:
-        table_of_signs(arguments.run, arguments.scores)
+def main(
+    study: Literal["made", "city", "runs"],
+    run: tuple[str, ...],
+    scenes: int = 3,
+    seed: int = 0,
+    frames: int = 20,
+    width: int = 288,
+    signs: bool = False,
+    scores: str | None = None,
+) -> None:
+    if signs:
+        table_of_signs(run, scores)
         return
-    if arguments.study == "made":
-        maps = list(made(arguments.scenes, arguments.seed))
-    elif arguments.study == "city":
-        maps = list(city(arguments.frames, arguments.width))
+    if study == "made":
+        maps = list(made(scenes, seed))
+    elif study == "city":
+        maps = list(city(frames, width))
     else:
-        maps = [own for run in arguments.run for own in of_run(run)]
-    print("|", " | ".join(HEAD), "|")
-    print("|", " | ".join("---" for _ in HEAD), "|")
-    told = list(rows(maps, lambda model: model.split(",")[0], by_class=arguments.study != "runs"))
+        maps = [own for one in run for own in of_run(one)]
+    cases.head(HEAD)
+    told = list(rows(maps, lambda model: model.split(",")[0], by_class=study != "runs"))
     for cells in told:
-        print("|", " | ".join(cells), "|", flush=True)
+        cases.row(cells)
     for column in ("as on its other flights", "as with other models"):
         pairs = [(cells[HEAD.index("wrong there, %")], cells[HEAD.index(column)]) for cells in told]
         off = [abs(float(own) - float(other)) for own, other in pairs if other != "-"]
         if off:
             print(f"\n{column}: off by {np.median(off):.1f} points in the median, {max(off):.1f} at most")
-
-
-if __name__ == "__main__":
-    main()

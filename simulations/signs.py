@@ -7,6 +7,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 
+import cases
 import numpy as np
 from scipy import ndimage
 from scipy.spatial import cKDTree
@@ -151,7 +152,7 @@ def of_run(run: str, scores: str | None) -> tuple[str, list[Mapping[str, float]]
 
 def table(runs: Sequence[str], scores: str | None) -> None:
     """Print a row for each run: the AUROC of each sign, mean (least to most) of its scenes."""
-    print("| model | places | wrong, % |", " | ".join(SIGNS), "|\n|---|" + "---:|" * (len(SIGNS) + 2))
+    cases.head(["model", "places", "wrong, %", *SIGNS])
     for run in runs:
         model, numbers = of_run(run, scores)
         places = sum(own["places"] for own in numbers)
@@ -162,7 +163,7 @@ def table(runs: Sequence[str], scores: str | None) -> None:
             f"{100 * wrong:.1f}",
             *(_over([own[sign] for own in numbers]) for sign in SIGNS),
         ]
-        print("|", " | ".join(cells), "|", flush=True)
+        cases.row(cells)
 
 
 def _over(values: Sequence[float]) -> str:

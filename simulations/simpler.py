@@ -1,7 +1,7 @@
 """Do simpler methods than the model of random effects give intervals that hold as often, and are no wider?
 
-    python simulations/simpler.py this-scene [--trials 30] [--seed 2]
-    python simulations/simpler.py other-scenes [--trials 40] [--seed 2]
+    python simulations/simulate.py simpler this-scene [--trials 30] [--seed 2]
+    python simulations/simulate.py simpler other-scenes [--trials 40] [--seed 2]
 
 Each flight of `intervals.py` gets its interval by each method, from the same influences x_gf of locations g and frames
 f. Prints a table in Markdown: the share of intervals that hold their target, and the median half width beside the
@@ -17,11 +17,12 @@ times as wide.
 
 from __future__ import annotations
 
-import argparse
 import math
 from collections.abc import Callable, Iterator, Mapping
+from typing import Literal
 from unittest import mock
 
+import cases
 import intervals as study
 import numpy as np
 from flights import Flight, fly, number_of, sums_of, totals_of, world
@@ -121,25 +122,13 @@ def rows(flight: Flight, key: str, count: int, seed: int, scope: Scope) -> Mappi
     return result
 
 
-def main() -> None:
-    """Print the table."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("study", choices=["this-scene", "other-scenes"])
-    parser.add_argument("--trials", type=int, default=30)
-    parser.add_argument("--seed", type=int, default=2)
-    arguments = parser.parse_args()
-    scope = THIS_SCENE if arguments.study == "this-scene" else OTHER_SCENES
+def main(study: Literal["this-scene", "other-scenes"], trials: int = 30, seed: int = 2) -> None:
+    scope = THIS_SCENE if study == "this-scene" else OTHER_SCENES
     others = [name for name in METHODS if name != "model"]
-    head = ["condition", "of", "model held", *(f"{name} {what}" for name in others for what in ("held", "width"))]
-    print("|", " | ".join(head), "|")
-    print("|", " | ".join("---" for _ in head), "|")
+    cases.head(["condition", "of", "model held", *(f"{name} {what}" for name in others for what in ("held", "width"))])
     for name, flight, key in conditions(scope):
-        found = rows(flight, key, arguments.trials, arguments.seed, scope)
+        found = rows(flight, key, trials, seed, scope)
         cells = [name, key, f"{found['model'][0]:.3f}"]
         for other in others:
             cells += [f"{found[other][0]:.3f}", f"{found[other][1] / found['model'][1]:.2f}"]
-        print("|", " | ".join(cells), "|", flush=True)
-
-
-if __name__ == "__main__":
-    main()
+        cases.row(cells)

@@ -35,7 +35,7 @@ configure_process()  # threads that spin would take the time of the other worker
 
 EARLY = (
     "backends", "torch_backend", "check", "city", "images", "predict", "packaging",
-    "benchmarks", "study_executors", "declared", "online_metric",
+    "performance", "study_executors", "declared", "online_metric",
 )  # fmt: skip
 """Files that run first: the one that compiles the loops, beside it some that need none, and those that take long."""
 

@@ -226,7 +226,7 @@ def test_a_class_that_is_nowhere_has_no_value_and_ends_are_one_sided():
 
 
 def test_simulated_pairs_without_a_difference_seldom_fail_and_a_loss_of_the_margin_seldom_passes():
-    """A small part of simulations/gate.py; docs/gate.md has the whole table."""
+    """A small part of `simulations/simulate.py gate`; docs/gate.md has the whole table."""
     margin, fails_, _, passes, _, _ = simulation.rates(Flight(32, 1.5, 1.0, 15, 15, "uneven"), 25, 0)
     assert 0.03 < margin < 0.12
     assert fails_ <= 0.12

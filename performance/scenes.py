@@ -1,4 +1,4 @@
-"""Frames for the benchmarks, drawn at random: boxes on a plane, walls round a camera, or slopes, cast by Open3D.
+"""Frames drawn at random: boxes on a plane, walls round a camera, or slopes, cast by Open3D.
 
 Nothing is tuned to a scene: what is drawn, in what size, from where and with which errors is up to a random generator.
 """

@@ -1,8 +1,5 @@
 """Time of one frame through backend `torch`, its input on the device already, beside the floor and the CPU backends.
 
-    python benchmarks/bench_gpu.py [--json FILE] [--device CUDA:0] [--sizes 3840x2160] [--classes 7 20]
-                                   [--voxels 1000000 20000000] [--rounds 50] [--logits float16]
-
 The map grows by one view fused at ever new places; then places chosen at random are fused again, as ids, as logits, and
 as ids of three models at once. Medians of `rounds` frames by CUDA events, after a warm-up. The floor is the bytes
 that must move (depth, ids or logits, and the rows of the touched voxels, read and written) over the bandwidth of a copy
@@ -11,14 +8,14 @@ on the device. At the end the maps of torch and numba are compared, voxel by vox
 
 from __future__ import annotations
 
-import argparse
 import dataclasses
-import logging
+import itertools
 from collections.abc import Callable
 from statistics import median
-from typing import Any
+from typing import Any, Literal
 
 import flight
+import measuring
 import numpy as np
 import torch
 
@@ -26,7 +23,6 @@ import semstab
 from semstab import backends
 from semstab.backends.torch_map import TorchMap, TorchMaps
 from semstab.backends.torch_storage import Columns, TensorPrediction
-from semstab.core.files import write_json
 from semstab.data.results import UnitName
 from semstab.metrics import compare
 
@@ -64,7 +60,7 @@ def seconds(work: Callable[[int], Any], places: list[int], device: torch.device)
     warm_up = places[:WARM_UP]
     for place in [*warm_up, *places]:
         if device.type != "cuda":
-            times.append(flight.milliseconds(work, place) / 1e3)
+            times.append(measuring.wall_ms(work, place) / 1e3)
             continue
         start, end = torch.cuda.Event(enable_timing=True), torch.cuda.Event(enable_timing=True)
         start.record()
@@ -83,35 +79,37 @@ def copy_bandwidth(device: torch.device, megabytes: int) -> float:
     return 2 * source.numel() * source.element_size() / best
 
 
-def measure(case: Case, K: int, voxels: int, arguments: argparse.Namespace) -> list[dict[str, Any]]:
-    """Rows of the table for one map: ids, logits, and ids of several models on a map of the first size."""
-    backend = TorchMap(VOXEL_SIZE, K, device=arguments.device, reserve=voxels + voxels // 5)
+def measure(
+    case: Case, K: int, voxels: int, device: str, rounds: int, logits: str, *, several: bool
+) -> list[dict[str, Any]]:
+    """Rows of the table for one map: ids, logits, and ids of several models."""
+    backend = TorchMap(VOXEL_SIZE, K, device=device, reserve=voxels + voxels // 5)
     places = seen = 0
     while seen < voxels:
         report = backend.integrate_tensors(*case.view(places), index=places, labels=case.ids)
         seen, touched = report.map_voxels, report.voxels
         places += 1
-    visits = np.random.default_rng(0).integers(0, places, arguments.rounds).tolist()
+    visits = np.random.default_rng(0).integers(0, places, rounds).tolist()
     row_bytes = Columns(K, torch.float64, torch.device("cpu")).row_bytes
     of_rows, pixels = 2 * touched * row_bytes, case.depth.numel()
 
     def fuse(place: int, **said: torch.Tensor) -> None:
         backend.integrate_tensors(*case.view(place), index=place, **said)
 
-    several = TorchMaps(VOXEL_SIZE, dict.fromkeys("abc"[:MODELS], K), device=arguments.device)
+    maps = TorchMaps(VOXEL_SIZE, dict.fromkeys("abc"[:MODELS], K), device=device)
 
     def fuse_several(place: int) -> None:
         said = {name: TensorPrediction(labels=case.ids) for name in "abc"[:MODELS]}
-        several.integrate_tensors(*case.view(place % 4), said, index=place)
+        maps.integrate_tensors(*case.view(place % 4), said, index=place)
 
     works: dict[str, tuple[Callable[[int], None], int]] = {
         "ids": (lambda place: fuse(place, labels=case.ids), pixels * 5 + of_rows),
-        f"{arguments.logits} logits": (
+        f"{logits} logits": (
             lambda place: fuse(place, logits=case.logits),
             pixels * (4 + K * case.logits.element_size()) + of_rows,
         ),
     }
-    if voxels == min(arguments.voxels):
+    if several:
         works[f"ids x{MODELS}"] = (fuse_several, pixels * (4 + MODELS) + MODELS * of_rows)
     return [
         {"voxels": seen, "input": name, "seconds": seconds(work, visits, backend.device), "bytes": size}
@@ -123,14 +121,14 @@ def on_the_cpu(frame: semstab.Frame, K: int, name: str, rounds: int) -> dict[str
     """The row of another backend: the median time of a frame that it has seen before."""
     backend = backends.create(name, voxel_size=VOXEL_SIZE, num_classes=K)
     voxels = backend.integrate(frame).map_voxels
-    times = [flight.milliseconds(backend.integrate, frame) for _ in range(rounds)]
+    times = [measuring.wall_ms(backend.integrate, frame) for _ in range(rounds)]
     return {"voxels": voxels, "input": "ids", "seconds": median(times) / 1e3, "bytes": None}
 
 
-def agreement(K: int, size: tuple[int, int], arguments: argparse.Namespace) -> bool:
+def agreement(K: int, size: tuple[int, int], device: str) -> bool:
     """Whether torch and numba leave the same map of four frames."""
     tables = []
-    for name, options in (("torch", {"device": arguments.device}), ("numba", {})):
+    for name, options in (("torch", {"device": device}), ("numba", {})):
         backend = backends.create(name, voxel_size=VOXEL_SIZE, num_classes=K, **options)
         for index in range(4):
             backend.integrate(flight.frame(index, *size, K))
@@ -139,51 +137,34 @@ def agreement(K: int, size: tuple[int, int], arguments: argparse.Namespace) -> b
     return compare(tables[0], tables[1], units).agrees
 
 
-def main() -> None:
-    """Print the table."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--json", help="also write the figures there")
-    parser.add_argument("--device", default="CUDA:0" if torch.cuda.is_available() else "CPU:0")
-    parser.add_argument("--sizes", nargs="+", default=["3840x2160"])
-    parser.add_argument("--classes", nargs="+", type=int, default=[7, 20])
-    parser.add_argument("--voxels", nargs="+", type=int, default=[1_000_000, 20_000_000])
-    parser.add_argument("--rounds", type=int, default=50)
-    parser.add_argument("--logits", choices=["float16", "bfloat16", "float32"], default="float16")
-    parser.add_argument("--cpu-backends", nargs="*", default=["numba", "open3d"])
-    parser.add_argument("--copied-megabytes", type=int, default=1024)
-    arguments = parser.parse_args()
-    logging.getLogger("semstab").setLevel(logging.ERROR)
-    device = TorchMap(VOXEL_SIZE, 2, device=arguments.device).device
-    bandwidth = copy_bandwidth(device, arguments.copied_megabytes)
-    name = torch.cuda.get_device_name(device) if device.type == "cuda" else "CPU"
-    print(f"{name}, torch {torch.__version__}; a copy moves {bandwidth / 1e9:.0f} GB/s")
-    print(f"{'size':>10} {'K':>4} {'voxels':>12}  {'input':<16} {'by':<8} {'ms':>9} {'floor ms':>9} {'ratio':>7}")
-    rows = []
-
-    def say(size: str, K: int, row: dict[str, Any], by: str) -> None:
-        floor = row["bytes"] / bandwidth if row["bytes"] else None
-        rows.append(row | {"size": size, "K": K, "by": by, "floor_seconds": floor})
-        beside = f"{1e3 * floor:9.3f} {row['seconds'] / floor:6.1f}x" if floor else ""
-        line = (
-            f"{size:>10} {K:>4} {row['voxels']:>12,}  {row['input']:<16} {by:<8} {1e3 * row['seconds']:9.3f} {beside}"
-        )
-        print(line.rstrip(), flush=True)
-
-    for size in arguments.sizes:
-        width, height = map(int, size.split("x"))
-        for K in arguments.classes:
-            case = Case.of(flight.frame(0, width, height, K), K, getattr(torch, arguments.logits), device)
-            for voxels in arguments.voxels:
-                for row in measure(case, K, voxels, arguments):
-                    say(size, K, row, "torch")
-            for by in arguments.cpu_backends:
-                say(size, K, on_the_cpu(case.frame, K, by, min(arguments.rounds, 10)), by)
-    agrees = agreement(arguments.classes[0], (width, height), arguments)
-    print(f"torch and numba {'agree' if agrees else 'DISAGREE'}")
-    if arguments.json:
-        about = {"device": name, "torch": torch.__version__}
-        write_json(arguments.json, about | {"copy_bytes_per_second": bandwidth, "agrees": agrees, "rows": rows})
-
-
-if __name__ == "__main__":
-    main()
+def main(
+    device: str = "CUDA:0" if torch.cuda.is_available() else "CPU:0",
+    sizes: tuple[str, ...] = ("3840x2160",),
+    classes: tuple[int, ...] = (7, 20),
+    voxels: tuple[int, ...] = (1_000_000, 20_000_000),
+    rounds: int = 50,
+    logits: Literal["float16", "bfloat16", "float32"] = "float16",
+    cpu_backends: tuple[str, ...] = ("numba", "open3d"),
+    copied_megabytes: int = 1024,
+) -> Any:
+    there = TorchMap(VOXEL_SIZE, 2, device=device).device
+    bandwidth = copy_bandwidth(there, copied_megabytes)
+    name = torch.cuda.get_device_name(there) if there.type == "cuda" else "CPU"
+    print(f"{name}, torch {torch.__version__}; a copy moves {bandwidth / 1e9:.0f} GB/s\n")
+    table = measuring.Table(size="", K="", voxels=",", input="", by="", ms=".3f", floor_ms=".3f", ratio=".1f")
+    for size, K in itertools.product(sizes, classes):
+        case = Case.of(flight.frame(0, *measuring.sides(size), K), K, getattr(torch, logits), there)
+        rows = [
+            {"by": "torch", **row}
+            for wanted in voxels
+            for row in measure(case, K, wanted, device, rounds, logits, several=wanted == min(voxels))
+        ]
+        rows += [{"by": by, **on_the_cpu(case.frame, K, by, min(rounds, 10))} for by in cpu_backends]
+        for row in rows:
+            floor = row["bytes"] / bandwidth if row["bytes"] else None
+            beside = {"floor_ms": 1e3 * floor, "ratio": row["seconds"] / floor} if floor else {}
+            table.add(size=size, K=K, ms=1e3 * row["seconds"], **row, **beside)
+    agrees = agreement(classes[0], measuring.sides(sizes[-1]), device)
+    print(f"\ntorch and numba {'agree' if agrees else 'DISAGREE'}")
+    about = {"device": name, "torch": torch.__version__, "copy_bytes_per_second": bandwidth}
+    return about | {"agrees": agrees, "rows": table.rows}

@@ -1,4 +1,4 @@
-"""The command, which also says what each stage took: `python benchmarks/staged.py FILE.json run --data ...`.
+"""The command, which also says what each stage took: `python performance/staged.py FILE.json run --data ...`.
 
 CPU seconds (of the main thread, and of all threads) and peak resident memory by stage of the stopwatch, as JSON. Where
 numba has one thread, what the main thread takes in the stages of a frame is theirs; images are decoded in others.

@@ -1,10 +1,8 @@
-"""Frames for the benchmarks: a UAV at 45 m over blocks of houses, of whose labels 2 % err; or in a noisy street."""
+"""Frames: a UAV at 45 m over blocks of houses, of whose labels 2 % err; or in a noisy street."""
 
 from __future__ import annotations
 
 import functools
-import time
-from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -118,10 +116,3 @@ def street(
     f = width / (2 * np.tan(np.radians(35)))
     camera = semstab.Intrinsics(f, f, width / 2, height / 2)
     return semstab.Frame(index=index, depth=depth, labels=label.astype(np.uint8), intrinsics=camera, T_wc=T_wc)
-
-
-def milliseconds(work: Callable[..., Any], *arguments: Any) -> float:
-    """Return wall-clock time of one call."""
-    started = time.perf_counter()
-    work(*arguments)
-    return 1e3 * (time.perf_counter() - started)

@@ -1,9 +1,11 @@
-"""Frames for the benchmarks: a camera that walks round a furnished room, 640x480, and sees each place again and again.
+"""Frames: a camera that walks round a furnished room, 640x480, and sees each place again and again.
 
 Depth has noise, labels err in patches, anew in each frame, and at the edges of things.
 """
 
 from __future__ import annotations
+
+import dataclasses
 
 import numpy as np
 
@@ -47,6 +49,14 @@ def frame(index: int, width: int = 640, height: int = 480, K: int = 7, step: int
         intrinsics=semstab.Intrinsics(f, f, width / 2, height / 2),
         T_wc=T_wc,
     )
+
+
+def smaller(index: int, width: int, height: int, K: int, times: float) -> semstab.Frame:
+    """Frame `index` of a walk round a room that is so many times as large."""
+    made = frame(index, width, height, K)
+    pose = made.T_wc.copy()
+    pose[:3, 3] *= times
+    return dataclasses.replace(made, depth=(made.depth * times).astype(np.float32), T_wc=pose)
 
 
 def _cast(eye: np.ndarray, ray: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

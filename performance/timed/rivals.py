@@ -1,9 +1,5 @@
 """CPU time, memory, voxels and labels of semstab's fusion beside other programs that fuse the same points.
 
-    python benchmarks/bench_rivals.py [--pyslam FOLDER] [--rival "NAME=PROGRAM WORDS" ...]
-                                      [--commit NAME=FOLDER_OR_HASH ...] [--size 640x480] [--frames 20] [--classes 7]
-                                      [--voxel-size 0.02] [--rounds 1] [--json FILE]
-
 A camera walks round a noisy room; 12 % of the patches of its label maps err. Each implementation runs as a program of
 its own on one core, and they take turns. The columns:
 
@@ -14,6 +10,7 @@ its own on one core, and they take turns. The columns:
 - label differs: share of their common voxels with another most likely class; without ties: of those where the largest
   evidence of numba's map is one class's
 
+`--rival "NAME=PROGRAM WORDS" ...` names other programs, `--commit NAME=FOLDER ...` or `=HASH` the state of each.
 `--pyslam` names your checkout of pySLAM (luigifreda/pyslam). Its semantic voxel blocks (cpp/volumetric) are compiled
 with the driver rivals/pyslam.cpp and pySLAM's own flags; this needs g++ and headers, on Debian and Ubuntu
 
@@ -36,9 +33,7 @@ its voxels would not be those of the points.
 
 from __future__ import annotations
 
-import argparse
 import json
-import logging
 import os
 import shlex
 import shutil
@@ -46,35 +41,29 @@ import subprocess
 import sys
 import sysconfig
 import tempfile
-import time
-from collections import defaultdict
 from collections.abc import Callable, Sequence
+from functools import partial
 from pathlib import Path
 from statistics import median
-from typing import Any
+from typing import Any, Literal
 
-from semstab.core.process import configure_process, trim_malloc
+import measuring
+import numpy as np
+import room
 
-configure_process()  # as the command line does, before anything starts threads
-
-import numpy as np  # noqa: E402
-import room  # noqa: E402
-from bench_statistics import resident  # noqa: E402
-
-import semstab  # noqa: E402
-from semstab import backends  # noqa: E402
-from semstab.core.files import write_json  # noqa: E402
-from semstab.metrics import dominant  # noqa: E402
+import semstab
+from semstab import backends
+from semstab.core.process import resident_bytes, trim_malloc
+from semstab.metrics import dominant
 
 BASELINE, OURS, IMAGES = "Open3D integrate", "semstab numba", "semstab numba, depth images"
 OWN = {BASELINE: "open3d", OURS: "points", IMAGES: "images"}
-HEADER = "| implementation | CPU ms | faster | voxels | bytes | peak | missing | extra | label differs | without ties |"
+BENCH = Path(__file__).parents[1] / "bench.py"
 
 
 def seen(size: str, frames: int, K: int) -> list[semstab.Frame]:
     """The frames of the walk."""
-    width, height = map(int, size.split("x"))
-    return [room.frame(index, width, height, K) for index in range(frames)]
+    return [room.frame(index, *measuring.sides(size), K) for index in range(frames)]
 
 
 def world(frame: semstab.Frame) -> tuple[Any, Any]:
@@ -108,40 +97,33 @@ def highest() -> int:
     return 1024 * int(status.split("VmHWM:")[1].split()[0])
 
 
-def fuse(kind: str, out: Path, arguments: argparse.Namespace) -> None:
+def fuse(kind: str, out: Path, images: str, count: int, K: int, size: float) -> None:
     """Be one of our own programs: 'open3d', 'points' or 'images'."""
-    size, K = arguments.voxel_size, arguments.classes
-    small, *frames = seen("64x48", 1, K) + seen(arguments.size, arguments.frames, K)
+    small, *frames = seen("64x48", 1, K) + seen(images, count, K)
     if kind == "points":
         small, *frames = (scan(frame) for frame in (small, *frames))
     grid: list[Any] = []
-    make: Callable[[], Callable[[semstab.Frame], object]]
+
+    def make() -> Callable[[semstab.Frame], object]:
+        if kind == "open3d":
+            return fusion.open3d_integrate(size)
+        grid[:] = [backends.create("numba", voxel_size=size, num_classes=K)]
+        integrate: Callable[[semstab.Frame], object] = grid[0].integrate
+        return integrate
+
     if kind == "open3d":
-        import bench_fusion
+        from timed import fusion
 
         for frame in frames:
-            bench_fusion.prepare(frame)
+            fusion.prepare(frame)
         small = frames[0]  # it is known by its index
-
-        def make() -> Callable[[semstab.Frame], object]:
-            return bench_fusion.open3d_integrate(size)
-    else:
-
-        def make() -> Callable[[semstab.Frame], object]:
-            grid[:] = [backends.create("numba", voxel_size=size, num_classes=K)]
-            integrate: Callable[[semstab.Frame], object] = grid[0].integrate
-            return integrate
-
     make()(small)  # loads and compiles
     integrate = make()
     trim_malloc()
     Path("/proc/self/clear_refs").write_text("5")
-    before, ms = resident(), []
-    for frame in frames:
-        started = time.process_time()
-        integrate(frame)
-        ms.append(1e3 * (time.process_time() - started))
-    report = {"ms": ms, "bytes": resident() - before, "peak_bytes": highest() - before}
+    before = resident_bytes()
+    ms = [measuring.cpu_ms(integrate, frame) for frame in frames]
+    report = {"ms": ms, "bytes": resident_bytes() - before, "peak_bytes": highest() - before}
     if grid:
         table = grid[0].table()
         evidence = np.asarray(table.evidence)
@@ -190,7 +172,7 @@ def run(command: Sequence[str], files: Sequence[Path]) -> dict[str, Any]:
     return report
 
 
-def commit(given: str) -> str:
+def commit_of(given: str) -> str:
     """The commit of a checkout: of git, or of the file COMMIT in an archive; a hash is itself."""
     folder = Path(given)
     if not folder.is_dir():
@@ -209,7 +191,7 @@ def build_pyslam(checkout: Path, folder: Path) -> dict[str, str]:
         *(f"-I{headers}" for headers in (
             checkout / "cpp/volumetric", "/usr/include/eigen3", "/usr/include/opencv4", sysconfig.get_path("include"),
         )),
-        str(Path(__file__).with_name("rivals") / "pyslam.cpp"), "-o", str(program), "-ltbb",
+        str(BENCH.with_name("rivals") / "pyslam.cpp"), "-o", str(program), "-ltbb",
         f"-L{libraries}", f"-Wl,-rpath,{libraries}", f"-lpython{sysconfig.get_config_var('LDVERSION')}",
     ]  # fmt: skip
     try:
@@ -227,81 +209,50 @@ def named(given: Sequence[str]) -> dict[str, str]:
     return {name: value for name, _, value in (one.partition("=") for one in given)}
 
 
-def line(row: dict[str, Any]) -> str:
-    """A row of the table."""
-    cells = [row["name"], f"{row['ms']:.1f}", f"{row['faster']:.2f}"]
-    cells += [f"{row[key]:,.0f}" if row.get(key) is not None else "" for key in ("voxels", "bytes", "peak")]
-    cells += [f"{row[key]:,}" if key in row else "" for key in ("missing", "extra")]
-    cells += [
-        f"{100 * row[key]:.2f} %" if row.get(key) is not None else "" for key in ("label_differs", "without_ties")
-    ]
-    return "| " + " | ".join(cells) + " |"
-
-
-def measure(arguments: argparse.Namespace, rivals: dict[str, str], folder: Path) -> list[dict[str, Any]]:
-    """Rows of the table: Open3D, ours, then the rivals in the order given."""
-    frames = seen(arguments.size, arguments.frames, arguments.classes)
-    given = folder / "frames.bin"
-    write_frames(given, frames, arguments.voxel_size, arguments.classes)
-    options = ["--size", arguments.size, "--frames", str(arguments.frames), "--classes", str(arguments.classes),
-               "--voxel-size", str(arguments.voxel_size)]  # fmt: skip
-    commands = {name: [sys.executable, __file__, *options, "--as", kind] for name, kind in OWN.items()}
-    commands |= {name: shlex.split(words) for name, words in rivals.items()}
-    out = {name: folder / f"{k}.bin" for k, name in enumerate(commands)}
-    reports = defaultdict(list)
-    for _ in range(arguments.rounds):
-        for name, command in commands.items():
-            reports[name].append(run(command, [out[name]] if name in OWN else [given, out[name]]))
-    maps = {name: read_map(path, arguments.voxel_size) for name, path in out.items() if path.exists()}
-    ms = {name: median([t for r in some for t in r["ms"][1:]]) for name, some in reports.items()}
-    rows = []
-    for name, some in reports.items():
-        row = {"name": name, "ms": ms[name], "faster": ms[BASELINE] / ms[name]}
-        if name in maps:
-            row |= compared(maps[OURS], maps[name])
-            row |= {short: median([r[key] for r in some]) / max(1, row["voxels"])
-                    for short, key in (("bytes", "bytes"), ("peak", "peak_bytes"))}  # fmt: skip
-        rows.append(row)
-    return rows
-
-
-def main() -> None:
-    """Print the table."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--pyslam", type=Path, metavar="FOLDER", help="a checkout of pySLAM, to be compiled")
-    parser.add_argument("--rival", action="append", default=[], help="NAME=PROGRAM WORDS, again for each")
-    parser.add_argument("--commit", action="append", default=[], help="NAME=FOLDER of its checkout, or =HASH")
-    parser.add_argument("--size", default="640x480")
-    parser.add_argument("--frames", type=int, default=20)
-    parser.add_argument("--classes", type=int, default=7)
-    parser.add_argument("--voxel-size", type=float, default=0.02)
-    parser.add_argument("--rounds", type=int, default=1)
-    parser.add_argument("--json", help="also write the figures there")
-    parser.add_argument("--as", dest="kind", choices=list(OWN.values()), help=argparse.SUPPRESS)
-    parser.add_argument("out", nargs="?", type=Path, help=argparse.SUPPRESS)
-    arguments = parser.parse_args()
-    logging.getLogger("semstab").setLevel(logging.ERROR)
-    if arguments.kind:
-        fuse(arguments.kind, arguments.out, arguments)
-        return
-    commits = {name: commit(given) for name, given in named(arguments.commit).items()}
-    with tempfile.TemporaryDirectory() as folder:
-        rivals = named(arguments.rival)
-        if arguments.pyslam:
-            rivals = build_pyslam(arguments.pyslam, Path(folder)) | rivals
-            commits = {"pySLAM": commit(str(arguments.pyslam))} | commits
-        rows = measure(arguments, rivals, Path(folder))
-    print(
-        f"{arguments.frames} frames of {arguments.size}, K = {arguments.classes}, {arguments.voxel_size:g} m, one core"
-    )
-    for name, which in commits.items():
-        print(f"{name}: {which}")
-    print(f"{HEADER}\n|---|{'---:|' * (HEADER.count('|') - 2)}")
-    for row in rows:
-        print(line(row), flush=True)
-    if arguments.json:
-        write_json(arguments.json, {"commits": commits, "rows": rows})
-
-
-if __name__ == "__main__":
-    main()
+def main(
+    pyslam: Path | None = None,
+    rival: tuple[str, ...] = (),
+    commit: tuple[str, ...] = (),
+    size: str = "640x480",
+    frames: int = 20,
+    classes: int = 7,
+    voxel_size: float = 0.02,
+    rounds: int = 1,
+    one: Literal["open3d", "points", "images"] | None = None,
+    out: Path | None = None,
+) -> Any:
+    if one and out:  # in a process of its own
+        fuse(one, out, size, frames, classes, voxel_size)
+        return None
+    commits = {name: commit_of(given) for name, given in named(commit).items()}
+    options = ["--size", size, "--frames", str(frames), "--classes", str(classes), "--voxel-size", str(voxel_size)]
+    with tempfile.TemporaryDirectory() as name:
+        folder, rivals = Path(name), named(rival)
+        if pyslam:
+            rivals = build_pyslam(pyslam, folder) | rivals
+            commits = {"pySLAM": commit_of(str(pyslam))} | commits
+        given = folder / "frames.bin"
+        write_frames(given, seen(size, frames, classes), voxel_size, classes)
+        maps = {name: folder / f"{k}.bin" for k, name in enumerate((*OWN, *rivals))}
+        works: dict[str, Callable[[], Any]] = {
+            name: partial(run, [sys.executable, str(BENCH), "rivals", *options, "--one", kind, "--out"], [maps[name]])
+            for name, kind in OWN.items()
+        }
+        works |= {name: partial(run, shlex.split(words), [given, maps[name]]) for name, words in rivals.items()}
+        reports = measuring.in_turns(works, rounds, warm=0)
+        found = {name: read_map(path, voxel_size) for name, path in maps.items() if path.exists()}
+    print(f"{frames} frames of {size}, K = {classes}, {voxel_size:g} m, one core")
+    print(*(f"{name}: {which}" for name, which in commits.items()), sep="\n", end="\n\n")
+    table = measuring.Table(
+        implementation="", CPU_ms=".1f", faster=".2f", voxels=",", bytes=",.0f", peak=",.0f", missing=",", extra=",",
+        label_differs=".2%", without_ties=".2%",
+    )  # fmt: skip
+    ms = {name: median([t for r in own for t in r["ms"][1:]]) for name, own in reports.items()}
+    for name, own in reports.items():
+        row = compared(found[OURS], found[name]) if name in found else {}
+        if row:
+            row["bytes"], row["peak"] = (
+                median(r[k] for r in own) / max(1, row["voxels"]) for k in ("bytes", "peak_bytes")
+            )
+        table.add(implementation=name, CPU_ms=ms[name], faster=ms[BASELINE] / ms[name], **row)
+    return {"commits": commits, "rows": table.rows}

@@ -1,7 +1,5 @@
 """True errors that the first tasks of `export --format` hold, beside as many regions chosen without a map.
 
-    python benchmarks/bench_annotation.py RUN --model fcn --scores fcn-scores     # a run of shared/data/apc_shelf
-
 The others are windows as large as the tasks, pixel by pixel the same budget: where the scores of a single image have
 the highest entropy (without windows that overlap in one image), at random, and at random on an edge between two
 classes. Wrong are pixels with depth whose label is not the truth: those in the regions, and those of all frames at the
@@ -10,10 +8,11 @@ voxels that the regions show, which a label of the place mends; wrong voxels hav
 
 from __future__ import annotations
 
-import argparse
+import contextlib
 from pathlib import Path
 
 import cv2
+import measuring
 import numpy as np
 
 import semstab
@@ -95,19 +94,15 @@ def at_random(images, areas, rng, *, edges):
     return chosen
 
 
-def main():
-    """Print the table."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("run", type=Path)
-    parser.add_argument("--model", required=True)
-    parser.add_argument("--scores", required=True, help="label source with scores of the same model")
-    parser.add_argument("--most", type=int, default=50)
-    options = parser.parse_args()
-    result = semstab.load_result(options.run)
-    record, soft = (result.record(model=name) for name in (options.model, options.scores))
-    (task, _), (scores, _) = (task_of(options.run, own, result.manifest["inputs"]) for own in (record, soft))
-    tasks = annotation_tasks(Chosen(result, record, columns=("op",)), task, options.most)
-    images = Images(task, scores, Chosen(result, record, columns=("op",)).first.table.voxel_size)
+def main(run: Path, model: str = "fcn", scores: str = "fcn-scores", most: int = 50):
+    result = semstab.load_result(run)
+    record, soft = (result.record(model=name) for name in (model, scores))
+    with contextlib.ExitStack() as open_tasks:
+        task, soft_task = (
+            open_tasks.enter_context(task_of(run, own, result.manifest["inputs"]))[0] for own in (record, soft)
+        )
+        tasks = annotation_tasks(Chosen(result, record, columns=("op",)), task, most)
+        images = Images(task, soft_task, Chosen(result, record, columns=("op",)).first.table.voxel_size)
     masks = []
     for one in tasks:
         mask = np.zeros(one.size[::-1], np.uint8)
@@ -121,12 +116,19 @@ def main():
     for name, edges in (("random on an edge of labels", True), ("random", False)):
         drawn = [images.held(at_random(images, areas, np.random.default_rng(s), edges=edges)) for s in range(20)]
         rows[name] = tuple(float(np.mean(values)) for values in zip(*drawn, strict=True))
-    print(f"{'':28}{'pixels':>9}{'wrong':>9}{'share':>8}{'voxels':>9}{'wrong in all frames':>22}{'wrong voxels':>15}")
+    table = measuring.Table(
+        regions="",
+        pixels=",.0f",
+        wrong=",.0f",
+        share=".1%",
+        voxels=",.0f",
+        wrong_in_all_frames=",.0f",
+        wrong_voxels=",.0f",
+    )
     for name, (pixels, wrong, voxels, everywhere, places) in rows.items():
-        print(f"{name:28}{pixels:9,.0f}{wrong:9,.0f}{wrong / pixels:8.1%}{voxels:9,.0f}", end="")
-        print(f"{everywhere:22,.0f}{places:15,.0f}")
-    print(f"{'all':57}{len(images.errors):6,}{images.errors.sum():22,}{np.count_nonzero(images.errors):15,}")
-
-
-if __name__ == "__main__":
-    main()
+        table.add(regions=name, pixels=pixels, wrong=wrong, share=wrong / pixels, voxels=voxels,
+                  wrong_in_all_frames=everywhere, wrong_voxels=places)  # fmt: skip
+    errors = images.errors
+    table.add(regions="all there are", voxels=len(errors), wrong_in_all_frames=int(errors.sum()),
+              wrong_voxels=int(np.count_nonzero(errors)))  # fmt: skip
+    return table.rows
