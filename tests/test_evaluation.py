@@ -142,7 +142,7 @@ def test_a_run_that_was_interrupted_ends_with_the_same_statistics(tmp_path) -> N
         semstab.run(config, out=tmp_path / "run", observers=[Interrupting()], report=False)
     resumed = semstab.run(config, out=tmp_path / "run", report=False)
     assert [to_json(entry.statistics) for entry in resumed.runs] == [to_json(entry.statistics) for entry in whole.runs]
-    assert whole.runs[0].statistics.correctness.accuracy.value > 0.5  # the truth was fused again
+    assert whole.runs[0].statistics.correctness.accuracy_op2.value > 0.5  # the truth was fused again
 
 
 def test_the_first_backend_that_keeps_a_log_has_all_statistics(tmp_path) -> None:
@@ -152,7 +152,9 @@ def test_the_first_backend_that_keeps_a_log_has_all_statistics(tmp_path) -> None
     assert open3d.statistics.drift.flips is None
     assert open3d.statistics.correctness is not None
     assert numpy.statistics.drift.flips is not None
-    assert numpy.statistics.agreement.voxel_alpha.value == pytest.approx(open3d.statistics.agreement.voxel_alpha.value)
+    assert numpy.statistics.agreement.voxel_alpha_op2.value == pytest.approx(
+        open3d.statistics.agreement.voxel_alpha_op2.value
+    )
     assert numpy.statistics.headline.alpha.value == open3d.statistics.headline.alpha.value
     plain = semstab.run(configure(root, backends=["open3d"], check="numpy"), report=False)
     assert [entry.statistics is not None for entry in plain.runs] == [True, False]
@@ -162,7 +164,7 @@ def test_frames_without_ground_truth_are_left_out_of_the_truth(tmp_path) -> None
     root = tiny_scene.write(tmp_path / "wall", ("a",), frames=4)
     (root / "labels/gt/0002.png").unlink()
     (entry,) = semstab.run(configure(root, statistics=True), report=False).runs
-    assert entry.statistics.correctness.accuracy.value > 0.5
+    assert entry.statistics.correctness.accuracy_op2.value > 0.5
 
 
 def test_no_ground_truth_no_judgement(tmp_path) -> None:
@@ -233,7 +235,7 @@ def test_the_tables_of_a_study_have_the_numbers_of_its_units(studied) -> None:
     base = {record.unit.model: record.statistics for record in found.select()}
     for row in rows_of(found, "temporal_agreement"):
         own = base[row["model"]]
-        assert row["psa"] == pytest.approx(dataclasses.asdict(own.agreement.psa), nan_ok=True)
+        assert row["psa"] == pytest.approx(dataclasses.asdict(own.agreement.psa_op2), nan_ok=True)
         assert row["flip_rate"] == own.drift.flips.rate.value
     for row in rows_of(found, "drift"):
         assert row["voxels"] == base[row["model"]].drift.voxels
@@ -261,7 +263,7 @@ def test_agreement_stands_beside_the_sweep(studied) -> None:
     found, _ = studied
     rows = [row for row in rows_of(found, "sensitivity_agreement_depth_noise") if row["model"] == "a"]
     (still,), noisy = (found.select("depth_noise", model="a", value=value) for value in (0, 0.05))
-    assert rows[0]["psa"] == still.statistics.agreement.psa.value
+    assert rows[0]["psa"] == still.statistics.agreement.psa_op2.value
     alphas = [record.statistics.headline.alpha.value for record in noisy]
     assert rows[1]["alpha"]["mean"] == pytest.approx(np.mean(alphas))
     assert rows[1]["alpha"]["sd"] == pytest.approx(np.std(alphas, ddof=1))
@@ -285,7 +287,7 @@ def test_the_mean_of_several_scenes_counts_each_once() -> None:
         for r in records
     ]
     *_, total = rows_of(study(*judged), "uncertainty")
-    entropies = [record.statistics.uncertainty.entropy.value for record in judged]
+    entropies = [record.statistics.uncertainty.entropy_op2.value for record in judged]
     assert total["scene"] == "Mean"
     assert total["entropy"] == pytest.approx(np.mean(entropies))
 

@@ -44,14 +44,14 @@ def numbers_of(record):
         "alpha": own.headline.alpha.value,
         "VSS (OP>=3)": recurrent.means.value["vss"],
         "SBD (OP>=3)": recurrent.means.value["sbd"],
-        "PSA (OP>=2)": own.headline.psa.value,
+        "PSA (OP>=2)": own.headline.psa_op2.value,
         "flicker, %": record.image_space.compensated_flicker_percent,
     }
     if own.correctness is not None:
         found |= {
-            "accuracy (OP>=2)": own.correctness.accuracy.value,
-            "mIoU (OP>=2)": own.correctness.miou.value,
-            "consistent but wrong (OP>=3)": own.headline.wrong_of_consistent.value,
+            "accuracy (OP>=2)": own.correctness.accuracy_op2.value,
+            "mIoU (OP>=2)": own.correctness.miou_op2.value,
+            "consistent but wrong (OP>=3)": own.headline.wrong_of_consistent_op3.value,
         }
     return found
 

@@ -129,8 +129,8 @@ def test_the_frame_series_ends_where_the_table_is(root, tmp_path) -> None:
         text = (out / "frames" / f"{run.unit.slug}.csv").read_text().splitlines()
         last = dict(zip(text[0].split(","), text[-1].split(","), strict=True))
         assert int(last["map_voxels"]) == run.table.voxels
-        assert float(last["map_vss"]) == pytest.approx(run.table[VSS], abs=1e-12)
-        assert float(last["map_entropy"]) == pytest.approx(run.table[ENTROPY], abs=1e-12)
+        assert float(last["map_vss_all"]) == pytest.approx(run.table[VSS], abs=1e-12)
+        assert float(last["map_entropy_all"]) == pytest.approx(run.table[ENTROPY], abs=1e-12)
         assert float(last["map_recurrent"]) == pytest.approx(run.table.recurrent.share, abs=1e-12)
 
 

@@ -59,7 +59,7 @@ def test_a_description_is_content_for_json_and_every_voxel_has_a_value(described
     write_json(tmp_path / "statistics.json", described.summary)
     content = read_json(tmp_path / "statistics.json")
     assert content["schema"] == 3
-    assert content["agreement"]["voxel_alpha"]["value"] == described.summary.agreement.voxel_alpha.value
+    assert content["agreement"]["voxel_alpha"]["value"] == described.summary.agreement.voxel_alpha_op2.value
     assert content["headline"]["alpha"]["value"] == described.summary.headline.alpha.value
     assert content["strata"][0]["psa"] is None
     assert math.isnan(described.summary.strata[0].psa)
@@ -92,7 +92,7 @@ def test_a_description_holds_what_the_functions_say(described):
     table, summary = events.table(), described.summary
     repeated = table.op >= 2
     assert (summary.repeated.voxels, summary.repeated.share) == (repeated.sum(), pytest.approx(repeated.mean()))
-    assert summary.agreement.voxel_alpha.value == pytest.approx(krippendorff_alpha(table))
+    assert summary.agreement.voxel_alpha_op2.value == pytest.approx(krippendorff_alpha(table))
     assert summary.headline.alpha.value == pytest.approx(krippendorff_alpha(table))  # each spot is alone in its voxel
     found = summary.spots
     assert (found.spots, found.views, found.frames, found.spacing) == (repeated.sum(), F, F, 0.125)
@@ -108,7 +108,7 @@ def test_a_description_holds_what_the_functions_say(described):
     assert parts.entropy.value == pytest.approx(parts.within.value + parts.between.value)
     geometry = summary.geometry
     assert geometry.geometry.value == 0
-    assert geometry.total.value == pytest.approx(1 - summary.agreement.psa.value)
+    assert geometry.total.value == pytest.approx(1 - summary.agreement.psa_op2.value)
     found = summary.correctness.quadrants
     parts_of_all = (found.consistent_right, found.consistent_wrong, found.inconsistent_right, found.inconsistent_wrong)
     assert sum(share.value for share in parts_of_all) == pytest.approx(1)
@@ -139,11 +139,11 @@ def values(section):
 def test_a_number_has_one_interval_wherever_it_stands():
     events = model(0.2, 0)
     found = describe(events.table(), events, events.table(), spots=spots(0.2, 0))
-    assert found.agreement.psa == found.headline.psa
-    assert found.correctness.accuracy == found.headline.accuracy
-    assert found.correctness.quadrants.wrong_of_consistent == found.headline.wrong_of_consistent
-    assert found.uncertainty.entropy.scope == found.headline.wrong_of_consistent.scope == THESE_FRAMES
-    assert found.headline.psa.scope == THIS_SCENE
+    assert found.agreement.psa_op2 == found.headline.psa_op2
+    assert found.correctness.accuracy_op2 == found.headline.accuracy_op2
+    assert found.correctness.quadrants.wrong_of_consistent_op3 == found.headline.wrong_of_consistent_op3
+    assert found.uncertainty.entropy_op2.scope == found.headline.wrong_of_consistent_op3.scope == THESE_FRAMES
+    assert found.headline.psa_op2.scope == THIS_SCENE
 
 
 def test_a_table_alone_is_described_as_far_as_it_goes():
@@ -154,7 +154,7 @@ def test_a_table_alone_is_described_as_far_as_it_goes():
     assert to_json(alone.drift.null) == to_json(logged.drift.null)
     assert values(alone.agreement) == pytest.approx(values(logged.agreement), abs=1e-12)
     assert alone.headline.alpha == logged.headline.alpha
-    assert (alone.headline.psa.scope, logged.headline.psa.scope) == (THESE_FRAMES, THIS_SCENE)
+    assert (alone.headline.psa_op2.scope, logged.headline.psa_op2.scope) == (THESE_FRAMES, THIS_SCENE)
     for found in (alone, logged):
         assert "for this scene flown again, from 8 frames" in found.verdict.line
 

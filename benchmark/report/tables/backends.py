@@ -9,8 +9,8 @@ from semstab.data.measures import measures
 from semstab.data.records import Record, Result
 from semstab.data.results import Agreement
 from semstab.report.means import Pooled, pooled
-from semstab.report.tables.stability import ALL_VOXELS, SBD_OVER, of_measures, settings
-from semstab.report.tables.table import Column, Group, Row, Table
+from semstab.report.tables.stability import SBD_OVER, of_measures, settings
+from semstab.report.tables.table import ALL_VOXELS, Column, Group, Row, Table
 
 # The fusion implementations: the same frames through every backend, and the differences of the measures.
 
