@@ -94,7 +94,7 @@ def test_the_run_folder_holds_what_the_design_promises(root, tmp_path) -> None:
     first = summary["runs"][0]
     for key in (
         "scene", "model", "backend", "K", "voxel_size", "frames", "points", "observations", "voxels", "mean_op",
-        "vss", "sbd", "entropy", "strata", "recurrent", "classes", "flicker_percent", "fuse_ms_per_frame",
+        "vss_all", "sbd_all", "entropy_all", "strata", "recurrent", "classes", "flicker_percent", "fuse_ms_per_frame",
     ):  # fmt: skip
         assert key in first
     assert first["strata"][0]["sbd"] is None

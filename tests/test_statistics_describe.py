@@ -59,7 +59,7 @@ def test_a_description_is_content_for_json_and_every_voxel_has_a_value(described
     write_json(tmp_path / "statistics.json", described.summary)
     content = read_json(tmp_path / "statistics.json")
     assert content["schema"] == 3
-    assert content["agreement"]["voxel_alpha"]["value"] == described.summary.agreement.voxel_alpha_op2.value
+    assert content["agreement"]["voxel_alpha_op2"]["value"] == described.summary.agreement.voxel_alpha_op2.value
     assert content["headline"]["alpha"]["value"] == described.summary.headline.alpha.value
     assert content["strata"][0]["psa"] is None
     assert math.isnan(described.summary.strata[0].psa)
@@ -99,7 +99,7 @@ def test_a_description_holds_what_the_functions_say(described):
     shares = table.evidence[:][repeated].sum(axis=0) / table.op[repeated].sum()
     assert found.chance == pytest.approx((shares**2).sum(), abs=0.001)
     assert (found.largest_class, found.largest_share) == (str(shares.argmax()), pytest.approx(shares.max()))
-    by_class = {row.name: row.voxel_alpha for row in summary.agreement.classes}
+    by_class = {row.name: row.voxel_alpha_op2 for row in summary.agreement.classes}
     assert {row.name: row.alpha.value for row in found.classes} == pytest.approx(by_class)
     assert summary.drift.excess.value == pytest.approx(np.nanmean(sbd(table) - expected_sbd(table)))
     flipped = summary.drift.flips

@@ -329,8 +329,8 @@ def test_statistics_come_with_every_unit_and_all_of_them_where_they_are_wanted(r
     assert gt.statistics.correctness is None
     assert all(record.statistics.voxel_size == 0.5 for record in swept)
     one, other = before[0].statistics.agreement, base.statistics.agreement
-    assert (one.kappa, one.within, one.classes) == (other.kappa, other.within, other.classes)
-    assert one.psa.value == pytest.approx(other.psa.value)  # whose interval needs the log
+    assert (one.kappa_op2, one.within, one.classes) == (other.kappa_op2, other.within, other.classes)
+    assert one.psa_op2.value == pytest.approx(other.psa_op2.value)  # whose interval needs the log
     assert before[0].statistics.drift.flips is None
     right = before[0].statistics.correctness.miou_op2.value, base.statistics.correctness.miou_op2.value
     assert right[0] == pytest.approx(right[1])  # whose interval needs the log

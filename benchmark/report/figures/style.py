@@ -100,15 +100,16 @@ def _pins(canvas: Canvas) -> list[tuple[str, str, float, float]]:
     """Return each text with a link: itself, the link, and its centre as shares of width and height from above left."""
     from matplotlib.text import Text
 
-    linked = canvas.findobj(lambda artist: isinstance(artist, Text) and bool(artist.get_url()))
+    texts = [artist for artist in canvas.findobj(Text) if isinstance(artist, Text)]
+    linked = [(text, url) for text in texts if (url := text.get_url())]
     if linked:
         canvas.set_dpi(DPI)
         canvas.draw_without_rendering()
-    boxes = [(text, text.get_window_extent()) for text in linked]
+    boxes = [(text.get_text(), url, text.get_window_extent()) for text, url in linked]
     width, height = canvas.bbox.size
     return [
-        (text.get_text(), text.get_url(), (box.x0 + box.x1) / 2 / width, 1 - (box.y0 + box.y1) / 2 / height)
-        for text, box in boxes
+        (text, url, float(box.x0 + box.x1) / 2 / width, 1 - float(box.y0 + box.y1) / 2 / height)
+        for text, url, box in boxes
     ]
 
 

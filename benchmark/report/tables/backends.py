@@ -32,7 +32,7 @@ def fusion(result: Result) -> list[Table]:
         Column("fuse_ms_per_frame", "ms per frame", 1, "lower"),
         Column("delta_voxels", "Voxels", 0, signed=True, over=DIFFERENCE),
         Column("delta_mean_op", "OP", 2, signed=True, over=DIFFERENCE),
-        *(Column(f"delta_{m.key}", m.title, m.digits[1], signed=True, over=DIFFERENCE) for m in measures()),
+        *(Column(f"delta_{m.key}_all", m.title, m.digits[1], signed=True, over=DIFFERENCE) for m in measures()),
     )
     caption = (
         f"{settings(result.select())} The means are pooled: they run over the voxels of all scenes together; ms per"
