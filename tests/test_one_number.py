@@ -112,7 +112,7 @@ def test_the_screen_has_the_numbers_of_the_record(run):
         assert lines[heads + 1].split() == ["%", "%", "OP>=3", "OP>=3", "OP>=2"]
         for model in result.models:
             *_, flicker, vss, sbd, miou = next(line.split() for line in lines[heads:] if line.split()[:1] == [model])
-            alpha = re.search(rf"{model} +\w+ +(-?\d?\.\d+)", "\n".join(lines))[1]
+            alpha = re.search(rf"^ +{model} .*? (-?\d?\.\d+)", "\n".join(lines[heads:]), re.M)[1]
             of_all = {"alpha": alpha, "compensated_flicker_percent": flicker, "vss_op3": vss, "sbd_op3": sbd}
             for key, printed in of_all.items():
                 half = 0.5 * 10.0 ** -len(printed.partition(".")[2])  # of the last digit; the table has its own
