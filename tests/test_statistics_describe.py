@@ -58,7 +58,7 @@ def described():
 def test_a_description_is_content_for_json_and_every_voxel_has_a_value(described, tmp_path):
     write_json(tmp_path / "statistics.json", described.summary)
     content = read_json(tmp_path / "statistics.json")
-    assert content["schema"] == 3
+    assert content["schema"] == 4
     assert content["agreement"]["voxel_alpha_op2"]["value"] == described.summary.agreement.voxel_alpha_op2.value
     assert content["headline"]["alpha"]["value"] == described.summary.headline.alpha.value
     assert content["strata"][0]["psa"] is None
@@ -105,7 +105,7 @@ def test_a_description_holds_what_the_functions_say(described):
     flipped = summary.drift.flips
     assert flipped.excess.value == pytest.approx(flipped.rate.value - flipped.null.value)
     parts = summary.uncertainty
-    assert parts.entropy.value == pytest.approx(parts.within.value + parts.between.value)
+    assert parts.entropy_op2.value == pytest.approx(parts.within.value + parts.between.value)
     geometry = summary.geometry
     assert geometry.geometry.value == 0
     assert geometry.total.value == pytest.approx(1 - summary.agreement.psa_op2.value)
@@ -193,7 +193,7 @@ def judged(low, high, wrong=UNKNOWN, voxels=5000, **spots):
         "largest_class": "grass", "largest_share": 0.5, "labelled": 1.0, "classes": (),
     } | spots  # fmt: skip
     return verdict(
-        "net", headline=replace(numbers, wrong_of_consistent=wrong), spots=SpotAgreement(**own), voxels=voxels,
+        "net", headline=replace(numbers, wrong_of_consistent_op3=wrong), spots=SpotAgreement(**own), voxels=voxels,
         share=0.5,
     )  # fmt: skip
 

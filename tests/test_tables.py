@@ -227,7 +227,7 @@ def test_other_backends_are_compared_with_the_base_one_on_the_scenes_that_all_fu
     assert (first["backend"], first["voxels"], first["delta_voxels"]) == ("numpy", 10, 0)
     assert (second["backend"], second["voxels"], second["delta_voxels"]) == ("other", 12, 2)
     assert second["delta_vss_all"] == pytest.approx((8 + 4 * 0.75) / 12 - 1)
-    assert second["delta_sbd"] == pytest.approx(0.4 / 12)
+    assert second["delta_sbd_all"] == pytest.approx(0.4 / 12)
     assert second["delta_mean_op"] == pytest.approx(28 / 12 - 2)
     assert "fusion" not in [table.name for table in tables(study(base[1], other))]  # no scene in common
 
