@@ -15,7 +15,7 @@ import numpy as np
 
 from semstab.comparison.differences import ComparisonData, Progress, find
 from semstab.comparison.locations import Changes
-from semstab.comparison.quantities import HEADLINES, IOU, by_key
+from semstab.comparison.quantities import HEADLINES, IOU, by_name
 from semstab.config.groups import ScopeOption, validated
 from semstab.core.files import TEMPORARY, FolderLock, keep_only, read_json, write_json, write_text
 from semstab.core.json_form import from_json
@@ -55,7 +55,7 @@ MOST_NUMBERS = 9
 def charts(comparison: RunComparison) -> dict[str, list[dict[str, str]]]:
     """Return charts of the differences with their intervals, by the name of the table above them."""
     colors = {run.name: k for k, run in enumerate(comparison.runs[1:])}
-    shown, panels, by_class = by_key(HEADLINES), Panels(), Panels()
+    shown, panels, by_class = by_name(HEADLINES), Panels(), Panels()
     for scope, against in scopes(comparison):
         for row in against.contrasts:
             if row.measure in shown:
@@ -64,7 +64,7 @@ def charts(comparison: RunComparison) -> dict[str, list[dict[str, str]]]:
     for quantity in (quantity for quantity in IN_CLASSES if quantity is not PSA):
         for own in comparison.overall if any(own.by_class for own in comparison.overall) else ():
             for row in (*own.contrasts, *own.by_class):
-                if row.measure == (MIOU.key if quantity is IOU and not row.of else quantity.key):
+                if row.measure == (MIOU.name if quantity is IOU and not row.of else quantity.name):
                     dots = by_class.setdefault(quantity.named, {}).setdefault(row.of or "all classes", [])
                     dots.append((colors[own.other], own.other, row.difference))
     less = f"less {comparison.base}"
@@ -103,26 +103,40 @@ def maps(comparison: ComparisonData, known: Mapping[str, Georeference] = Mapping
                 " between frames and, where there is ground truth, of correctness. Numbers name the areas that got"
                 " worse.",
                 f"Maps of {scene.scene} from above: orange where {against.other} is worse, blue where it is better.",
-                partial(_draw, changes, comparison.up[scene.scene], against, known.get(scene.scene)),
+                partial(_draw, changes, comparison.up[scene.scene], scene.scene, against, known.get(scene.scene)),
                 unit=slug(scene.scene, against.other),
             )
 
 
 def _draw(
-    changes: Changes, up: tuple[float, float, float], against: Against, georeference: Georeference | None
+    changes: Changes,
+    up: tuple[float, float, float],
+    scene: str,
+    against: Against,
+    georeference: Georeference | None,
 ) -> Canvas:
     shown = changes.shown
-    panels = [Panel("agreement", ("lost", "gained"), shown.change, *_numbers(against, "agreement"))]
+    panels = [Panel("agreement", ("lost", "gained"), shown.change, *_numbers(scene, against, "agreement"))]
     if shown.right is not None:
         panels.append(
-            Panel("truth", ("wrong now", "right now"), shown.right.astype(float), *_numbers(against, "truth"))
+            Panel("truth", ("wrong now", "right now"), shown.right.astype(float), *_numbers(scene, against, "truth"))
         )
     return draw_changes(shown.table, up, panels, georeference)
 
 
-def _numbers(against: Against, what: str) -> tuple[list[int], list[tuple[float, float, float]]]:
-    shown = [area for area in against.areas if area.what == what][:MOST_NUMBERS]
-    return [area.number for area in shown], [area.centre for area in shown]
+def _numbers(scene: str, against: Against, what: str) -> tuple[list[int], list[tuple[float, float, float]], list[str]]:
+    """Return the numbers of the areas that a map names, their centres, and where the page tells of them."""
+    shown = _numbered(against, what)
+    links = [f"#{_anchor(scene, against, area)}" for area in shown]
+    return [area.number for area in shown], [area.centre for area in shown], links
+
+
+def _numbered(against: Against, what: str) -> list[Area]:
+    return [area for area in against.areas if area.what == what][:MOST_NUMBERS]
+
+
+def _anchor(scene: str, against: Against, area: Area) -> str:
+    return f"area-{slug(scene, against.other)}-{area.what}-{area.number}"
 
 
 CONTENT, PAGE, REPORT, RECORDING = "comparison.json", "comparison.md", "report.html", "recording.rrd"
@@ -151,7 +165,7 @@ def compare(
     Examples:
         >>> semstab.compare("run:sim-steady", "run:sim-flicker")
         <RunComparison with sim-steady on scene0>
-          sim-flicker: alpha -.22 ..., p ...; worse in alpha, psa, vss...
+          sim-flicker: alpha -.22 ..., p ...; worse in alpha, psa_op2, vss_op3...
     """
     lock = None
     if out is not None:
@@ -281,13 +295,16 @@ def _described(comparison: ComparisonData, result: RunComparison) -> list[dict[s
     for own, against, changes in _shown(comparison):
         scene, told = of_told[own.scene, against.other]
         other = next(run for run in others if run.name == against.other)
-        areas = told.areas[: 2 * MOST_NUMBERS]
+        areas = [area for what in ("agreement", "truth") for area in _numbered(told, what)]
         points = {k: own_points for k, area in enumerate(areas) if len(own_points := _points(area, changes))}
         pictures = area_pictures(areas, points, (base, other), scene.scene)
-        rows = [_area(area, scene.crs, pictures.get(k)) for k, area in enumerate(areas)]
+        rows = [
+            _area(area, scene.crs, pictures.get(k)) | {"id": _anchor(scene.scene, told, area)}
+            for k, area in enumerate(areas)
+        ]
         if rows:
             heading_text = relations(heading(result, scene.scene, against))
-            listed.append({"id": slug(scene.scene, against.other), "title": heading_text, "areas": rows})
+            listed.append({"title": heading_text, "areas": rows})
     return listed
 
 

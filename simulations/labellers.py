@@ -54,7 +54,7 @@ def rows(scene: str, frames: int, width: int) -> Iterator[list[str]]:
             reasons = [
                 reason for part, reason in REASONS.items() if any(part in text and name in text for text in said)
             ]
-            numbers = right.headline.wrong_of_consistent.value, right.correctness.accuracy.value
+            numbers = right.headline.wrong_of_consistent_op3.value, right.correctness.accuracy_op2.value
             yield [
                 name, f"{found.headline.alpha.value:.2f}", f"{100 * found.spots.labelled:.0f}",
                 f"{100 * own.image_space.edge_recall:.0f}", f"{own.image_space.compensated_flicker_percent:.1f}",

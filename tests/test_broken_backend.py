@@ -326,7 +326,7 @@ class ReportsTheMeanOfTheFrame(Oracle):
     def integrate(self, frame):
         report = super().integrate(frame)
         last = [q for q in self.history if self.last_frame(q) == frame.index]
-        return dataclasses.replace(report, map_vss=sum(map(self.vss, last)) / len(last) if last else math.nan)
+        return dataclasses.replace(report, map_vss_all=sum(map(self.vss, last)) / len(last) if last else math.nan)
 
 
 @pytest.mark.parametrize(("broken", "test"), BROKEN)

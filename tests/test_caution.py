@@ -65,9 +65,9 @@ def test_what_is_more_stable_and_less_right_is_said_to_be_so(old, change, truth)
     assert alpha.change == "better"
     first, *_ = found.cautions
     if truth:
-        assert first.startswith("new is more stable and less right than old (accuracy .")
-        (accuracy,) = (row for row in found.overall[0].contrasts if row.measure == "accuracy")
-        assert f"accuracy {f'{accuracy.other:.3f}'.lstrip('0')} against" in first
+        assert first.startswith("new is more stable and less right than old (accuracy (OP>=2) .")
+        (accuracy,) = (row for row in found.overall[0].contrasts if row.measure == "accuracy_op2")
+        assert f"accuracy (OP>=2) {f'{accuracy.other:.3f}'.lstrip('0')} against" in first
     else:
         assert first.endswith("not that they are right: no ground truth was compared")
     assert any("fewer classes" in text for text in found.cautions) == (change is merged)

@@ -38,7 +38,7 @@ def test_a_label_source_is_selected_behind_a_colon_and_names_are_the_shortest(ru
     assert (found.model, list(found.scenes), found.source) == ("b", ["wall"], run)
     entry = found.scenes["wall"]
     assert entry.classes == entry.with_voxels("").table().classes
-    assert value(entry.sums, "psa") == pytest.approx(entry.summary.statistics.agreement.psa.value)
+    assert value(entry.sums, "psa") == pytest.approx(entry.summary.statistics.agreement.psa_op2.value)
     assert list(entry.flicker) == [1, 2, 3, 4, 5]
     assert np.mean(list(entry.flicker.values())) == pytest.approx(entry.image_space.compensated_flicker_percent)
     shutil.copytree(run, tmp_path / "new")

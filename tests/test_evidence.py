@@ -63,4 +63,4 @@ def test_hundreds_of_classes_have_statistics():
     labels = RNG.integers(0, 300, size=(60, 4))
     labels[:, 1:][RNG.random((60, 3)) < 0.6] = 7
     events = log_of(labels, K=300)
-    assert -1 < describe(events.table(), events).agreement.voxel_alpha.value < 1
+    assert -1 < describe(events.table(), events).agreement.voxel_alpha_op2.value < 1

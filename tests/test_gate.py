@@ -531,7 +531,7 @@ def test_a_change_of_alpha_is_what_a_comparison_says_of_the_same_runs(run, quiet
             for name, folder, own in (("new", quiet_models, "part"), ("base", run, "a"))}  # fmt: skip
     assert alone.new == pytest.approx(kept["new"].spots.pairs.of_all(kept["new"].headline.alpha.value))
     assert of_all.base != kept["base"].headline.alpha.value
-    assert voxels.new == pytest.approx(kept["new"].agreement.voxel_alpha.value)
+    assert voxels.new == pytest.approx(kept["new"].agreement.voxel_alpha_op2.value)
     text, *_ = gate(new, base, gate_config(rules=rules[:1])).notes
     assert re.fullmatch(r"wall: the run gives no label to 1\d\.\d% of the pixels .* disagree", text)
     said = " ".join(cli("compare", base, new).output.split())

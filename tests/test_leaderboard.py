@@ -333,7 +333,7 @@ def test_models_are_ranked_and_those_that_cannot_be_told_apart_share_ranks(home,
     run = semstab.load_result(home / "run")
     for name, row in rows.items():
         alphas = [record.statistics.headline.alpha.value for record in run.select(model=name)]
-        accuracy = [record.statistics.headline.accuracy.value for record in run.select(model=name)]
+        accuracy = [record.statistics.headline.accuracy_op2.value for record in run.select(model=name)]
         assert row.alpha.value == row.of_labelled.value == pytest.approx(np.mean(alphas), abs=NEARLY)
         assert row.truth("accuracy").value == pytest.approx(np.mean(accuracy), abs=1e-6)
         assert row.labelled == 1.0

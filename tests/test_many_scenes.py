@@ -46,8 +46,8 @@ def test_a_model_that_truth_refutes_is_named_once_for_all_scenes(result):
     def misleading(record):
         own = record.summary.statistics
         verdict = dataclasses.replace(own.verdict, level="misleading")
-        wrong = dataclasses.replace(own.headline.wrong_of_consistent, value=0.57, low=0.43, high=0.7)
-        headline = dataclasses.replace(own.headline, wrong_of_consistent=wrong)
+        wrong = dataclasses.replace(own.headline.wrong_of_consistent_op3, value=0.57, low=0.43, high=0.7)
+        headline = dataclasses.replace(own.headline, wrong_of_consistent_op3=wrong)
         statistics = dataclasses.replace(own, verdict=verdict, headline=headline)
         return dataclasses.replace(record, summary=dataclasses.replace(record.summary, statistics=statistics))
 

@@ -79,10 +79,10 @@ def test_the_summary_has_its_means_and_reads_them_back(run, study) -> None:
     summary = json.loads((out / "summary.json").read_text())
     entry, table = summary["runs"][0], VoxelTable.load(out / "voxels" / "wall__a__numba.parquet")
     values = second_largest(table)
-    assert entry["rival"] == pytest.approx(np.nanmean(values))
-    assert entry["recurrent"]["rival_voxels"] == np.count_nonzero(table.op >= 3)
+    assert entry["rival_all"] == pytest.approx(np.nanmean(values))
+    assert entry["recurrent"]["rival_voxels_op3"] == np.count_nonzero(table.op >= 3)
     assert entry["strata"][0]["rival"] is None
-    assert result.runs[0].table[RIVAL] == entry["rival"]
+    assert result.runs[0].table[RIVAL] == entry["rival_all"]
     assert all("rival" in row["differences"] for row in summary["agreement"])
     found, folder = study
     again = load_result(folder)
@@ -125,10 +125,10 @@ def test_tables_and_the_comparison_have_it(study) -> None:
     found = {table.name: list(csv.DictReader(io.StringIO(to_csv(table)))) for table in made}
     base = {record.unit.model: record.summary.table for record in study[0].select()}
     for name in ("scenes", "persistence", "classes", "cross_model", "fusion", "sensitivity_voxel_size"):
-        assert all("rival" in row for row in found[name]), name
-    assert [float(row["rival"]) for row in found["scenes"]] == [round(t[RIVAL], 2) for t in base.values()]
+        assert all({"rival", "rival_all"} & row.keys() for row in found[name]), name
+    assert [float(row["rival_all"]) for row in found["scenes"]] == [round(t[RIVAL], 2) for t in base.values()]
     assert all(float(row["max_rival"]) < 1e-9 for row in found["agreement"])
-    (difference,) = (row for row in found["comparison_all"] if row["measure"] == "rival" and not row["class"])
+    (difference,) = (row for row in found["comparison_all"] if row["measure"] == "rival_op3" and not row["class"])
     low, value, high = (float(difference[f"difference{part}"]) for part in ("_low", "", "_high"))
     assert low <= value <= high
 

@@ -100,8 +100,8 @@ def test_a_study_writes_frame_series_and_where_asked_a_recording_of_its_base_uni
     assert int(rows[-1]["map_voxels"]) == base.summary.table.voxels
     logged = set(read(out / "recording.rrd"))
     for model in "ab":
-        assert f"/wall/series/map_vss/{model}/numba" in logged
-        assert f"/wall/series/map_vss/{model}/numpy" in logged
+        assert f"/wall/series/map_vss_all/{model}/numba" in logged
+        assert f"/wall/series/map_vss_all/{model}/numpy" in logged
         assert f"/wall/camera/{model}/labels" in logged
     assert [record.unit.backend for record in result.select(BACKENDS)] == ["numpy", "numpy"]
 

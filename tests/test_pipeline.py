@@ -90,11 +90,11 @@ def test_the_run_folder_holds_what_the_design_promises(root, tmp_path) -> None:
     result = semstab.run(configure(root, events=True), out=out, command=["semstab-bench", "--x"], report=False)
     summary = json.loads((out / "summary.json").read_text())
     assert summary == json.loads(json.dumps(summary))
-    assert summary["schema"] == 4
+    assert summary["schema"] == 5
     first = summary["runs"][0]
     for key in (
         "scene", "model", "backend", "K", "voxel_size", "frames", "points", "observations", "voxels", "mean_op",
-        "vss", "sbd", "entropy", "strata", "recurrent", "classes", "flicker_percent", "fuse_ms_per_frame",
+        "vss_all", "sbd_all", "entropy_all", "strata", "recurrent", "classes", "flicker_percent", "fuse_ms_per_frame",
     ):  # fmt: skip
         assert key in first
     assert first["strata"][0]["sbd"] is None
@@ -129,8 +129,8 @@ def test_the_frame_series_ends_where_the_table_is(root, tmp_path) -> None:
         text = (out / "frames" / f"{run.unit.slug}.csv").read_text().splitlines()
         last = dict(zip(text[0].split(","), text[-1].split(","), strict=True))
         assert int(last["map_voxels"]) == run.table.voxels
-        assert float(last["map_vss"]) == pytest.approx(run.table[VSS], abs=1e-12)
-        assert float(last["map_entropy"]) == pytest.approx(run.table[ENTROPY], abs=1e-12)
+        assert float(last["map_vss_all"]) == pytest.approx(run.table[VSS], abs=1e-12)
+        assert float(last["map_entropy_all"]) == pytest.approx(run.table[ENTROPY], abs=1e-12)
         assert float(last["map_recurrent"]) == pytest.approx(run.table.recurrent.share, abs=1e-12)
 
 

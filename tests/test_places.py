@@ -6,6 +6,7 @@ import csv
 import dataclasses
 import json
 import math
+import re
 
 import numpy as np
 import pyproj
@@ -384,6 +385,12 @@ def test_areas_of_compare_are_in_the_coordinates_of_the_exports(runs) -> None:
     first = scene.against[0].areas[0]
     assert f'id="area-scene__{scene.against[0].other}-{first.what}-1"' in page
     assert f"east {metres(round(first.centre[0], 2))}" in page
+    pins = re.findall(r'class="pin" href="#(area-[^"]+)" style="left:([\d.]+)%;top:([\d.]+)%"', page)
+    assert f"area-scene__{scene.against[0].other}-{first.what}-1" in {link for link, *_ in pins}
+    for link, left, top in pins:  # each opens an area that the page tells of, and lies in the picture
+        assert f'<details class="place" id="{link}">' in page
+        assert 0 < float(left) < 100
+        assert 0 < float(top) < 100
     assert "Centres are in the coordinates of the scene." in (runs / "versus-nowhere" / "comparison.md").read_text()
 
 

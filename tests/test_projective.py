@@ -120,7 +120,7 @@ def test_the_report_counts_look_ups():
     report = backend.integrate(wall(7))
     assert (report.frame, report.points, report.voxels, report.new_voxels, report.map_voxels) == (7, 18, 18, 18, 18)
     again = backend.integrate(wall(8))
-    assert (again.new_voxels, again.map_voxels, again.map_vss, again.map_recurrent) == (0, 18, 1, 0)
+    assert (again.new_voxels, again.map_voxels, again.map_vss_all, again.map_recurrent) == (0, 18, 1, 0)
     assert report.association_seconds + report.update_seconds == pytest.approx(report.seconds)
     assert backend.events() is None
 

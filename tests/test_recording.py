@@ -158,7 +158,7 @@ def test_every_series_is_a_column_of_the_frame_csv(run, model) -> None:
 
 def test_lines_are_named_and_have_distinct_colours(run) -> None:
     rows = read(run / "recording.rrd")
-    paths = ["map_vss/a/numpy", "map_vss/b/numpy", "flicker_percent/b"]
+    paths = ["map_vss_all/a/numpy", "map_vss_all/b/numpy", "flicker_percent/b"]
     styles = [next(row for row in rows[f"/wall/series/{path}"] if "SeriesLines:names" in row) for path in paths]
     assert [style["SeriesLines:names"] for style in styles] == [["a, numpy"], ["b, numpy"], ["b"]]
     colors = [style["SeriesLines:colors"] for style in styles]
@@ -488,7 +488,7 @@ def test_what_goes_wrong_beside_the_loop_is_said_and_the_file_is_closed(tmp_path
     with pytest.raises(RuntimeError, match="no room"):
         watching.close()
     verify(path)
-    assert set(series(read(path), r"/floor\ 1/series/map_vss/net\/x/numpy")) == {0, 1}
+    assert set(series(read(path), r"/floor\ 1/series/map_vss_all/net\/x/numpy")) == {0, 1}
 
 
 def test_jobs_run_in_order_and_few_are_pending() -> None:

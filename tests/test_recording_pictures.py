@@ -82,8 +82,8 @@ def test_backends_that_need_not_agree_have_lines_of_their_own(tmp_path, given, s
     plan = make_plan(config.model_copy(update={"backends": given_backends, "check": None}))
     (task,) = plan.tasks
     assert layout.drawn(task) == shown
-    views = layout._plot("wall", "map_vss", [task])
-    assert views.contents == [entity("map_vss", UnitName("wall", "a", backend)) for backend in lines]
+    views = layout._plot("wall", "map_vss_all", [task])
+    assert views.contents == [entity("map_vss_all", UnitName("wall", "a", backend)) for backend in lines]
     watching = Recording(tmp_path / "recording.rrd")
     watching.run_started(plan, {})
     fused = {
@@ -476,7 +476,7 @@ semstab.run(config, observers=[Recording({str(path)!r}), Killing()])
     whole = tmp_path / "whole.rrd"
     subprocess.run([rerun, "rrd", "optimize", path, "-o", whole], capture_output=True, check=True)
     verify(whole)
-    assert set(series(read(whole), "/wall/series/map_vss/a/numba")) == {0, 1, 2}
+    assert set(series(read(whole), "/wall/series/map_vss_all/a/numba")) == {0, 1, 2}
 
 
 @pytest.fixture(scope="module")
@@ -520,7 +520,7 @@ def test_a_map_in_tiles_has_the_pictures_and_flips_of_the_whole_map(compared, ag
 
 def test_without_its_dataset_a_run_is_recorded_without_pictures(compared, again) -> None:
     whole, without = (read(path) for path in (compared[1] / "recording.rrd", again[2]))
-    entity = "/wall/series/map_vss/a/numba"
+    entity = "/wall/series/map_vss_all/a/numba"
     assert series(without, entity) == series(whole, entity)
     assert grid(without, "/wall/map/a/numba")["op"] == grid(whole, "/wall/map/a/numba")["op"]
     assert lacks_pictures(compared[1], again[2])

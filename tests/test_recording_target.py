@@ -165,6 +165,6 @@ def test_a_run_is_streamed_to_a_viewer_and_into_its_file(tmp_path) -> None:
         semstab.run(config_of(root, "numba"), observers=[Recording(watched)])
         time.sleep(1)
     verify(tmp_path / "own.rrd")
-    expected = series(read(tmp_path / "own.rrd"), "/wall/series/map_vss/a/numba")
+    expected = series(read(tmp_path / "own.rrd"), "/wall/series/map_vss_all/a/numba")
     assert len(expected) == 3
     assert saved.stat().st_size > 10_000

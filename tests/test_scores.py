@@ -52,7 +52,7 @@ def test_scores_and_labels_in_turns_are_the_reference(K, dtype) -> None:
     for frame in frames:
         expected, *reports = (backend.integrate(frame) for backend in made.values())
         for report in reports:
-            for what in ("points", "voxels", "new_voxels", "drift_sum", "map_vss", "map_entropy"):
+            for what in ("points", "voxels", "new_voxels", "drift_sum", "map_vss_all", "map_entropy_all"):
                 assert getattr(report, what) == pytest.approx(getattr(expected, what), abs=1e-9), what
     reference = made.pop("numpy").table()
     for backend in made.values():

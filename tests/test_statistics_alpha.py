@@ -183,7 +183,7 @@ def test_alpha_is_the_same_whatever_the_size_of_the_voxels(options):
     found = verdicts(**options)
     by_spots = [summary.headline.alpha.value for summary in found]
     assert by_spots == pytest.approx([by_spots[0]] * 3, abs=1e-12)
-    by_voxels = [summary.agreement.voxel_alpha.value for summary in found]
+    by_voxels = [summary.agreement.voxel_alpha_op2.value for summary in found]
     assert by_voxels[0] - by_voxels[-1] > 0.1
 
 
@@ -217,7 +217,7 @@ def test_scores_have_the_alpha_and_the_level_of_their_likeliest_class():
     by_labels, by_scores = (describe(fused(own, 0.3).table(), spots=sampled(own)) for own in (frames, unsure))
     assert by_scores.headline.alpha == by_labels.headline.alpha
     assert by_scores.verdict.level == by_labels.verdict.level
-    assert by_scores.agreement.voxel_alpha.value < by_labels.agreement.voxel_alpha.value - 0.1
+    assert by_scores.agreement.voxel_alpha_op2.value < by_labels.agreement.voxel_alpha_op2.value - 0.1
 
 
 # --- It counts views, not frames --------------------------------------------------------------------------------------

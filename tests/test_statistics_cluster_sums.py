@@ -83,7 +83,7 @@ def test_the_sums_give_every_number_back(soft_evidence):
         sums = cluster_sums_of(table, given, truth, sbd_excess=excess)
         assert {key: value(sums, key) for key in expected} == pytest.approx(expected, abs=1e-12, nan_ok=True)
     sums = cluster_sums_of(table, log, truth)
-    by_class = [row.voxel_alpha for row in class_agreement(table, log)]
+    by_class = [row.voxel_alpha_op2 for row in class_agreement(table, log)]
     assert [value(sums, "voxel_alpha", k) for k in range(3)] == pytest.approx(by_class)
     true_one = again & (truth == 1)
     assert value(sums, "accuracy", 1) == pytest.approx(right[true_one].mean())
@@ -121,7 +121,7 @@ def test_the_sums_of_spots_give_alpha_back():
     lever = lever_by_hand(spots)
     assert 0.1 < lever < 1
     assert value(whole, "alpha") == pytest.approx(expected[0] + lever * (expected[0] - expected[1]))
-    by_class = [[row.voxel_alpha for row in class_agreement(log.table(), log)] for log in logs]
+    by_class = [[row.voxel_alpha_op2 for row in class_agreement(log.table(), log)] for log in logs]
     for k in range(K):
         assert value(whole, "alpha", k) == pytest.approx(by_class[0][k] + lever * (by_class[0][k] - by_class[1][k]))
     alone = sums_of_spots(spots)

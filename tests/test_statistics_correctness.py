@@ -101,7 +101,7 @@ def test_quadrants_by_hand():
     assert found.voxels == 4
     shares = (found.consistent_right, found.consistent_wrong, found.inconsistent_right, found.inconsistent_wrong)
     assert [share.value for share in shares] == pytest.approx([0.25, 0.25, 0.25, 0.25], abs=0.01)
-    assert found.wrong_of_consistent.value == pytest.approx(0.5, abs=0.01)
+    assert found.wrong_of_consistent_op3.value == pytest.approx(0.5, abs=0.01)
     assert consistent_wrong(table, truth).tolist() == [False, True, False, False, False, False]
     table = log_of([[0] * 90 + [1] * 10, [0] * 80 + [1] * 20]).table()
     truth = join_truth(table, log_of([[1], [1]]).table())
@@ -144,5 +144,5 @@ def test_a_model_that_errs_the_same_way_in_every_view_is_stable_and_wrong():
     table = log_of(labels, index=grid(side)).table()
     true = log_of(true, index=grid(side)).table()
     truth, found = join_truth(table, true), describe(table, truth=true).correctness.quadrants
-    assert found.wrong_of_consistent.low <= place.mean() <= found.wrong_of_consistent.high
+    assert found.wrong_of_consistent_op3.low <= place.mean() <= found.wrong_of_consistent_op3.high
     assert consistent_wrong(table, truth)[~place[:, 0]].mean() < 0.01

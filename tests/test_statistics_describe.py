@@ -58,8 +58,8 @@ def described():
 def test_a_description_is_content_for_json_and_every_voxel_has_a_value(described, tmp_path):
     write_json(tmp_path / "statistics.json", described.summary)
     content = read_json(tmp_path / "statistics.json")
-    assert content["schema"] == 3
-    assert content["agreement"]["voxel_alpha"]["value"] == described.summary.agreement.voxel_alpha.value
+    assert content["schema"] == 4
+    assert content["agreement"]["voxel_alpha_op2"]["value"] == described.summary.agreement.voxel_alpha_op2.value
     assert content["headline"]["alpha"]["value"] == described.summary.headline.alpha.value
     assert content["strata"][0]["psa"] is None
     assert math.isnan(described.summary.strata[0].psa)
@@ -92,23 +92,23 @@ def test_a_description_holds_what_the_functions_say(described):
     table, summary = events.table(), described.summary
     repeated = table.op >= 2
     assert (summary.repeated.voxels, summary.repeated.share) == (repeated.sum(), pytest.approx(repeated.mean()))
-    assert summary.agreement.voxel_alpha.value == pytest.approx(krippendorff_alpha(table))
+    assert summary.agreement.voxel_alpha_op2.value == pytest.approx(krippendorff_alpha(table))
     assert summary.headline.alpha.value == pytest.approx(krippendorff_alpha(table))  # each spot is alone in its voxel
     found = summary.spots
     assert (found.spots, found.views, found.frames, found.spacing) == (repeated.sum(), F, F, 0.125)
     shares = table.evidence[:][repeated].sum(axis=0) / table.op[repeated].sum()
     assert found.chance == pytest.approx((shares**2).sum(), abs=0.001)
     assert (found.largest_class, found.largest_share) == (str(shares.argmax()), pytest.approx(shares.max()))
-    by_class = {row.name: row.voxel_alpha for row in summary.agreement.classes}
+    by_class = {row.name: row.voxel_alpha_op2 for row in summary.agreement.classes}
     assert {row.name: row.alpha.value for row in found.classes} == pytest.approx(by_class)
     assert summary.drift.excess.value == pytest.approx(np.nanmean(sbd(table) - expected_sbd(table)))
     flipped = summary.drift.flips
     assert flipped.excess.value == pytest.approx(flipped.rate.value - flipped.null.value)
     parts = summary.uncertainty
-    assert parts.entropy.value == pytest.approx(parts.within.value + parts.between.value)
+    assert parts.entropy_op2.value == pytest.approx(parts.within.value + parts.between.value)
     geometry = summary.geometry
     assert geometry.geometry.value == 0
-    assert geometry.total.value == pytest.approx(1 - summary.agreement.psa.value)
+    assert geometry.total.value == pytest.approx(1 - summary.agreement.psa_op2.value)
     found = summary.correctness.quadrants
     parts_of_all = (found.consistent_right, found.consistent_wrong, found.inconsistent_right, found.inconsistent_wrong)
     assert sum(share.value for share in parts_of_all) == pytest.approx(1)
@@ -139,11 +139,11 @@ def values(section):
 def test_a_number_has_one_interval_wherever_it_stands():
     events = model(0.2, 0)
     found = describe(events.table(), events, events.table(), spots=spots(0.2, 0))
-    assert found.agreement.psa == found.headline.psa
-    assert found.correctness.accuracy == found.headline.accuracy
-    assert found.correctness.quadrants.wrong_of_consistent == found.headline.wrong_of_consistent
-    assert found.uncertainty.entropy.scope == found.headline.wrong_of_consistent.scope == THESE_FRAMES
-    assert found.headline.psa.scope == THIS_SCENE
+    assert found.agreement.psa_op2 == found.headline.psa_op2
+    assert found.correctness.accuracy_op2 == found.headline.accuracy_op2
+    assert found.correctness.quadrants.wrong_of_consistent_op3 == found.headline.wrong_of_consistent_op3
+    assert found.uncertainty.entropy_op2.scope == found.headline.wrong_of_consistent_op3.scope == THESE_FRAMES
+    assert found.headline.psa_op2.scope == THIS_SCENE
 
 
 def test_a_table_alone_is_described_as_far_as_it_goes():
@@ -154,7 +154,7 @@ def test_a_table_alone_is_described_as_far_as_it_goes():
     assert to_json(alone.drift.null) == to_json(logged.drift.null)
     assert values(alone.agreement) == pytest.approx(values(logged.agreement), abs=1e-12)
     assert alone.headline.alpha == logged.headline.alpha
-    assert (alone.headline.psa.scope, logged.headline.psa.scope) == (THESE_FRAMES, THIS_SCENE)
+    assert (alone.headline.psa_op2.scope, logged.headline.psa_op2.scope) == (THESE_FRAMES, THIS_SCENE)
     for found in (alone, logged):
         assert "for this scene flown again, from 8 frames" in found.verdict.line
 
@@ -193,7 +193,7 @@ def judged(low, high, wrong=UNKNOWN, voxels=5000, **spots):
         "largest_class": "grass", "largest_share": 0.5, "labelled": 1.0, "classes": (),
     } | spots  # fmt: skip
     return verdict(
-        "net", headline=replace(numbers, wrong_of_consistent=wrong), spots=SpotAgreement(**own), voxels=voxels,
+        "net", headline=replace(numbers, wrong_of_consistent_op3=wrong), spots=SpotAgreement(**own), voxels=voxels,
         share=0.5,
     )  # fmt: skip
 

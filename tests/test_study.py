@@ -323,16 +323,16 @@ def test_statistics_come_with_every_unit_and_all_of_them_where_they_are_wanted(r
     run = semstab.run(settings, out=tmp_path / "run", report=False).runs[0]
     events = semstab.Events.load(tmp_path / "run" / "events" / f"{run.unit.slug}.parquet")
     base, gt, *swept = result.records
-    assert base.statistics.agreement.psa.value == pytest.approx(psa_by_definition(events))
+    assert base.statistics.agreement.psa_op2.value == pytest.approx(psa_by_definition(events))
     assert base.statistics.drift.flips is not None  # the events were kept
     assert base.statistics.correctness is not None  # against the truth, which no map of the truth itself has
     assert gt.statistics.correctness is None
     assert all(record.statistics.voxel_size == 0.5 for record in swept)
     one, other = before[0].statistics.agreement, base.statistics.agreement
-    assert (one.kappa, one.within, one.classes) == (other.kappa, other.within, other.classes)
-    assert one.psa.value == pytest.approx(other.psa.value)  # whose interval needs the log
+    assert (one.kappa_op2, one.within, one.classes) == (other.kappa_op2, other.within, other.classes)
+    assert one.psa_op2.value == pytest.approx(other.psa_op2.value)  # whose interval needs the log
     assert before[0].statistics.drift.flips is None
-    right = before[0].statistics.correctness.miou.value, base.statistics.correctness.miou.value
+    right = before[0].statistics.correctness.miou_op2.value, base.statistics.correctness.miou_op2.value
     assert right[0] == pytest.approx(right[1])  # whose interval needs the log
     again = run_study(config, tmp_path / "out", report=False).records
     assert to_json([record.statistics for record in again]) == to_json([record.statistics for record in before])

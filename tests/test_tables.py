@@ -134,14 +134,14 @@ def test_the_scenes_have_their_own_means_and_a_macro_mean(walls, model):
     assert [row["scene"] for row in rows] == [*STEPS, "Total / Mean"]
     for row, unit in zip(rows, walls.select(model=model), strict=False):
         table = unit.table()
-        assert row["vss"] == pytest.approx(vss(table).mean())
-        assert row["sbd"] == pytest.approx(np.nanmean(sbd(table)))
+        assert row["vss_all"] == pytest.approx(vss(table).mean())
+        assert row["sbd_all"] == pytest.approx(np.nanmean(sbd(table)))
         assert row["mean_op"] == pytest.approx(table.op.mean())
         assert row["points"] == table.pixels.sum()
     *scenes, total = rows
     for key in ("voxels", "points"):
         assert total[key] == sum(row[key] for row in scenes)
-    for key in ("mean_op", "vss", "sbd", "entropy"):
+    for key in ("mean_op", "vss_all", "sbd_all", "entropy_all"):
         assert total[key] == pytest.approx(statistics.mean(row[key] for row in scenes))
 
 
@@ -204,7 +204,7 @@ def test_a_sweep_has_mean_and_spread_over_its_repeats():
     assert disturbed["recurrent_percent"] == {
         "mean": pytest.approx(statistics.mean(shares)), "sd": pytest.approx(statistics.stdev(shares)), "repeats": 3,
     }  # fmt: skip
-    assert (calm["value"], calm["recurrent_percent"], calm["vss"]) == ("0", 100, 0.75)
+    assert (calm["value"], calm["recurrent_percent"], calm["vss_all"]) == ("0", 100, 0.75)
     assert disturbed["vss_op3"]["sd"] == 0
 
 
@@ -239,8 +239,8 @@ def test_other_backends_are_compared_with_the_base_one_on_the_scenes_that_all_fu
     first, second = rows_of(study(*base, other), "fusion")
     assert (first["backend"], first["voxels"], first["delta_voxels"]) == ("numpy", 10, 0)
     assert (second["backend"], second["voxels"], second["delta_voxels"]) == ("other", 12, 2)
-    assert second["delta_vss"] == pytest.approx((8 + 4 * 0.75) / 12 - 1)
-    assert second["delta_sbd"] == pytest.approx(0.4 / 12)
+    assert second["delta_vss_all"] == pytest.approx((8 + 4 * 0.75) / 12 - 1)
+    assert second["delta_sbd_all"] == pytest.approx(0.4 / 12)
     assert second["delta_mean_op"] == pytest.approx(28 / 12 - 2)
     assert "fusion" not in [table.name for table in tables(study(base[1], other))]  # no scene in common
 

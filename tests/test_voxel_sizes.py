@@ -61,7 +61,9 @@ def test_alpha_at_each_size_is_that_of_a_map_of_its_own(kind):
     frames = KINDS[kind](list(flight(4, flicker=0.3)))
     found = alphas(frames, 0.17)
     assert [(size.voxel_size, size.frames) for size in found] == [(0.085, 4), (0.17, 4), (0.34, 4)]
-    assert [size.voxel_alpha for size in found] == pytest.approx([alpha_of(frames, size.voxel_size) for size in found])
+    assert [size.voxel_alpha_op2 for size in found] == pytest.approx(
+        [alpha_of(frames, size.voxel_size) for size in found]
+    )
 
 
 def test_a_scene_larger_than_a_map_and_frames_without_a_pixel_have_none():
@@ -69,4 +71,4 @@ def test_a_scene_larger_than_a_map_and_frames_without_a_pixel_have_none():
     far = dataclasses.replace(far, depth=np.full(far.shape, 3e5, np.float32))
     assert alphas([near, far], 0.17) == ()
     frames = [dataclasses.replace(frame, depth=np.zeros_like(frame.depth)) for frame in flight(2)]
-    assert [math.isnan(size.voxel_alpha) for size in alphas(frames, 0.17)] == [True] * 3
+    assert [math.isnan(size.voxel_alpha_op2) for size in alphas(frames, 0.17)] == [True] * 3

@@ -52,7 +52,7 @@ def cautions(
         contrasts: The other model against the base, over all scenes.
     """
     by_measure = {row.measure: row for row in contrasts if not row.of}
-    alpha = by_measure.get(ALPHA.key)
+    alpha = by_measure.get(ALPHA.name)
     if alpha is None or not alpha.change:
         return
     stable = int(alpha.change == "better")  # 0: the base is more stable, 1: the other model
@@ -78,10 +78,10 @@ def cautions(
 
 
 def _of_truth(more: str, less: str, by_measure: Mapping[str, Contrast], order: tuple[int, int]) -> str:
-    known = [by_measure[q.key] for q in (ACCURACY, MIOU) if q.key in by_measure]
+    known = [by_measure[q.name] for q in (ACCURACY, MIOU) if q.name in by_measure]
     if not known:
         return f"more stable means that frames of {more} agree, not that they are right: no ground truth was compared"
-    titles = {ACCURACY.key: "accuracy", MIOU.key: "mIoU"}
+    titles = {q.name: f"{q.word} ({q.population})" for q in (ACCURACY, MIOU)}
     both = [(row.base, row.other) for row in known]
     values = [(pair[order[0]], pair[order[1]]) for pair in both]
     numbers = ", ".join(

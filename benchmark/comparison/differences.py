@@ -68,7 +68,7 @@ def contrasts(common: Common, base: Entry, other: Entry, number: int) -> tuple[C
     `number` is the other run's among the runs.
     """
     result = {row.measure: row for row in _rows(common, base, other, number)}
-    return tuple(result[quantity.key] for quantity in quantities() if quantity.key in result)
+    return tuple(result[quantity.name] for quantity in quantities() if quantity.name in result)
 
 
 def by_class(common: Common, base: Entry, number: int) -> tuple[Contrast, ...]:
@@ -79,7 +79,7 @@ def by_class(common: Common, base: Entry, number: int) -> tuple[Contrast, ...]:
     names = base.classes or tuple(str(k) for k in range(base.sums.K))
     of_locations = list(_of_locations(common, names, number)) if common.tables else []
     rows = [*_against_all(common, names, number), *of_locations]
-    order = {quantity.key: rank for rank, quantity in enumerate(BY_CLASS)}
+    order = {quantity.name: rank for rank, quantity in enumerate(BY_CLASS)}
     return tuple(sorted(rows, key=lambda row: (names.index(row.of), order[row.measure])))
 
 
@@ -103,11 +103,11 @@ def corrected(lists: Sequence[Sequence[Contrast]]) -> list[tuple[Contrast, ...]]
     """
     rows = [row for contrasts in lists for row in contrasts]
     p_values = np.array([row.difference.p_value for row in rows])
-    tested = np.array([row.measure == ALPHA.key and not row.of for row in rows], bool)
+    tested = np.array([row.measure == ALPHA.name and not row.of for row in rows], bool)
     for family in (tested, ~tested):
         p_values[family] = holm(p_values[family].tolist())
     of_rows = iter(p_values.tolist())
-    better = {quantity.key: quantity.sign for quantity in (*quantities(), *BY_CLASS)}
+    better = {quantity.name: quantity.sign for quantity in (*quantities(), *BY_CLASS)}
     return [tuple(_with_change(row, next(of_rows), better[row.measure]) for row in contrasts) for contrasts in lists]
 
 
@@ -144,7 +144,7 @@ def _rows(common: Common, base: Entry, other: Entry, number: int) -> Iterator[Co
             yield from _row(quantity, common.sums[0], common.sums[number], common)
     if common.basis != "flights" and not common.sizes_differ:
         change = sums_difference(COVERAGE.key, after, before, same_frames=common.same_frames)
-        yield Contrast(COVERAGE.key, "", 1.0, 1 + change.value, change, math.nan, "")
+        yield Contrast(COVERAGE.name, "", 1.0, 1 + change.value, change, math.nan, "")
     if base.flicker and (base.flicker.keys() == other.flicker.keys() or common.same_frames is False):
         yield _flicker(base.flicker, other.flicker, paired=common.same_frames is not False)
     done = {quantity.key for quantity in (*HEADLINES, *IN_SUMS)}
@@ -168,7 +168,7 @@ def _row(
         scope = THESE_FRAMES if THESE_FRAMES in scopes else common.scope
         apart = common.basis == "flights"
         change = sums_difference(key, other, base, k, scope=scope, same_frames=common.same_frames, apart=apart)
-        yield Contrast(key, of, before, after, change, math.nan, "")
+        yield Contrast(quantity.name, of, before, after, change, math.nan, "")
 
 
 def sums_difference(
@@ -214,7 +214,7 @@ def _flicker(base: Flicker, other: Flicker, *, paired: bool) -> Contrast:
         mean(np.array([flicker[frame] for frame in (frames if len(frames) > 1 else flicker)]))
         for flicker in (base, other)
     )
-    return Contrast(FLICKER.key, "", before, after, flicker_difference(other, base, paired=paired), math.nan, "")
+    return Contrast(FLICKER.name, "", before, after, flicker_difference(other, base, paired=paired), math.nan, "")
 
 
 def _of_voxels(measure: Measure, base: VoxelTable, other: VoxelTable, edge: float) -> Contrast:
@@ -222,12 +222,12 @@ def _of_voxels(measure: Measure, base: VoxelTable, other: VoxelTable, edge: floa
     before, after = measure.of(base), measure.of(other)
     known = ~np.isnan(before) & ~np.isnan(after) & (base.op >= measure.op) & (other.op >= measure.op)
     if not known.any():
-        return Contrast(measure.key, "", math.nan, math.nan, UNKNOWN, math.nan, "")
+        return Contrast(measure.name, "", math.nan, math.nan, UNKNOWN, math.nan, "")
     cubes, columns = Cubes.of(base, edge, where=known), np.stack([after - before, known], axis=1)
     before, after = before[known], after[known]
     change = cubes.estimate(columns, ratio_of, (-measure.largest, measure.largest), "plain")
     result = no_difference(change) if np.array_equal(before, after) else _with_p_value(change)
-    return Contrast(measure.key, "", mean(before), mean(after), result, math.nan, "")
+    return Contrast(measure.name, "", mean(before), mean(after), result, math.nan, "")
 
 
 def _with_p_value(interval: Interval) -> Interval:
@@ -274,7 +274,7 @@ def class_of_locations(common: Common) -> Int64:
 
 # Each run is compared with the first one, scene by scene and over all scenes.
 
-SCHEMA = 2
+SCHEMA = 3
 COLUMNS = "columns"
 """Folder of the files SCENE__BASE__RUN.parquet: the changes in each voxel."""
 

@@ -38,9 +38,9 @@ def quantities() -> tuple[Quantity, ...]:
     return (*HEADLINES, *(measure for measure in measures() if measure is not VSS))
 
 
-def by_key(chosen: Sequence[Quantity]) -> Mapping[str, Quantity]:
-    """Return the measures by their keys."""
-    return {quantity.key: quantity for quantity in chosen}
+def by_name(chosen: Sequence[Quantity]) -> Mapping[str, Quantity]:
+    """Return the measures by their names."""
+    return {quantity.name: quantity for quantity in chosen}
 
 
 IN_SUMS = (ALPHA, VOXEL_ALPHA, PSA, RECURRENT_VSS, SBD_EXCESS, ENTROPY, ACCURACY, MIOU, ECE, MISLEADING)

@@ -21,7 +21,13 @@ if TYPE_CHECKING:
 
 T = TypeVar("T")
 
-INLINE: Mapping[str, bool] = types.MappingProxyType({"inline": True})
+
+def inline(suffix: str = "") -> Mapping[str, str]:
+    """Return metadata of a field whose own fields stand among those of its parent, with a suffix to their names."""
+    return types.MappingProxyType({"inline": suffix})
+
+
+INLINE = inline()
 """Metadata of a field whose own fields stand among those of its parent: `unit: UnitName = field(metadata=INLINE)`."""
 
 LONGEST = 150
@@ -54,7 +60,7 @@ def _writer(kind: Any) -> Callable[[Any], Any]:
     if hasattr(kind, "json_content"):
         return lambda value: to_json(value.json_content())
     if dataclasses.is_dataclass(kind):
-        return functools.partial(_fields, [(f.name, "inline" in f.metadata) for f in dataclasses.fields(kind)])
+        return functools.partial(_fields, [(f.name, f.metadata.get("inline")) for f in dataclasses.fields(kind)])
     raise TypeError(f"{kind.__name__} has no JSON form")
 
 
@@ -69,11 +75,11 @@ _WRITERS: Mapping[Any, Callable[[Any], Any]] = {
 }
 
 
-def _fields(fields: list[tuple[str, bool]], value: Any) -> dict[str, Any]:
+def _fields(fields: list[tuple[str, str | None]], value: Any) -> dict[str, Any]:
     content: dict[str, Any] = {}
-    for name, inline in fields:
+    for name, suffix in fields:
         own = to_json(getattr(value, name))
-        content |= own if inline else {name: own}
+        content |= {name: own} if suffix is None else {key + suffix: item for key, item in own.items()}
     return content
 
 
@@ -128,17 +134,28 @@ def _adapted(schema: Any) -> Any:
         return schema
     kind, cls = schema.get("type"), cast(Any, schema.get("cls"))
     own = {key: _adapted(value) for key, value in schema.items()} | ({"strict": True} if kind in EXACT else {})
-    inline = [f.name for f in dataclasses.fields(cls) if "inline" in f.metadata] if kind == "dataclass" else []
+    inlined = {
+        f.name: f.metadata["inline"]
+        for f in (dataclasses.fields(cls) if kind == "dataclass" else ())
+        if "inline" in f.metadata
+    }
 
     def spread(content: Any) -> Any:
-        """Show an inline field all entries of its parent: it takes its own."""
-        return content | dict.fromkeys(inline, content) if isinstance(content, dict) else content
+        """Show an inline field all entries of its parent that end with its suffix: it takes its own."""
+        if not isinstance(content, dict):
+            return content
+        return content | {
+            name: {key.removesuffix(end): item for key, item in content.items() if key.endswith(end)}
+            if end
+            else content
+            for name, end in inlined.items()
+        }
 
     if kind == "float":
         return core_schema.no_info_plain_validator_function(number)
     if kind == "dataclass" and hasattr(cls, "of_json_content"):
         return core_schema.no_info_plain_validator_function(cls.of_json_content, ref=own.get("ref"))
-    return core_schema.no_info_before_validator_function(spread, own, ref=own.pop("ref", None)) if inline else own
+    return core_schema.no_info_before_validator_function(spread, own, ref=own.pop("ref", None)) if inlined else own
 
 
 def _line(problem: ErrorDetails) -> str:

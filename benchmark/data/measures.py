@@ -109,7 +109,7 @@ class Quantity:
     """A number that is reported.
 
     Attributes:
-        key: Key of its columns and JSON entries.
+        key: Its name in rules of a gate, and among columns that have a value a voxel.
         title: Title in print; `short` where there is little room, `unit` where it has one.
         better: Direction that is good.
         digits: Decimals where a map is summarised, and where maps are compared.
@@ -132,6 +132,11 @@ class Quantity:
     def population(self) -> str:
         """The voxels that it is a number of: 'OP>=3'; '' for a number of something else."""
         return f"OP>={self.op}" if self.op else ""
+
+    @property
+    def name(self) -> str:
+        """The key with the population, as tables and JSON have it: 'vss_op3'."""
+        return f"{self.key}_op{self.op}" if self.op else self.key
 
     @property
     def named(self) -> str:

@@ -8,13 +8,13 @@ import re
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 
-from semstab.core.json_form import INLINE
+from semstab.core.json_form import INLINE, inline
 from semstab.core.types import Float32, Int64, UInt16
 from semstab.data.frames import LeftOut
-from semstab.data.measures import Measure, MeasureMeans
+from semstab.data.measures import RECURRENT, Measure, MeasureMeans
 from semstab.data.statistics import UNKNOWN, MapStatistics
 
-SCHEMA = 4
+SCHEMA = 5
 """Version of summary.json."""
 
 STAGES = ("decode", "network", "wait", "flicker", "association", "update", "logging")
@@ -84,8 +84,8 @@ class FrameReport:
         drift_sum: Sum over the other ones of D_JS(p^(t), p^(t-1)), bits.
         seconds: wall-clock time of integrate.
         map_voxels: Voxels in the map.
-        map_vss: Mean VSS over them.
-        map_entropy: Mean normalised entropy over them.
+        map_vss_all: Mean VSS over them.
+        map_entropy_all: Mean normalised entropy over them.
         map_recurrent: Share of them with OP >= 3.
     """
 
@@ -96,8 +96,8 @@ class FrameReport:
     drift_sum: float
     seconds: float
     map_voxels: int
-    map_vss: float = math.nan
-    map_entropy: float = math.nan
+    map_vss_all: float = math.nan
+    map_entropy_all: float = math.nan
     map_recurrent: float = math.nan
     association_seconds: float = math.nan
     update_seconds: float = math.nan
@@ -146,12 +146,19 @@ class Means:
 
 
 @dataclass(frozen=True)
+class Recurrent(Means):
+    """Means over the voxels with OP >= 3: JSON has them as in `UnitSummary.row`, `vss_op3`."""
+
+    means: MeasureMeans = field(metadata=inline(f"_op{RECURRENT}"))
+
+
+@dataclass(frozen=True)
 class TableSummary:
     """The summary of a voxel table: one row of the paper's scene table, its strata and its classes.
 
-    `summary[VSS]` is the mean of a measure over all voxels where it is defined. `well_seen` is the last stratum in
-    finer steps of OP. `categories` has the share of the voxels in each stability category, `confused_with` for each
-    dominant class the one that most of the other evidence in its voxels is for.
+    `summary[VSS]` is the mean of a measure over all voxels where it is defined, `vss_all` in JSON. `well_seen` is the
+    last stratum in finer steps of OP. `categories` has the share of the voxels in each stability category,
+    `confused_with` for each dominant class the one that most of the other evidence in its voxels is for.
     """
 
     K: int
@@ -160,9 +167,9 @@ class TableSummary:
     observations: int
     voxels: int
     mean_op: float
-    means: MeasureMeans = field(metadata=INLINE)
+    means: MeasureMeans = field(metadata=inline("_all"))
     strata: tuple[Means, ...]
-    recurrent: Means
+    recurrent: Recurrent
     classes: tuple[Means, ...]
     well_seen: tuple[Means, ...] = ()
     categories: Mapping[str, float] = field(default_factory=dict)
@@ -237,13 +244,13 @@ class ReducedScores:
     """The result of soft scores with each pixel reduced to its likeliest class, to be compared with hard labels.
 
     Attributes:
-        vss, recurrent_vss: Over all voxels, and over those with OP >= 3.
-        voxel_alpha: Krippendorff's alpha of the voxels with OP >= 2.
+        vss_all, vss_op3: Over all voxels, and over those with OP >= 3.
+        voxel_alpha_op2: Krippendorff's alpha of the voxels with OP >= 2.
     """
 
-    vss: float
-    recurrent_vss: float
-    voxel_alpha: float
+    vss_all: float
+    vss_op3: float
+    voxel_alpha_op2: float
 
 
 @dataclass(frozen=True)
@@ -269,7 +276,7 @@ class SizeAlpha:
 
     voxel_size: float
     frames: int
-    voxel_alpha: float
+    voxel_alpha_op2: float
 
 
 @dataclass(frozen=True)

@@ -148,7 +148,7 @@ SUMS = ("points", "voxels", "new_voxels", "drift_sum", "seconds")
 SECONDS = ("association_seconds", "update_seconds")
 """The columns that are not known of a frame that no tile fused."""
 
-MEANS = ("map_vss", "map_entropy", "map_recurrent")
+MEANS = ("map_vss_all", "map_entropy_all", "map_recurrent")
 
 
 def joined_series(frames: Float64, tiles: Sequence[Float64]) -> Series:

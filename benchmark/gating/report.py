@@ -14,7 +14,7 @@ from semstab.core.json_form import to_json
 from semstab.errors import ConfigError
 from semstab.gating.result import POWER, GateResult, Verdict
 
-SCHEMA = 2
+SCHEMA = 3
 INDENT = 10
 MOST_NAMED = 4
 """Most rules of each verdict that the headline names."""
@@ -152,8 +152,7 @@ def as_json(result: GateResult) -> str:
     """Return the result as JSON."""
     rows = [
         {
-            "rule": each.rule.text, "verdict": each.verdict, "measure": each.rule.measure.name,
-            "population": each.rule.measure.quantity.population,
+            "rule": each.rule.text, "verdict": each.verdict, "measure": each.rule.measure.quantity.name,
             "class": each.rule.class_name, "scene": each.rule.scene, "change": each.rule.change,
             "limit": each.rule.limit, "new": each.new, "base": each.base, "found": each.interval, "reason": each.reason,
             "about": each.about,

@@ -15,9 +15,10 @@ from pathlib import Path
 import numpy as np
 
 from semstab.comparison.entries import RunHandle
+from semstab.comparison.quantities import MISLEADING
 from semstab.comparison.ranking import over_places, ranked
 from semstab.core.files import write_text
-from semstab.data.statistics import UNKNOWN, HeadlineStatistics, Interval, Level, SpotAgreement
+from semstab.data.statistics import CONFIDENCE, UNKNOWN, HeadlineStatistics, Interval, Level, SpotAgreement
 from semstab.errors import ConfigError, DataError
 from semstab.leaderboard.definition import Benchmark, Number
 from semstab.leaderboard.geometry import Spots
@@ -26,13 +27,14 @@ from semstab.leaderboard.sums import completed, labelled_share
 from semstab.report.html import filled, table_block
 from semstab.report.tables.table import Column, Group, Row, Table
 from semstab.statistics.cluster_sums import ClusterSums, chance_of
+from semstab.statistics.correctness import ACCURACY, MIOU
 from semstab.statistics.intervals import estimate, scope_of
 from semstab.statistics.verdict import verdict
 
 OF_TRUTH: Mapping[Number, Column] = {
-    "accuracy": Column("accuracy", "accuracy", 3, "higher"),
-    "miou": Column("miou", "mIoU", 3, "higher"),
-    "wrong_of_consistent": Column("wrong_of_consistent", "consistent but wrong", 3, "lower"),
+    "accuracy": Column.of(ACCURACY),
+    "miou": Column.of(MIOU),
+    "wrong_of_consistent": Column.of(MISLEADING),
 }
 """The columns that need ground truth."""
 
@@ -282,9 +284,9 @@ def headline(board: Board) -> Table:
     what = f"{count} {'place' if benchmark.flights else 'scene'}{'' if count == 1 else 's'}"
     caption = (
         f"{benchmark.description[0].upper()}{benchmark.description[1:]}; definition {benchmark.digest}. Means over"
-        f" {what}, with intervals at 95 %, all computed from sums that were checked. Alpha counts an answer that a"
-        " model leaves out as one that disagrees. A rank is 1 plus the number of models that are shown to be more"
-        " stable in it (paired by frames and cubes, Holm); 'to' names the last rank that is possible: models that"
+        f" {what}, with intervals at {CONFIDENCE:.0%}, all computed from sums that were checked. Alpha counts an answer"
+        " that a model leaves out as one that disagrees. A rank is 1 plus the number of models that are shown to be"
+        " more stable in it (paired by frames and cubes, Holm); 'to' names the last rank that is possible: models that"
         " share ranks are not told apart."
     )
     caption += "".join(f" {text[0].upper()}{text[1:]}." for text in board.reasons)
@@ -298,7 +300,12 @@ def by_scene(board: Board) -> Table:
     columns = (Column("model", "model"), *(Column(scene, scene, 3, "higher") for scene in scenes))
     rows: tuple[Row, ...] = tuple((row.name, *(row.scenes[scene].alpha for scene in scenes)) for row in board.rows)
     return _table(
-        board, "scenes", f"{board.benchmark.id} by scene", "Alpha in each scene, with intervals at 95 %.", columns, rows
+        board,
+        "scenes",
+        f"{board.benchmark.id} by scene",
+        f"Alpha in each scene, with intervals at {CONFIDENCE:.0%}.",
+        columns,
+        rows,
     )
 
 

@@ -14,7 +14,7 @@ from semstab.core.types import Float64, Int32, Int64, UInt8
 from semstab.data.evidence import stretches
 from semstab.data.information import by_group
 from semstab.data.measures import RECURRENT, MeasureMeans, Voxels, bits, dominant, mean, measures, sbd
-from semstab.data.results import Means, TableSummary
+from semstab.data.results import Means, Recurrent, TableSummary
 from semstab.data.voxels import VoxelTable
 from semstab.errors import ConfigError
 
@@ -129,7 +129,7 @@ class TableSums:
             mean_op=observations / voxels if voxels else math.nan,
             means=MeasureMeans.of_sums(self.stratum.sum(axis=1)[1:]),
             strata=tuple(means(name, self.stratum, g) for g, (name, _, _) in enumerate(strata(edges))),
-            recurrent=means(f"OP>={RECURRENT}", self.recurrence, 1),
+            recurrent=Recurrent(**vars(means(f"OP>={RECURRENT}", self.recurrence, 1))),
             classes=tuple(means(name, self.kind, k) for k, name in enumerate(names)),
             well_seen=tuple(
                 means(name, self.step, g)

@@ -59,7 +59,7 @@ class Summary:
             vss_op3=float(table.recurrent[VSS]),
             sbd_op3=float(table.recurrent[SBD]),
             entropy_op3=float(table.recurrent[ENTROPY]),
-            psa_op2=statistics.agreement.psa.value,
+            psa_op2=statistics.agreement.psa_op2.value,
             flicker=flicker,
             recurrent_share=table.recurrent.share,
             verdict=verdict.decisive,

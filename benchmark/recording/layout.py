@@ -199,8 +199,8 @@ SIDE_BY_SIDE = 4
 OPENED = "category"
 """The colouring of the maps that the viewer opens on."""
 
-OVERVIEW = ("drift", "compensated_flicker_percent", "map_vss", "map_recurrent")
-COMPARED = ("drift", "map_vss", "map_entropy", "map_recurrent", "new_voxels", "fuse_ms")
+OVERVIEW = ("drift", "compensated_flicker_percent", "map_vss_all", "map_recurrent")
+COMPARED = ("drift", "map_vss_all", "map_entropy_all", "map_recurrent", "new_voxels", "fuse_ms")
 """The series of two backends that are shown in one plot."""
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import base64
 import io
 import itertools
+import json
 import re
 from collections.abc import Iterator, Sequence
 from pathlib import Path
@@ -15,7 +16,7 @@ import numpy.typing as npt
 
 from semstab.core.types import Int64, Mask, UInt8
 from semstab.report.charts import colors_css
-from semstab.report.figures.style import COLUMN, DPI, Figure
+from semstab.report.figures.style import COLUMN, DPI, PINS, Figure
 from semstab.report.tables.table import ARROWS, Table, relations, sections
 
 SCREEN_DPI = 200
@@ -92,6 +93,7 @@ def figure_block(figure: Figure, folder: Path) -> dict[str, Any]:
         figure.save(png.parent)
     with Image.open(png) as image:
         width, height = (edge / DPI for edge in image.size)
+        pins = json.loads(image.info.get(PINS, "[]"))
         size = [round(edge * SCREEN_DPI / DPI) for edge in image.size]
         small = image.convert("RGB").resize((size[0], size[1]), Image.Resampling.LANCZOS)
     data = io.BytesIO()
@@ -105,6 +107,7 @@ def figure_block(figure: Figure, folder: Path) -> dict[str, Any]:
         "source": _url(data.getvalue(), "png"),
         "width": round(width * CSS_INCH),
         "height": round(height * CSS_INCH),
+        "pins": [(text, link, 100 * x, 100 * y) for text, link, x, y in pins],
         "narrow": width <= COLUMN * 1.01,
     }
 

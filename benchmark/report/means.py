@@ -89,9 +89,9 @@ def pooled(records: Sequence[Record]) -> Pooled:
         classes=tuple(pool(rows, voxels) for rows in of_class),
         well_seen=tuple(split_last(tables)),
         fuse_ms_per_frame=macro_mean([record.summary.fuse_ms_per_frame for record in records]),
-        psa=_estimate(records, lambda stats: stats.agreement.psa),
+        psa=_estimate(records, lambda stats: stats.agreement.psa_op2),
         alpha=_estimate(records, lambda stats: stats.headline.alpha),
-        drift=_estimate(records, lambda stats: stats.drift.sbd if stats.order_known else UNDEFINED),
+        drift=_estimate(records, lambda stats: stats.drift.sbd_op2 if stats.order_known else UNDEFINED),
         drift_null=_macro(records, lambda stats: stats.drift.null if stats.order_known else UNDEFINED),
     )
 

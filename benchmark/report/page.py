@@ -166,7 +166,7 @@ def _numbers(
         yield measure.named, value, note if enough else few
     right = [miou(record) for record in records]
     yield MIOU.named, short(macro_mean(right), digits=MIOU.digits[0]), "of the fused labels"
-    wrong = [stats.headline.wrong_of_consistent.value for stats in assessed]
+    wrong = [stats.headline.wrong_of_consistent_op3.value for stats in assessed]
     yield "consistent but wrong", mean(wrong, "{:.1f} %", 100), "of the consistent locations"
 
 

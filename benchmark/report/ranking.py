@@ -104,6 +104,6 @@ def _measured(records: Sequence[Record]) -> dict[str, float]:
     recurrent = pooled(records).recurrent
     enough = recurrent.voxels >= ENOUGH
     known = [record.statistics.correctness for record in records if record.statistics is not None]
-    miou = macro_mean([right.miou.value for right in known if right is not None]) if any(known) else math.nan
+    miou = macro_mean([right.miou_op2.value for right in known if right is not None]) if any(known) else math.nan
     vss, sbd = (recurrent[measure] if enough else math.nan for measure in (VSS, SBD))
     return {"VSS (OP>=3)": vss, "SBD": sbd, "mIoU": miou}

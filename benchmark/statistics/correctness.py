@@ -226,7 +226,7 @@ def quadrants(table: VoxelTable, truth: Truth, consistent: Float64, edge: float,
     parts = (likely * right, likely * ~right, (1 - likely) * right, (1 - likely) * ~right)
     sums = cubes.named(cubes.means(dict(zip(QUADRANTS, parts, strict=True))))
     shares = {name: estimate(sums, mean_functional(name)) for name in QUADRANTS}
-    return Quadrants(int(counted.sum()), **shares, wrong_of_consistent=wrong)
+    return Quadrants(int(counted.sum()), **shares, wrong_of_consistent_op3=wrong)
 
 
 def consistent_wrong(table: VoxelTable, truth: Truth, *, consistent: float = CONSISTENT) -> Mask:

@@ -11,7 +11,7 @@ import numpy as np
 import numpy.typing as npt
 
 from semstab.core.types import THESE_FRAMES, THIS_SCENE, Float64, Int64, Scope
-from semstab.data.statistics import CONFIDENCE, UNKNOWN, HeadlineStatistics, Interval
+from semstab.data.statistics import CONFIDENCE, UNKNOWN, Interval
 from semstab.statistics.agreement import ratio_of
 from semstab.statistics.cluster_sums import (
     MOST_GROUPS,
@@ -175,8 +175,8 @@ def scope_of(
 
 def headline_specs(sums: ClusterSums, wanted: Scope = THIS_SCENE) -> Iterator[EstimateSpec]:
     """Yield the specs of the numbers that a verdict on a map rests on, in the order of `HeadlineStatistics`."""
-    for field in dataclasses.fields(HeadlineStatistics):
-        yield spec_of(sums, field.name, scope=scope_of(sums, wanted, field.name))
+    for key in ("alpha", "psa", "vss", "accuracy", "wrong_of_consistent"):
+        yield spec_of(sums, key, scope=scope_of(sums, wanted, key))
 
 
 def _answer(spec: EstimateSpec, grid: Influences) -> Interval:

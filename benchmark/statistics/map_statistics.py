@@ -67,7 +67,7 @@ from semstab.statistics.sample import MapSample
 from semstab.statistics.spot_agreement import spot_agreement
 from semstab.statistics.verdict import LIMITS, Limits, verdict
 
-SCHEMA = 3
+SCHEMA = 4
 
 
 @dataclass(frozen=True, eq=False)
@@ -252,8 +252,8 @@ def _intervals(sums: ClusterSums, numbers: Iterable[Functional]) -> list[Interva
 
 
 def _agreement(means: Mapping[str, Interval], classes: tuple[ClassAgreement, ...]) -> FrameAgreement:
-    names = ("psa", "kappa", "voxel_alpha", "vss", "within", "between")
-    return FrameAgreement(**{name: means[name] for name in names}, classes=classes)
+    voxels = {f"{name}_op2": means[name] for name in ("psa", "kappa", "voxel_alpha", "vss")}
+    return FrameAgreement(**voxels, within=means["within"], between=means["between"], classes=classes)
 
 
 def _drift(
@@ -267,7 +267,7 @@ def _drift(
         rates = FlipRates(rate, null, excess, since)
     return DriftStatistics(
         voxels=round(known / sampled * repeats) if sampled else 0,
-        sbd=means["sbd"],
+        sbd_op2=means["sbd"],
         null=means["null"],
         excess=means["excess"],
         flips=rates,
@@ -284,15 +284,15 @@ def _correctness(
 ) -> CorrectnessStatistics:
     predictions = Predictions.of(table.evidence, truth.label)
     repeated = prediction_sums(predictions, truth.known & (table.op >= 2))
-    miou = estimate(sums, MIOU.key, scope=scope_of(sums, headline.accuracy.scope, MIOU.key))
+    miou = estimate(sums, MIOU.key, scope=scope_of(sums, headline.accuracy_op2.scope, MIOU.key))
     if math.isnan(miou.value):  # there are no sums of so many classes
         miou = dataclasses.replace(miou, value=correctness_of(repeated).miou)
     return CorrectnessStatistics(
-        accuracy=headline.accuracy,
-        miou=miou,
+        accuracy_op2=headline.accuracy_op2,
+        miou_op2=miou,
         strata=by_stratum(predictions, table.op, truth.known, edges),
         reliability=reliability_of(repeated),
-        quadrants=quadrants(table, truth, consistent, sums.edge, headline.wrong_of_consistent),
+        quadrants=quadrants(table, truth, consistent, sums.edge, headline.wrong_of_consistent_op3),
     )
 
 

@@ -148,7 +148,7 @@ def verdict(
     both = StabilityVerdict(level, probability, "", labelled=spots.pixels_labelled)
     if of_all != level:
         both = dataclasses.replace(both, of_all=of_all, probability_of_all=probability_of_all)
-    wrong = headline.wrong_of_consistent
+    wrong = headline.wrong_of_consistent_op3
     same = spots.agreeing(headline.alpha.value)
     parts = [_alpha(headline.alpha, spots), f"two views see the same class at {same:.0%} of the spots"]
     if level == "uninformative":
@@ -189,7 +189,7 @@ def _level(
     level = max(probabilities, key=lambda name: probabilities[name])
     if math.isnan(probabilities[level]):
         return "no verdict", math.nan
-    if headline.wrong_of_consistent.low > DANGEROUS and level != "unstable":
+    if headline.wrong_of_consistent_op3.low > DANGEROUS and level != "unstable":
         return "misleading", math.nan
     if probabilities[level] < DECIDED or holds_all_levels(headline.alpha, limits, pairs):
         return "undecided", probabilities[level]

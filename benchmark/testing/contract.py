@@ -219,8 +219,8 @@ class ContractTests(BackendTests):
         assert report.drift_sum == self.near(after.drift_sum.sum() - before.drift_sum.sum())
         assert report.map_voxels == len(after)
         means = {
-            "map_vss": vss(after),
-            "map_entropy": entropy(after),
+            "map_vss_all": vss(after),
+            "map_entropy_all": entropy(after),
             "map_recurrent": after.op >= RECURRENT,
         }
         for name, values in means.items():

@@ -17,8 +17,8 @@ class ClassAgreement:
 
     name: str
     observations: float
-    kappa: float
-    voxel_alpha: float
+    kappa_op2: float
+    voxel_alpha_op2: float
 
 
 @dataclass(frozen=True)
@@ -26,19 +26,19 @@ class FrameAgreement:
     """Agreement of frames at the voxels with OP >= 2, whose size it depends on.
 
     Attributes:
-        psa: Probability that two frames agree.
-        kappa: Fleiss' kappa.
-        voxel_alpha: Krippendorff's alpha.
-        vss: The paper's VSS.
+        psa_op2: Probability that two frames agree.
+        kappa_op2: Fleiss' kappa.
+        voxel_alpha_op2: Krippendorff's alpha.
+        vss_op2: The paper's VSS.
         within: Part of 1 - PSA that is there within a frame.
         between: Part of 1 - PSA that is there between frames.
         classes: The same of each class.
     """
 
-    psa: Interval
-    kappa: Interval
-    voxel_alpha: Interval
-    vss: Interval
+    psa_op2: Interval
+    kappa_op2: Interval
+    voxel_alpha_op2: Interval
+    vss_op2: Interval
     within: Interval
     between: Interval
     classes: tuple[ClassAgreement, ...]

@@ -40,7 +40,7 @@ class Correctness:
 class Quadrants:
     """Shares of the voxels with OP >= 3 and a true class that are consistent or not, right or wrong.
 
-    wrong_of_consistent is the share of the consistent voxels that are wrong: the error where the map looks safe.
+    wrong_of_consistent_op3 is the share of the consistent voxels that are wrong: the error where the map looks safe.
     """
 
     voxels: int
@@ -48,7 +48,7 @@ class Quadrants:
     consistent_wrong: Interval
     inconsistent_right: Interval
     inconsistent_wrong: Interval
-    wrong_of_consistent: Interval
+    wrong_of_consistent_op3: Interval
 
 
 @dataclass(frozen=True)
@@ -56,15 +56,15 @@ class CorrectnessStatistics:
     """Stability vs. accuracy of the fused labels.
 
     Attributes:
-        accuracy, miou: Of the voxels seen twice or more, as `compare` and gates have them.
+        accuracy_op2, miou_op2: Of the voxels seen twice or more, as `compare` and gates have them.
         strata: All voxels with a true class, then each stratum of OP.
     """
 
-    accuracy: Interval
+    accuracy_op2: Interval
     strata: tuple[Correctness, ...]
     reliability: tuple[Reliability, ...]
     quadrants: Quadrants
-    miou: Interval = UNKNOWN
+    miou_op2: Interval = UNKNOWN
 
 
 @dataclass(frozen=True)

@@ -41,7 +41,7 @@ class DriftStatistics:
     """SBD in bits, and SBD of the same observations in random order, the null, over the `voxels` that have one."""
 
     voxels: int
-    sbd: Interval
+    sbd_op2: Interval
     null: Interval
     excess: Interval
     flips: FlipRates | None = None

@@ -81,22 +81,21 @@ class HeadlineStatistics:
     """The numbers that a verdict rests on, with intervals for the same scene flown again.
 
     If frames are not known, or too few to tell, the intervals are for these frames, as their `scope` says. alpha is
-    of spots, NaN without them; psa and vss are of voxels, at OP >= 2 and OP >= 3; the last two are undefined
-    without ground truth.
+    of spots, NaN without them; the others are of voxels; the last two are undefined without ground truth.
     """
 
     alpha: Interval
-    psa: Interval
-    vss: Interval
-    accuracy: Interval
-    wrong_of_consistent: Interval
+    psa_op2: Interval
+    vss_op3: Interval
+    accuracy_op2: Interval
+    wrong_of_consistent_op3: Interval
 
 
 @dataclass(frozen=True)
 class EntropyParts:
-    """Mean entropy of the belief, and its parts within each frame and between them."""
+    """Mean entropy of the belief at OP >= 2, and its parts within each frame and between them."""
 
-    entropy: Interval
+    entropy_op2: Interval
     within: Interval
     between: Interval
 

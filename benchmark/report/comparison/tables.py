@@ -9,7 +9,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 
 from semstab.comparison.locations import MOST
-from semstab.comparison.quantities import BY_CLASS, COVERAGE, HEADLINES, IOU, RECALL, by_key
+from semstab.comparison.quantities import BY_CLASS, COVERAGE, HEADLINES, IOU, RECALL, by_name
 from semstab.core.console import Console
 from semstab.data.contrast import (
     Against,
@@ -98,7 +98,7 @@ def _others(comparison: RunComparison) -> str:
 
 
 def _rows(against: Against, shown: Sequence[Quantity]) -> tuple[Row, ...]:
-    keys = {quantity.key: quantity for quantity in shown}
+    keys = by_name(shown)
     return tuple(
         (_titled(keys[row.measure]), row.base, row.other, row.difference, row.p_holm, scope(row), _change(row))
         for row in against.contrasts
@@ -108,7 +108,7 @@ def _rows(against: Against, shown: Sequence[Quantity]) -> tuple[Row, ...]:
 
 def _change(row: Contrast) -> str:
     """Return 'better' or 'worse'; for coverage, which is neither, 'more' or 'fewer'."""
-    return COUNTED.get(row.change, "") if row.measure == COVERAGE.key else row.change
+    return COUNTED.get(row.change, "") if row.measure == COVERAGE.name else row.change
 
 
 COUNTED = {"better": "more", "worse": "fewer"}
@@ -121,8 +121,8 @@ def _titled(quantity: Quantity) -> str:
 
 def _by_class(comparison: RunComparison) -> Table:
     measured = {row.measure for _, against in scopes(comparison) for row in against.by_class}
-    shown = [quantity for quantity in IN_CLASSES if quantity.key in measured]
-    columns = (Column("class", "Class"), *(Column(q.key, q.named, 3, q.better, signed=True) for q in shown))
+    shown = [quantity for quantity in IN_CLASSES if quantity.name in measured]
+    columns = (Column("class", "Class"), *(Column(q.name, q.named, 3, q.better, signed=True) for q in shown))
     worse = Column("worse", "Worse"), Column("better", "Better")
     groups = tuple(
         Group(heading(comparison, scope, against), _class_rows(against, shown)) for scope, against in scopes(comparison)
@@ -136,11 +136,11 @@ def _by_class(comparison: RunComparison) -> Table:
 
 
 def _class_rows(against: Against, shown: Sequence[Quantity]) -> tuple[Row, ...]:
-    words = by_key(BY_CLASS)
+    words = by_name(BY_CLASS)
     rows = []
     for name in dict.fromkeys(row.of for row in against.by_class):
         mine = {row.measure: row for row in against.by_class if row.of == name}
-        cells = [mine[q.key].difference if q.key in mine else math.nan for q in shown]
+        cells = [mine[q.name].difference if q.name in mine else math.nan for q in shown]
         changed = {
             change: ", ".join(
                 words[row.measure].symbol if row.measure in words else row.measure
@@ -331,14 +331,14 @@ LEAST_LEFT_OUT = 0.005
 
 def _of_run(comparison: RunComparison, against: Against) -> Iterator[str]:
     yield _stability(comparison, against)
-    if changes := _changes(against.contrasts, by_key([row for row in HEADLINES if row is not COVERAGE])):
+    if changes := _changes(against.contrasts, by_name([row for row in HEADLINES if row is not COVERAGE])):
         yield f"{against.other}: {changes}."
     yield from _coverage(comparison, against)
     classes = {
         name: [row for row in against.by_class if row.of == name]
         for name in dict.fromkeys(r.of for r in against.by_class)
     }
-    notes = {name: _changes(rows, by_key(BY_CLASS)) for name, rows in classes.items()}
+    notes = {name: _changes(rows, by_name(BY_CLASS)) for name, rows in classes.items()}
     if listed := [f"{name} ({text})" for name, text in notes.items() if text]:
         left = len(listed) - MOST_CLASSES
         more = f" and {left} more {'class' if left == 1 else 'classes'}" if len(listed) > MOST_CLASSES else ""
@@ -352,7 +352,7 @@ def _of_run(comparison: RunComparison, against: Against) -> Iterator[str]:
 
 def _stability(comparison: RunComparison, against: Against) -> str:
     """Return the difference of alpha, on which verdicts rest."""
-    row = next((row for row in against.contrasts if row.measure == ALPHA.key), None)
+    row = next((row for row in against.contrasts if row.measure == ALPHA.name), None)
     if row is None:
         return f"Alpha of {against.other} or {comparison.base} is not known: run it with more overlap between frames."
     where = f" over {len(comparison.scenes)} scenes" if len(comparison.scenes) > 1 else ""
@@ -382,7 +382,7 @@ LEAST_COVERAGE = 0.005
 def _coverage(comparison: RunComparison, against: Against) -> Iterator[str]:
     for row in against.contrasts:
         change = row.difference.value
-        if row.measure == COVERAGE.key and abs(change) >= LEAST_COVERAGE:
+        if row.measure == COVERAGE.name and abs(change) >= LEAST_COVERAGE:
             more = "more" if change > 0 else "fewer"
             yield f"{against.other} covers {abs(change):.1%} {more} voxels than {comparison.base}."
 
@@ -415,7 +415,7 @@ def _of_areas(areas: Sequence[Area], crs: str) -> str:
 
 SHOWN = {
     "comparison": ("measure", "base", "other", "difference", "p_holm", "change"),
-    "comparison_classes": ("class", "worse", "better", ALPHA.key),
+    "comparison_classes": ("class", "worse", "better", ALPHA.name),
     "comparison_areas": ("class", "confused_with", "voxels", "loss", "x", "y", "z"),
 }
 """The columns of each table that fit; files have all of them."""

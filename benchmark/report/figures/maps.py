@@ -374,13 +374,18 @@ SAME = "#dedede"
 
 @dataclass(frozen=True)
 class Panel:
-    """A value of each voxel, from -1, worse, to 1, better; and the numbers of areas (m,), drawn at their centres."""
+    """A value of each voxel, from -1, worse, to 1, better; and the numbers of areas (m,), drawn at their centres.
+
+    Attributes:
+        links: (m,) what a click on each number opens in a page.
+    """
 
     title: str
     ends: tuple[str, str]
     values: Float64
     numbers: Sequence[int]
     centres: Sequence[tuple[float, float, float]]
+    links: Sequence[str]
 
 
 def draw_changes(
@@ -420,9 +425,11 @@ def _number(axes: Axes, panel: Panel, located: Located, cells: tuple[int, ...]) 
     """Draw the numbers of the areas at their centres, in a picture of so many rows and columns of cells."""
     from matplotlib.patheffects import withStroke
 
-    for number, centre in zip(panel.numbers, panel.centres, strict=True):
+    for number, centre, link in zip(panel.numbers, panel.centres, panel.links, strict=True):
         x, y = located.share(centre)
+        if not (0 <= x <= 1 and 0 <= y <= 1):
+            continue
         axes.annotate(
             str(number), (x * cells[1] - 0.5, y * cells[0] - 0.5), fontsize=6.5, color=INK, ha="center", va="center",
-            path_effects=[withStroke(linewidth=2, foreground="white")], annotation_clip=True,
+            path_effects=[withStroke(linewidth=2, foreground="white")], url=link,
         )  # fmt: skip

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -22,6 +23,9 @@ DPI = 300
 
 COLORS = ("#0072B2", "#D55E00")
 """The ends of a scale between two sides, for any colour vision."""
+
+PINS = "Pins"
+"""Key of a PNG's text that has the links of its numbers: a page lays them over the picture."""
 
 INK, FAINT = "#222222", "#999999"
 
@@ -83,11 +87,30 @@ class Figure:
         with matplotlib.rc_context(_STYLE):
             canvas = self.draw()
             _without_formulas(canvas)
+            if pins := _pins(canvas):
+                formats["png"]["metadata"][PINS] = json.dumps(pins)
             for suffix, options in formats.items():
                 with atomic_path(folder / f"{self.name}.{suffix}") as temporary:
                     canvas.savefig(temporary, format=suffix, **options)
                 canvas.set_layout_engine("none")  # the layout is complete; repeating it takes as long as drawing
         return [folder / f"{self.name}.{suffix}" for suffix in formats]
+
+
+def _pins(canvas: Canvas) -> list[tuple[str, str, float, float]]:
+    """Return each text with a link: itself, the link, and its centre as shares of width and height from above left."""
+    from matplotlib.text import Text
+
+    texts = [artist for artist in canvas.findobj(Text) if isinstance(artist, Text)]
+    linked = [(text, url) for text in texts if (url := text.get_url())]
+    if linked:
+        canvas.set_dpi(DPI)
+        canvas.draw_without_rendering()
+    boxes = [(text.get_text(), url, text.get_window_extent()) for text, url in linked]
+    width, height = canvas.bbox.size
+    return [
+        (text, url, float(box.x0 + box.x1) / 2 / width, 1 - float(box.y0 + box.y1) / 2 / height)
+        for text, url, box in boxes
+    ]
 
 
 def _without_formulas(canvas: Canvas) -> None:

@@ -9,8 +9,8 @@ from semstab.data.measures import measures
 from semstab.data.records import Record, Result
 from semstab.data.results import Agreement
 from semstab.report.means import Pooled, pooled
-from semstab.report.tables.stability import ALL_VOXELS, SBD_OVER, of_measures, settings
-from semstab.report.tables.table import Column, Group, Row, Table
+from semstab.report.tables.stability import SBD_OVER, of_measures, settings
+from semstab.report.tables.table import ALL_VOXELS, Column, Group, Row, Table
 
 # The fusion implementations: the same frames through every backend, and the differences of the measures.
 
@@ -32,7 +32,7 @@ def fusion(result: Result) -> list[Table]:
         Column("fuse_ms_per_frame", "ms per frame", 1, "lower"),
         Column("delta_voxels", "Voxels", 0, signed=True, over=DIFFERENCE),
         Column("delta_mean_op", "OP", 2, signed=True, over=DIFFERENCE),
-        *(Column(f"delta_{m.key}", m.title, m.digits[1], signed=True, over=DIFFERENCE) for m in measures()),
+        *(Column(f"delta_{m.key}_all", m.title, m.digits[1], signed=True, over=DIFFERENCE) for m in measures()),
     )
     caption = (
         f"{settings(result.select())} The means are pooled: they run over the voxels of all scenes together; ms per"

@@ -17,9 +17,9 @@ from semstab.data.statistics import (
     Quadrants,
 )
 from semstab.metrics import macro_mean
-from semstab.report.tables.stability import OF_ROW, settings
+from semstab.report.tables.stability import settings
 from semstab.report.tables.statistics import INTERVALS, Number, assessed_records, by_scene, grouped
-from semstab.report.tables.table import Column, Group, Row, Table
+from semstab.report.tables.table import OF_ROW, Column, Group, Row, Table
 from semstab.statistics.correctness import ACCURACY, BRIER, ECE, MIOU
 from semstab.statistics.correlogram import STANDARD
 from semstab.statistics.intervals import LEAST_FRAMES
@@ -83,7 +83,7 @@ def _quadrants(result: Result) -> list[Table]:
         Column("consistent_wrong_percent", "wrong", 1, "lower", over="Consistent (%)"),
         Column("inconsistent_right_percent", "right", 1, over="Inconsistent (%)"),
         Column("inconsistent_wrong_percent", "wrong", 1, "lower", over="Inconsistent (%)"),
-        Column("wrong_of_consistent_percent", "Wrong of consistent (%)", 1, "lower"),
+        Column("wrong_of_consistent_op3_percent", "Wrong of consistent (%)", 1, "lower"),
     )
     numbers = (
         _quadrant(lambda quadrants: quadrants.voxels),
@@ -91,7 +91,7 @@ def _quadrants(result: Result) -> list[Table]:
         _quadrant(lambda quadrants: quadrants.consistent_wrong.percent),
         _quadrant(lambda quadrants: quadrants.inconsistent_right.percent),
         _quadrant(lambda quadrants: quadrants.inconsistent_wrong.percent),
-        _quadrant(lambda quadrants: quadrants.wrong_of_consistent.percent),
+        _quadrant(lambda quadrants: quadrants.wrong_of_consistent_op3.percent),
     )
     caption = (
         "The table shows the voxels with OP>=3 and a true class. A voxel is consistent if PSA >= 0.8: one of ten frames"

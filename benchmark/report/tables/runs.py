@@ -21,8 +21,7 @@ COLUMNS = (
     SCENE, Column("model", "Model"), Column("verdict", "Verdict"), Column("probability_percent", "Probability (%)", 0),
     Column.of(ALPHA), Column("scope", "For"), Column("agree_percent", "Agree (%)", 1, "higher"),
     Column("flicker_percent", "Flicker (%)", 1, "lower"),
-    Column("vss_op3", "VSS (OP>=3)", 3, "higher"),
-    Column("sbd_op3", "SBD (OP>=3)", 4, "lower"), Column.of(MIOU),
+    Column.of(VSS), Column.of(SBD), Column.of(MIOU),
     Column("voxel_size", "Voxel (m)", 3), Column("frames", "Frames", 0),
 )  # fmt: skip
 
@@ -78,5 +77,5 @@ def _row(record: Record) -> Row:
         unknown if headline is None else headline.alpha,
         "" if headline is None else headline.alpha.scope,
         unknown if statistics is None else 100 * statistics.agreeing, record.image_space.compensated_flicker_percent,
-        *means, unknown if correct is None else correct.miou, run.table.voxel_size, run.frames,
+        *means, unknown if correct is None else correct.miou_op2, run.table.voxel_size, run.frames,
     )  # fmt: skip

@@ -20,7 +20,7 @@ from semstab.report.means import (
     swept,
 )
 from semstab.report.tables.stability import SBD_OVER, of_measures
-from semstab.report.tables.table import Column, Group, Row, Table
+from semstab.report.tables.table import ALL_VOXELS, Column, Group, Row, Table
 from semstab.statistics.agreement import ALPHA, PSA, VOXEL_ALPHA
 
 # The sensitivity sweeps: means of all voxels and of the recurrent ones side by side, with their share.
@@ -50,7 +50,7 @@ def _table(result: Result, sweep: Sweep) -> Table:
     assessed = any(level.assessed for of_model in by_model.values() for level in of_model)
     agreement = (
         *(Column.of(quantity, compared=True) for quantity in (PSA, ALPHA)),
-        Column("sbd_excess", "SBD excess", 4, signed=True),
+        Column("sbd_excess_op2", "SBD excess (OP>=2)", 4, signed=True),
     )
     columns = (
         Column("value", sweep.header),
@@ -58,8 +58,8 @@ def _table(result: Result, sweep: Sweep) -> Table:
         Column("voxels", "Voxels", 0),
         Column("mean_op", "Mean OP", 2),
         Column("recurrent_percent", "OP>=3 (%)", 2),
-        *of_measures(compared=True, over="All voxels"),
-        *of_measures(compared=True, suffix="_op3", over="OP>=3"),
+        *of_measures(compared=True, over=ALL_VOXELS),
+        *of_measures(compared=True, over="OP>=3"),
         *(agreement if assessed else ()),
         Column("note", "Note"),
     )
@@ -103,8 +103,8 @@ def reduced(result: Result) -> list[Table]:
         return []
     columns = (
         Column("scene", "Scene"),
-        Column("vss", VSS.title, VSS.digits[0], VSS.better),
-        Column("vss_op3", VSS.named, VSS.digits[0], VSS.better),
+        Column("vss_all", "VSS, all voxels", VSS.digits[0], VSS.better),
+        Column.of(VSS),
         Column.of(VOXEL_ALPHA),
     )
     groups = tuple(
@@ -121,8 +121,8 @@ def reduced(result: Result) -> list[Table]:
 def _reduced_row(record: Record) -> Row:
     reduced, table, statistics = record.summary.reduced, record.summary.table, record.summary.statistics
     if reduced is not None:
-        return record.unit.scene, reduced.vss, reduced.recurrent_vss, reduced.voxel_alpha
-    alpha = math.nan if statistics is None else statistics.agreement.voxel_alpha.value
+        return record.unit.scene, reduced.vss_all, reduced.vss_op3, reduced.voxel_alpha_op2
+    alpha = math.nan if statistics is None else statistics.agreement.voxel_alpha_op2.value
     return record.unit.scene, table[VSS], table.recurrent[VSS], alpha
 
 
@@ -133,7 +133,7 @@ def voxel_sizes(result: Result) -> list[Table]:
         for name, records in by_model(result.select()).items()
         if (
             rows := tuple(
-                (r.unit.scene, s.voxel_size, s.frames, s.voxel_alpha) for r in records for s in r.summary.sizes
+                (r.unit.scene, s.voxel_size, s.frames, s.voxel_alpha_op2) for r in records for s in r.summary.sizes
             )
         )
     )

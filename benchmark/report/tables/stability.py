@@ -10,7 +10,7 @@ from semstab.data.records import Record, Result
 from semstab.data.results import Means, TableSummary
 from semstab.metrics import macro_mean, split_last
 from semstab.report.means import ENOUGH, by_model, pooled
-from semstab.report.tables.table import Column, Group, Row, Table
+from semstab.report.tables.table import ALL_VOXELS, OF_ROW, Column, Group, Row, Table
 from semstab.statistics.agreement import ALPHA
 
 VOXELS = Column("voxels", "Voxels", 0)
@@ -18,13 +18,9 @@ SHARE = Column("share_percent", "Voxels (%)", 2)
 SBD_OVER = "Means of SBD (bits) run over the voxels seen twice or more."
 
 
-ALL_VOXELS, OF_ROW = "All voxels", "Of these voxels"
-"""What stands over the columns of measures whose population is all voxels, or the one that the row names."""
-
-
-def of_measures(*, over: str, compared: bool = False, suffix: str = "") -> list[Column]:
+def of_measures(*, over: str, compared: bool = False) -> list[Column]:
     """Return a column for each measure under its population `over`; the paper prints more decimals to compare."""
-    return [Column.of(measure, compared=compared, suffix=suffix, over=over) for measure in measures()]
+    return [Column.of(measure, compared=compared, over=over) for measure in measures()]
 
 
 def settings(records: Sequence[Record]) -> str:
@@ -55,7 +51,7 @@ _COLUMNS = (
     Column("once_percent", "Seen once (%)", 2),
     Column("recurrent_percent", "OP>=3 (%)", 2),
     *(Column.of(measure, over=ALL_VOXELS) for measure in _HEADLINES),
-    *(Column.of(measure, suffix="_op3", over="OP>=3") for measure in _HEADLINES),
+    *(Column.of(measure, over="OP>=3") for measure in _HEADLINES),
     Column("flicker_percent", "Pixel flicker (%)", 2, "lower"),
     Column("compensated_flicker_percent", "Flicker (%)", 2, "lower"),
 )

@@ -61,10 +61,10 @@ def temporal_agreement(result: Result) -> list[Table]:
         of_spots(lambda spots: spots.views),
         of_spots(lambda spots: 100 * spots.labelled),
         lambda stats: stats.repeated.voxels,
-        lambda stats: stats.agreement.vss.value,
-        lambda stats: stats.agreement.psa,
-        lambda stats: stats.agreement.kappa.value,
-        lambda stats: stats.agreement.voxel_alpha,
+        lambda stats: stats.agreement.vss_op2.value,
+        lambda stats: stats.agreement.psa_op2,
+        lambda stats: stats.agreement.kappa_op2.value,
+        lambda stats: stats.agreement.voxel_alpha_op2,
         lambda stats: stats.agreement.within.value,
         lambda stats: stats.agreement.between.value,
         lambda stats: math.nan if stats.drift.flips is None else stats.drift.flips.rate.value,
@@ -149,13 +149,13 @@ def drift(result: Result) -> list[Table]:
     """Return SBD and the SBD of the same observations in random order."""
     columns = (
         Column("voxels", "Voxels", 0),
-        Column("sbd", "observed", 4, over="SBD (bits)"),
-        Column("sbd_null", "random order", 4, over="SBD (bits)"),
-        Column("sbd_excess", "excess", 4, signed=True, over="SBD (bits)"),
+        Column("sbd_op2", "observed", 4, over="SBD (bits)"),
+        Column("sbd_null_op2", "random order", 4, over="SBD (bits)"),
+        Column("sbd_excess_op2", "excess", 4, signed=True, over="SBD (bits)"),
     )
     numbers: tuple[Number, ...] = (
         ordered(lambda drift: drift.voxels),
-        ordered(lambda drift: drift.sbd.value),
+        ordered(lambda drift: drift.sbd_op2.value),
         ordered(lambda drift: drift.null.value),
         ordered(lambda drift: drift.excess),
     )
@@ -217,11 +217,11 @@ def uncertainty(result: Result) -> list[Table]:
     )
 
     def share(stats: MapStatistics) -> float:
-        entropy = stats.uncertainty.entropy.value
+        entropy = stats.uncertainty.entropy_op2.value
         return 100 * stats.uncertainty.within.value / entropy if entropy else math.nan
 
     numbers: tuple[Number, ...] = (
-        lambda stats: stats.uncertainty.entropy,
+        lambda stats: stats.uncertainty.entropy_op2,
         lambda stats: stats.uncertainty.within,
         lambda stats: stats.uncertainty.between,
         share,
@@ -246,7 +246,7 @@ def verdicts(result: Result) -> list[Table]:
         Column("probability_percent", "Probability (%)", 0),
         Column.of(ALPHA),
         Column("labelled_percent", "Labelled (%)", 0, "higher"),
-        Column("wrong_of_consistent_percent", "Wrong of consistent (%)", 0, "lower"),
+        Column("wrong_of_consistent_op3_percent", "Wrong of consistent (OP>=3, %)", 0, "lower"),
         REPEATED,
         Column("repeated_percent", "of the map (%)", 0),
         Column("advice", "Recommendation"),
@@ -352,8 +352,8 @@ def _class_rows(assessed: Sequence[MapStatistics]) -> tuple[Row, ...]:
             _one_or_mean([row.alpha.ends for row in alphas.get(name, [])]),
             "yes" if any(row.counts_for_verdict for row in alphas.get(name, [])) else "",
             macro_mean([100 * row.unstable for row in alphas.get(name, [])]),
-            macro_mean([row.kappa for row in rows]),
-            macro_mean([row.voxel_alpha for row in rows]),
+            macro_mean([row.kappa_op2 for row in rows]),
+            macro_mean([row.voxel_alpha_op2 for row in rows]),
         )
         for name, rows in by_name.items()
         if any(row.observations for row in rows)
@@ -374,7 +374,7 @@ def _verdict_row(record: Record, stats: MapStatistics) -> Row:
         100 * stats.verdict.probability,
         stats.headline.alpha.ends,
         math.nan if stats.spots is None else 100 * stats.spots.labelled,
-        UNDEFINED if right is None else right.quadrants.wrong_of_consistent.percent,
+        UNDEFINED if right is None else right.quadrants.wrong_of_consistent_op3.percent,
         stats.repeated.voxels,
         100 * stats.repeated.share,
         ADVICE[stats.verdict.decisive],

@@ -21,6 +21,12 @@ from semstab.statistics import Estimate
 UNDEFINED = "--"
 """The text of an undefined number in print; in JSON it is null, in CSV an empty field."""
 
+ALL_VOXELS, OF_ROW = "All voxels", "Of these voxels"
+"""What stands over the columns of measures whose population is all voxels, or the one that the row names."""
+
+POPULATIONS = {ALL_VOXELS: "_all", OF_ROW: "", "OP>=2": "_op2", "OP>=3": "_op3"}
+"""Headings over columns of measures, and the suffix that their keys have for it."""
+
 Cell = str | int | float | Spread | Estimate
 Row = tuple[Cell, ...]
 
@@ -45,13 +51,14 @@ class Column:
     over: str = ""
 
     @classmethod
-    def of(cls, quantity: Quantity, *, compared: bool = False, suffix: str = "", over: str = "") -> Column:
+    def of(cls, quantity: Quantity, *, compared: bool = False, over: str = "") -> Column:
         """Return the column of a measure, with the decimals of a summary or of a comparison.
 
-        Its name holds its population, unless the heading `over` it does.
+        Its header holds its population, unless the heading `over` it does; its key does, unless each row has its own.
         """
         digits, title = quantity.digits[compared], quantity.title if over else quantity.named
-        return cls(quantity.key + suffix, title, digits, quantity.better, over=over)
+        key = quantity.key + POPULATIONS[over] if over else quantity.name
+        return cls(key, title, digits, quantity.better, over=over)
 
     def number(self, value: float) -> str:
         """Return the rounded number; UNDEFINED where there is none."""

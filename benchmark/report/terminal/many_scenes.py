@@ -86,7 +86,7 @@ def _model_row(name: str, records: Sequence[Record]) -> list[str]:
     recurrent = pooled(records).recurrent
     means = [recurrent[m] if recurrent.voxels >= ENOUGH else math.nan for m in headlines()]
     shown = [short(value, digits=m.digits[0]) for m, value in zip(headlines(), means, strict=True)]
-    right = [own.correctness.miou.value for own in statistics if own.correctness is not None]
+    right = [own.correctness.miou_op2.value for own in statistics if own.correctness is not None]
     miou = macro_mean(right) if right else math.nan
     return [name, verdicts, alpha.text(), number(agree, 0), number(flicker, 1), *shown, short(miou, digits=3)]
 
@@ -117,7 +117,7 @@ def _refuted(models: dict[str, list[Record]]) -> Iterator[str]:
     """Yield the models whose agreement ground truth refutes in a scene, with the share that is wrong there."""
     for name, records in models.items():
         known = [own.statistics for own in records if own.statistics is not None]
-        wrong = [own.headline.wrong_of_consistent.value for own in known if own.verdict.level == "misleading"]
+        wrong = [own.headline.wrong_of_consistent_op3.value for own in known if own.verdict.level == "misleading"]
         if wrong:
             low, high = percent(min(wrong)), percent(max(wrong))
             share = low if low == high else f"{low} to {high}"

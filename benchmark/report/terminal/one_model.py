@@ -84,7 +84,7 @@ def wrong_text(statistics: MapStatistics) -> str:
 
 def share_of_wrong(statistics: MapStatistics) -> str:
     """Return the share of the consistent locations that are wrong: '5 % (3 to 6 %)'; '' without truth."""
-    wrong = statistics.headline.wrong_of_consistent
+    wrong = statistics.headline.wrong_of_consistent_op3
     return "" if math.isnan(wrong.value) else f"{percent(wrong.value)}{_interval(wrong, 100)}"
 
 

@@ -53,7 +53,7 @@ def row_of(record: Record, begin: str = "") -> list[str]:
 def miou(record: Record) -> float:
     """Return the mIoU of the fused labels seen twice or more; NaN without ground truth."""
     statistics = record.summary.statistics
-    return math.nan if statistics is None or statistics.correctness is None else statistics.correctness.miou.value
+    return math.nan if statistics is None or statistics.correctness is None else statistics.correctness.miou_op2.value
 
 
 OF_MAP = "of each map"
