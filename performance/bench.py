@@ -23,6 +23,7 @@ CASES = {
     "rivals": "timed.rivals",
     "gpu": "timed.gpu",
     "statistics": "timed.statistics",
+    "spots": "timed.spots",
     "online": "timed.online",
     "filters": "timed.filters",
     "casting": "timed.casting",
@@ -33,7 +34,7 @@ CASES = {
     "workers": "timed.workers",
     "annotation": "timed.annotation",
 }
-PREPARED = ("fusion", "random-scenes", "scores", "scans", "rivals", "statistics")
+PREPARED = ("fusion", "random-scenes", "scores", "scans", "rivals", "statistics", "spots")
 """Cases whose process is made ready as the command makes its own, before anything starts threads."""
 
 
