@@ -36,8 +36,9 @@ MOST_NEW = 1 << 15
 LOOKED_AT = 6_000
 """Blocks of pixels, about, or points of a scan, in which new spots are looked for."""
 
-PART = 0.5
-"""Part of the blocks in which new spots are looked for after the first frame: a place is seen by several frames."""
+PLACES, MOST_LOOKED = 4.0, 1 << 17
+"""Places that are looked at in the area of a coarse cell's face, so that few cells are left out by chance; and the most
+places, about, of a frame."""
 
 APART = 0.7
 """Edge of a coarse cell, by the mean area that a block of pixels shows, or up to twice as much."""
@@ -51,8 +52,8 @@ FEW = 20_000
 REACH = 1 << 20
 """Coarse cells from the first camera within which there are spots."""
 
-OBLIQUE = 2.0
-"""How much wider than a surface that faces the sensor points of sparse depth lie apart, about."""
+SOME_POINTS = 1_500
+"""Points of sparse depth, about, that tell the mean area for which a point stands."""
 
 CHANGE = 8.0
 """Growth or fall of the median footprint from which on the sample begins again, as after a take-off."""
@@ -106,8 +107,7 @@ class Sparse:
         camera: Focal lengths and principal point in pixels; of a scan, pixels in a radian.
         around: Whether columns close a circle.
         reach: Pixels to each side in which points around a place are looked for.
-        spacing: Of the points, in pixels of an image, or in distances of a scan's points.
-        pixels: Of the points, in pixels of the grid.
+        spacing: Distance of the points in pixels of the grid.
         labels: (n,) uint16 labels of the points; None if the image has labels in all pixels.
     """
 
@@ -119,8 +119,11 @@ class Sparse:
     around: bool
     reach: int
     spacing: float
-    pixels: float
     labels: UInt16 | None = None
+
+    def apart(self, looked: int) -> float:
+        """Return the distance, in pixels of the grid, of some of the points that are looked at."""
+        return self.spacing * math.sqrt(len(self.w) / max(looked, 1))
 
     @property
     def arrays(self) -> tuple[Any, ...]:
@@ -155,7 +158,7 @@ class Sampler:
         self._clear()
 
     def _clear(self) -> None:
-        self._share, self._answers, self._spots, self._part = 1 << 32, 0, 0, 1.0
+        self._share, self._answers, self._spots = 1 << 32, 0, 0
         self._point, self._hash = np.empty((1 << 12, 3)), np.empty(1 << 12, np.uint32)
         self._table = np.full(1 << 14, -1, np.int64)
         self._columns = {name: np.empty(1 << 14, dtype) for name, dtype in TYPES.items()}
@@ -194,7 +197,7 @@ class Sampler:
         self._anchor = self._seen[digest] = Anchor(len(self._views), frame.T_wc.copy(), focal, depth)
         centre, when = frame.T_wc[:3, 3], math.nan if frame.timestamp is None else frame.timestamp
         self._views.append([frame.index, *centre.tolist(), when, depth / focal])
-        self._widths.append(_width(frame, sparse, depth / focal))
+        self._widths.append(_width(frame, sparse, self._allowed()) or depth / focal)
         edge = 2.0 ** math.ceil(math.log2(APART * float(np.median(self._widths))))
         if not self._edge / CHANGE < edge < self._edge * CHANGE:
             self._edge = edge
@@ -210,16 +213,22 @@ class Sampler:
 
         (H, W), stride = frame.shape, _stride(frame.shape)
         blocks = -(-H // stride) * -(-W // stride)
-        looked = max(1, round(self._part * blocks))
-        where = SURE * self._noise, self._edge, self._share, self._low, stride, _factor(blocks), looked, seed
+        where = SURE * self._noise, self._edge, self._share, self._low, stride, _factor(blocks)
+        where = *where, self._density(blocks), seed
         self._new(lambda *room: new_in_image(fixed(frame.depth), _camera(frame), T, *where, *room))
+
+    def _density(self, blocks: int) -> float:
+        """Return how many places are looked at in the area of a coarse cell's face."""
+        return min(PLACES, MOST_LOOKED / (blocks * (self._widths[-1] / self._edge) ** 2))
 
     def _find_in_points(self, sparse: Sparse, T: Float64, seed: int) -> None:
         """Add spots among the points of sparse depth."""
         from semstab.statistics.loops.sparse import new_in_points
 
-        place = sparse.camera, sparse.around, sparse.reach, sparse.pixels
-        where = self._allowed(), T, self._edge, self._share, self._low, _factor(len(sparse.w)), LOOKED_AT, seed
+        looked = min(len(sparse.w), LOOKED_AT)
+        place = sparse.camera, sparse.around, sparse.reach, sparse.apart(looked)
+        where = self._allowed(), T, self._edge, self._share, self._low, _factor(len(sparse.w))
+        where = *where, looked, self._density(looked), seed
         self._new(lambda *room: new_in_points(*sparse.arrays, *place, *where, *room))
 
     def _new(self, find: Any) -> None:
@@ -231,7 +240,6 @@ class Sampler:
             self._point, self._hash = _longer(self._point, room), _longer(self._hash, room)
         end = self._spots + MOST_NEW
         self._spots += find(self._table, self._point[self._spots : end], self._hash[self._spots : end])
-        self._part = PART
 
     def _rebuilt(self, size: int) -> Int64:
         """Return a table of the coarse cells of all spots."""
@@ -258,14 +266,15 @@ class Sampler:
         from semstab.statistics.loops.spots import answer, project
 
         n, camera = self._spots, _camera(frame)
-        spot, (x, y, error, room) = np.empty(n, np.int32), np.empty((4, n))
+        spot, pixel, (x, y, error, room) = np.empty(n, np.int32), np.empty(n, np.int64), np.empty((4, n))
         noise = SURE * self._noise if self._noise > SMOOTH else 0.0
-        n = project(self._point[:n], fixed(frame.depth), camera, T, noise, spot, x, y, error, room)
-        spot, x, y, error, room = spot[:n], x[:n], y[:n], error[:n], room[:n]
+        where = fixed(frame.depth), camera, T, noise, self._allowed()
+        n = project(self._point[:n], *where, spot, pixel, x, y, error, room)
+        spot, pixel, x, y, error, room = spot[:n], pixel[:n], x[:n], y[:n], error[:n], room[:n]
         self._learn(self._known, spot, error)
         out = _room(n)
         m = answer(
-            spot, x, y, room, self._allowed(), fixed(frame.depth), *_labels(frame), self.K, camera, self._hash,
+            spot, pixel, x, y, room, self._allowed(), fixed(frame.depth), *_labels(frame), self.K, camera, self._hash,
             seed, *out,
         )  # fmt: skip
         return tuple(column[:m] for column in out)
@@ -368,14 +377,16 @@ def _stride(shape: tuple[int, int]) -> int:
     return max(1, round(math.sqrt(shape[0] * shape[1] / LOOKED_AT)))
 
 
-def _width(frame: Frame, sparse: Sparse | None, footprint: float) -> float:
+def _width(frame: Frame, sparse: Sparse | None, allowed: float) -> float:
     """Return the edge, metres, of a square as large as the mean area that a block of pixels, or a point, shows."""
+    from semstab.statistics.loops.sparse import mean_area_of_points
     from semstab.statistics.loops.spots import mean_area
 
     if sparse is not None:
-        return OBLIQUE * sparse.spacing * footprint
+        place = sparse.camera, sparse.around, sparse.reach, sparse.apart(min(len(sparse.w), LOOKED_AT))
+        return math.sqrt(mean_area_of_points(*sparse.arrays, *place, allowed, max(1, len(sparse.w) // SOME_POINTS)))
     stride = _stride(frame.shape)
-    return stride * math.sqrt(mean_area(fixed(frame.depth), _camera(frame), 2 * stride, stride)) or footprint
+    return stride * math.sqrt(mean_area(fixed(frame.depth), _camera(frame), 2 * stride, stride))
 
 
 def _noise(frame: Frame) -> float:
@@ -414,7 +425,7 @@ def _sparse(frame: Frame, K: int) -> Sparse | None:
         labels = frame.predicted.reshape(-1).astype(np.uint16)
         unlabelled = np.False_ if frame.unlabelled is None else frame.unlabelled.reshape(-1)
         labels = np.where(labels < K, labels, np.where(unlabelled, K, K + 1)).astype(np.uint16)
-        return Sparse(grid, u, v, w, (1 / unit, 1 / unit, 0.0, 0.0), True, 5, 1.0, 2.0, labels)
+        return Sparse(grid, u, v, w, (1 / unit, 1 / unit, 0.0, 0.0), True, 5, 2.0, labels)
     rows = frame.depth[:: _few(frame.shape)]
     valid = (rows > 0) & (rows < np.inf)
     n, pairs = int(np.count_nonzero(valid)), int(np.count_nonzero(valid[:, 1:] & valid[:, :-1]))
@@ -434,4 +445,4 @@ def _sparse(frame: Frame, K: int) -> Sparse | None:
     labels = frame.predicted[valid].astype(np.uint16)
     labels = np.where(labels < K, labels, np.where(unlabelled, K, K + 1)).astype(np.uint16)
     reach = min(max(math.ceil(1.1 * spacing), 2), 12)
-    return Sparse(grid, u, v, w, _camera(frame), False, reach, spacing, spacing, None if dense else labels)
+    return Sparse(grid, u, v, w, _camera(frame), False, reach, spacing, None if dense else labels)

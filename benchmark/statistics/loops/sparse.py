@@ -6,8 +6,6 @@ import numpy as np
 
 from semstab.core.compiled import serial
 from semstab.statistics.loops.spots import (
-    OFF,
-    PLACES,
     STEEPEST,
     add_spot,
     area,
@@ -103,36 +101,49 @@ def surface(grid, u, v, w, x, y, reach, around):
 
 
 @serial
+def shown_by(grid, u, v, w, at, camera, around, reach, allowed):
+    """Return the area that a pixel at a point shows, m^2, and the plane through the points around it.
+
+    The plane is an inverse depth, 0 if there is no plane, and two slopes, relative. Without a plane the surface is
+    taken to face the sensor.
+    """
+    fx, fy, cx, cy = camera
+    there, left, _, _, along_x, along_y = surface(grid, u, v, w, u[at], v[at], reach, around)
+    if there == 0.0 or left > allowed:
+        return 1.0 / (w[at] * w[at] * fx * fy), 0.0, 0.0, 0.0
+    if around:
+        narrow = max(np.cos(v[at] / fy - 0.5 * np.pi), 1e-3)
+        normal = np.sqrt(1.0 + (along_x * fx / narrow) ** 2 + (along_y * fy) ** 2)
+        shown = min(normal, STEEPEST) * narrow / (w[at] * w[at] * fx * fy)
+    else:
+        x, y = (u[at] - cx) / fx, (v[at] - cy) / fy
+        shown = area(w[at], along_x * w[at], along_y * w[at], x, y, fx, fy)
+    return shown, there, along_x, along_y
+
+
+@serial
+def mean_area_of_points(grid, u, v, w, camera, around, reach, spacing, allowed, step):
+    """Return the mean area of the surface for which a point stands, m^2, over every step-th point; 0 without any."""
+    total, count = 0.0, 0
+    for at in range(0, len(w), step):
+        if w[at] > 0.0:
+            shown, _, _, _ = shown_by(grid, u, v, w, at, camera, around, reach, allowed)
+            total += shown * spacing * spacing
+            count += 1
+    return total / max(count, 1)
+
+
+@serial
 def new_in_points(
-    grid,
-    u,
-    v,
-    w,
-    camera,
-    around,
-    reach,
-    spacing,
-    allowed,
-    T,
-    edge,
-    share,
-    low,
-    factor,
-    most,
-    seed,
-    table,
-    point,
-    hashed,
-):
+    grid, u, v, w, camera, around, reach, spacing, allowed, T, edge, share, low, factor, looked, density, seed, table,
+    point, hashed,
+):  # fmt: skip
     """Add spots where points show a coarse cell without one; return how many.
 
-    Places are looked at evenly over the surface, as in `new_in_image`, at `most` of the points: on the plane through
-    the points around a point, up to half of `spacing` (pixels) away from it; at the point itself without a plane.
+    Places are looked at evenly over the surface, as in `new_in_image`, at `looked` points: on the plane through the
+    points around a point, up to half of `spacing` (pixels) away from it; at the point itself without a plane.
     """
     total, n, at = len(w), 0, np.int64(seed % len(w))
-    looked = min(total, most)
-    fx, fy, cx, cy = camera
-    spacing = spacing * np.sqrt(total / looked)
     for _ in range(looked):
         at += factor
         if at >= total:
@@ -140,24 +151,12 @@ def new_in_points(
         if w[at] == 0.0:
             continue
         number = np.uint32(np.uint32(seed) ^ (np.uint32(at) * np.uint32(0x85EBCA6B)))
-        there, left, _, _, along_x, along_y = surface(grid, u, v, w, u[at], v[at], reach, around)
-        plane = there > 0.0 and left <= allowed
-        if plane:
-            if around:
-                narrow = max(np.cos(v[at] / fy - 0.5 * np.pi), 1e-3)
-                normal = np.sqrt(1.0 + (along_x * fx / narrow) ** 2 + (along_y * fy) ** 2)
-                shown = min(normal, STEEPEST) * narrow / (w[at] * w[at] * fx * fy)
-            else:
-                x, y = (u[at] - cx) / fx, (v[at] - cy) / fy
-                shown = area(w[at], along_x * w[at], along_y * w[at], x, y, fx, fy)
-        else:
-            shown = 1.0 / (w[at] * w[at] * fx * fy)
-        shown *= spacing * spacing
-        places = number_of(PLACES * shown / (edge * edge), fraction(np.uint32(number ^ np.uint32(0x165667B1))))
-        for _ in range(places):
+        shown, there, along_x, along_y = shown_by(grid, u, v, w, at, camera, around, reach, allowed)
+        expected = density * shown * spacing * spacing / (edge * edge)
+        for _ in range(number_of(expected, fraction(np.uint32(number ^ np.uint32(0x165667B1))))):
             number = mixed(np.uint32(number + np.uint32(0x9E3779B9)))
             x, y, here = u[at], v[at], w[at]
-            if plane:
+            if there > 0.0:
                 dx = (fraction(number) - 0.5) * spacing
                 dy = (fraction(np.uint32(number ^ np.uint32(0x27D4EB2F))) - 0.5) * spacing
                 near = there * (1.0 + along_x * dx + along_y * dy)
@@ -201,8 +200,6 @@ def project_sparse(point, grid, u, v, w, camera, around, reach, dense, T, spot, 
         else:
             p, q = X / Z * fx + cx, Y / Z * fy + cy
             if not (-0.5 <= p < columns - 0.5 and -0.5 <= q < rows - 0.5):
-                continue
-            if dense and (abs(p - np.floor(p + 0.5)) > OFF or abs(q - np.floor(q + 0.5)) > OFF):
                 continue
         there, left, at, least, along_x, along_y = surface(grid, u, v, w, p, q, reach, around)
         if there == 0.0 or left > ON_A_PLANE:

@@ -25,10 +25,6 @@ EMPTY = np.int64(-1)
 PHASE = 0.3819660113
 """Part of its edge by which coarse cells are moved from the origin: the golden section."""
 
-PLACES, MOST_PLACES = 2.0, np.int64(64)
-"""Places that are looked at in the area of a coarse cell's face, so that few cells are left out by chance; and the most
-of them for one block of pixels, or point of a scan."""
-
 STEEPEST = 32.0
 """Largest area that a pixel shows, in those that it would show if the surface faced it."""
 
@@ -41,10 +37,6 @@ AROUND, LEAST_AROUND = 2, 6.0
 EDGE, JUMP = 4.0, 0.01
 """A slope of inverse depth to one side that is larger than that to the other side by this factor, and this share of the
 inverse depth, is an edge."""
-
-OFF = 0.35
-"""A pixel answers for a spot if its centre is at most this far from it along each axis, in pixels: a pixel at a border
-of classes tells the class at its centre. Every second view is lost by this, whatever the labels."""
 
 
 @serial
@@ -248,17 +240,16 @@ def area(here, along_x, along_y, x, y, fx, fy):
 
 @serial
 def number_of(expected, chance):
-    """Return how many places to look at if `expected` are expected, by a number from 0 to 1; at most MOST_PLACES."""
-    return min(np.int64(np.floor(expected + chance)), MOST_PLACES)
+    """Return how many places to look at if `expected` are expected, by a number from 0 to 1."""
+    return np.int64(np.floor(expected + chance))
 
 
 @serial
-def new_in_image(depth, camera, T, allowed, edge, share, low, stride, factor, looked, seed, table, point, hashed):
+def new_in_image(depth, camera, T, allowed, edge, share, low, stride, factor, density, seed, table, point, hashed):
     """Add spots where an image shows a coarse cell without one; return how many.
 
-    Places are looked at evenly over the surface, PLACES in the area of a coarse cell's face: in blocks of stride x
-    stride pixels, of which `looked` are taken, in an order that jumps over the image by `factor`, as many as the area
-    that a pixel shows asks for.
+    Places are looked at evenly over the surface, `density` in the area of a coarse cell's face: in all blocks of stride
+    x stride pixels, in an order that jumps over the image by `factor`, as many as the area that a block shows asks for.
     A place lies anywhere in its pixel, so that the view that finds a spot meets it as any other view does.
     """
     H, W = depth.shape
@@ -266,7 +257,7 @@ def new_in_image(depth, camera, T, allowed, edge, share, low, stride, factor, lo
     columns = (W + stride - 1) // stride
     total, n = (H + stride - 1) // stride * columns, 0
     at = np.int64(seed % total)
-    for _ in range(looked):
+    for _ in range(total):
         at += factor
         if at >= total:
             at -= total
@@ -286,10 +277,12 @@ def new_in_image(depth, camera, T, allowed, edge, share, low, stride, factor, lo
             if done == 1:
                 along_x, along_y = slopes(depth, row, column, here, stride)
                 shown = area(here, along_x, along_y, (column - cx) / fx, (row - cy) / fy, fx, fy) * stride * stride
-                places = number_of(PLACES * shown / (edge * edge), fraction(np.uint32(number ^ np.uint32(0x165667B1))))
+                places = number_of(density * shown / (edge * edge), fraction(np.uint32(number ^ np.uint32(0x165667B1))))
                 if places == 0:
                     continue
-            px, py, pz = in_world((u - cx) / fx / here, (v - cy) / fy / here, 1.0 / here, T)
+            along_x, along_y = slopes(depth, row, column, here)
+            z = 1.0 / max(here + along_x * (u - column) + along_y * (v - row), 0.5 * here)
+            px, py, pz = in_world((u - cx) / fx * z, (v - cy) / fy * z, z, T)
             if free(px, py, pz, edge, share, low, table, False) < 0:
                 continue
             there = smoothed(depth, row, column, here, u - column, v - row, allowed)
@@ -331,12 +324,14 @@ def outside(depth, row, column, here, dx, dy, w):
 
 
 @serial
-def project(point, depth, camera, T, noise, spot, x, y, error, room):
+def project(point, depth, camera, T, noise, allowed, spot, pixel, x, y, error, room):
     """Find the spots that fall on a pixel with depth, in front of the camera; return how many.
 
-    For each it writes its number, its image coordinates, how much nearer than the spot the surface is by the pixel's
-    slope, and `room`: how far the spot is from all that the slopes to the pixels around allow; both relative. Noise is
-    what pixels of one surface differ by, relative: if it is not 0, planes through the pixels around tell the depth.
+    For each it writes its number, the pixel, its image coordinates, how much nearer than the spot the surface is by the
+    pixel's slope, and `room`: how far the spot is from all that the slopes to the pixels around allow; both relative.
+    The pixel is that which the spot falls into, or the next one if that shows the spot's surface (`allowed`) and the
+    first one does not, as at the edge of a narrow surface. Noise is what pixels of one surface differ by, relative: if
+    it is not 0, planes through the pixels around tell the depth.
     """
     H, W = depth.shape
     fx, fy, cx, cy = camera
@@ -350,19 +345,39 @@ def project(point, depth, camera, T, noise, spot, x, y, error, room):
             continue
         column, row = np.int64(np.floor(u + 0.5)), np.int64(np.floor(v + 0.5))
         here = inverse(depth, row, column)
-        if here == 0.0 or abs(u - column) > OFF or abs(v - row) > OFF:
+        error[n], room[n] = misfit(depth, row, column, here, u - column, v - row, z, noise) if here > 0.0 else (-1.0, 1.0)
+        if room[n] > allowed and error[n] < 0.0:
+            step_x, step_y = np.int64(1) if u > column else np.int64(-1), np.int64(1) if v > row else np.int64(-1)
+            along_row = abs(u - column) > abs(v - row)
+            for turn in range(3):
+                a = step_x if turn == 2 or (turn == 0) == along_row else np.int64(0)
+                b = step_y if turn == 2 or (turn == 0) != along_row else np.int64(0)
+                there = inverse(depth, row + b, column + a)
+                if there == 0.0:
+                    continue
+                off, left = misfit(depth, row + b, column + a, there, u - column - a, v - row - b, z, noise)
+                if left <= allowed:
+                    column, row, here, room[n] = column + a, row + b, there, left
+                    break
+        if here == 0.0:
             continue
-        spot[n], x[n], y[n] = i, u, v
-        if noise > 0.0:
-            error[n] = smoothed(depth, row, column, here, u - column, v - row, noise) * z - 1.0
-            room[n] = abs(error[n])
-            n += 1
-            continue
-        along_x, along_y = slopes(depth, row, column, here)
-        error[n] = (here + along_x * (u - column) + along_y * (v - row)) * z - 1.0
-        room[n] = outside(depth, row, column, here, u - column, v - row, 1.0 / z) * z
+        spot[n], pixel[n], x[n], y[n] = i, row * W + column, u, v
         n += 1
     return n
+
+
+@serial
+def misfit(depth, row, column, here, dx, dy, z, noise):
+    """Return how much nearer than depth z a pixel's surface is at (dx, dy) from its centre, and how far it is at least.
+
+    Both are relative; see `project`.
+    """
+    if noise > 0.0:
+        error = smoothed(depth, row, column, here, dx, dy, noise) * z - 1.0
+        return error, abs(error)
+    along_x, along_y = slopes(depth, row, column, here)
+    error = (here + along_x * dx + along_y * dy) * z - 1.0
+    return error, outside(depth, row, column, here, dx, dy, 1.0 / z) * z
 
 
 @serial
@@ -411,12 +426,12 @@ def squared(dx, dy, here, fx, fy):
 
 @serial
 def answer(
-    spot, x, y, room, allowed, depth, labels, unlabelled, K, camera, hashed, seed, out, near, far, beyond, square
+    spot, pixel, x, y, room, allowed, depth, labels, unlabelled, K, camera, hashed, seed, out, near, far, beyond, square
 ):
     """Write the answers of the pixels that show a spot: its number, three labels, and two squared distances, metres^2.
 
     A pixel shows a spot if both are at the same depth, but for `allowed` (relative). The first label is that of the
-    pixel which the spot falls into; the second and the third one those of the next two pixels to one side, if they
+    pixel which `project` found; the second and the third one those of the next two pixels to one side, if they
     show the same surface. The distances are those of the first two pixels' centres from the spot, across the ray.
     unlabelled (H, W) marks pixels to which the model gave no label; (0, 0) without such pixels. Returns the number of
     answers.
@@ -426,7 +441,7 @@ def answer(
     for i in range(len(spot)):
         if room[i] > allowed:
             continue
-        column, row = np.int64(np.floor(x[i] + 0.5)), np.int64(np.floor(y[i] + 0.5))
+        row, column = pixel[i] // depth.shape[1], pixel[i] % depth.shape[1]
         own, here = own_label(labels, unlabelled, row, column, K), inverse(depth, row, column)
         out[n], near[n], far[n], beyond[n] = spot[i], own, own, own
         dx, dy = column - x[i], row - y[i]
