@@ -25,7 +25,7 @@ from semstab.statistics import Sampler, SpotObservations, Views, describe, disag
 from semstab.statistics.accumulate import sums_of_spots
 from semstab.statistics.cluster_sums import lever_of, value
 from semstab.statistics.intervals import estimate
-from semstab.statistics.loops.spots import OFF, hash_cell
+from semstab.statistics.loops.spots import hash_cell
 from semstab.statistics.observations import COLUMNS
 
 DATA = Path(os.environ.get("SEMSTAB_DATA", Path(__file__).parents[2] / "shared/data"))
@@ -51,7 +51,7 @@ def seen_by(frame, point):
     column, row = np.floor(u + 0.5).astype(int), np.floor(v + 0.5).astype(int)
     H, W = frame.shape
     inside = (column >= 0) & (column < W) & (row >= 0) & (row < H)
-    return u, v, column, row, inside & (abs(u - column) <= OFF) & (abs(v - row) <= OFF)
+    return u, v, column, row, inside
 
 
 def with_a_hole(frames, *, said):

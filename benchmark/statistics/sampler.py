@@ -285,9 +285,7 @@ class Sampler:
         n = self._spots
         spot, nearest, (x, y, error, room) = np.empty(n, np.int32), np.empty(n, np.int64), np.empty((4, n))
         place = sparse.camera, sparse.around, sparse.reach
-        n = project_sparse(
-            self._point[:n], *sparse.arrays, *place, sparse.labels is None, T, spot, x, y, error, room, nearest
-        )
+        n = project_sparse(self._point[:n], *sparse.arrays, *place, T, spot, x, y, error, room, nearest)
         spot, x, y, error, room, nearest = spot[:n], x[:n], y[:n], error[:n], room[:n], nearest[:n]
         self._learn(self._known, spot, error)
         out = _room(n)

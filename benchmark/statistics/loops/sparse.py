@@ -181,7 +181,7 @@ def back(x, y, w, camera, around):
 
 
 @serial
-def project_sparse(point, grid, u, v, w, camera, around, reach, dense, T, spot, x, y, error, room, nearest):
+def project_sparse(point, grid, u, v, w, camera, around, reach, T, spot, x, y, error, room, nearest):
     """Find the spots that points around show; return how many. As `project`, and `nearest` takes the nearest point.
 
     A plane through the points around tells the depth there; if they lie on no plane, as at an edge, the nearest point

@@ -329,9 +329,9 @@ def project(point, depth, camera, T, noise, allowed, spot, pixel, x, y, error, r
 
     For each it writes its number, the pixel, its image coordinates, how much nearer than the spot the surface is by the
     pixel's slope, and `room`: how far the spot is from all that the slopes to the pixels around allow; both relative.
-    The pixel is that which the spot falls into, or the next one if that shows the spot's surface (`allowed`) and the
-    first one does not, as at the edge of a narrow surface. Noise is what pixels of one surface differ by, relative: if
-    it is not 0, planes through the pixels around tell the depth.
+    The pixel is that which the spot falls into. If that shows only what lies behind the spot, it is one of the next
+    pixels if one shows the spot's surface, as along a narrow surface (`allowed`, relative). Noise is what pixels of one
+    surface differ by, relative: if it is not 0, planes through the pixels around tell the depth.
     """
     H, W = depth.shape
     fx, fy, cx, cy = camera
@@ -345,25 +345,32 @@ def project(point, depth, camera, T, noise, allowed, spot, pixel, x, y, error, r
             continue
         column, row = np.int64(np.floor(u + 0.5)), np.int64(np.floor(v + 0.5))
         here = inverse(depth, row, column)
-        error[n], room[n] = misfit(depth, row, column, here, u - column, v - row, z, noise) if here > 0.0 else (-1.0, 1.0)
-        if room[n] > allowed and error[n] < 0.0:
-            step_x, step_y = np.int64(1) if u > column else np.int64(-1), np.int64(1) if v > row else np.int64(-1)
-            along_row = abs(u - column) > abs(v - row)
+        error[n], room[n] = -1.0, 1.0
+        if here > 0.0:
+            error[n], room[n] = misfit(depth, row, column, here, u - column, v - row, z, noise)
+        if room[n] > allowed and error[n] < 0.0:  # the spot is in front of all that its pixel shows
             for turn in range(3):
-                a = step_x if turn == 2 or (turn == 0) == along_row else np.int64(0)
-                b = step_y if turn == 2 or (turn == 0) != along_row else np.int64(0)
+                a, b = towards(u - column, v - row, turn)
                 there = inverse(depth, row + b, column + a)
-                if there == 0.0:
-                    continue
-                off, left = misfit(depth, row + b, column + a, there, u - column - a, v - row - b, z, noise)
-                if left <= allowed:
-                    column, row, here, room[n] = column + a, row + b, there, left
-                    break
+                if there > 0.0:
+                    _, left = misfit(depth, row + b, column + a, there, u - column - a, v - row - b, z, noise)
+                    if left <= allowed:
+                        column, row, here, room[n] = column + a, row + b, there, left
+                        break
         if here == 0.0:
             continue
         spot[n], pixel[n], x[n], y[n] = i, row * W + column, u, v
         n += 1
     return n
+
+
+@serial
+def towards(dx, dy, turn):
+    """Return the step to the next pixel towards (dx, dy): along the longer of them, the shorter, or both."""
+    a, b = np.int64(1) if dx > 0.0 else np.int64(-1), np.int64(1) if dy > 0.0 else np.int64(-1)
+    if turn == 2:
+        return a, b
+    return (a, np.int64(0)) if (turn == 0) == (abs(dx) > abs(dy)) else (np.int64(0), b)
 
 
 @serial
