@@ -279,12 +279,12 @@ def test_a_camera_that_stood_still_has_no_verdict():
 
 
 def test_a_map_of_nearly_one_class_is_uninformative():
-    """97 % of all that the camera sees is class 0; 94 % is not enough to say so.
+    """98.5 % of all that the camera sees is class 0; 94 % is not enough to say so.
 
-    These are 97.0 and 94.0 % of the pixels: spots are a random sample of the floor, whose share is a little off.
+    These are shares of the pixels: spots are a random sample of the floor, whose share is a little off.
     """
     levels = []
-    for rows in (2, 4):
+    for rows in (1, 4):
         labels = np.zeros((60, 80), np.uint8)
         labels[:rows, :72] = 1
         frames = [dataclasses.replace(frame, labels=labels) for frame in flight(16)]
@@ -427,7 +427,7 @@ def test_the_samples_of_all_models_are_of_the_same_spots_whatever_their_budget()
     some, other = sampled(flight(), budget=5000), sampled(flight(flicker=0.05, seed=1), budget=1500)
     share = min(some.share, other.share)
     assert places(some.within(share)) == places(other.within(share))
-    assert len(other.point) > 200
+    assert len(other.point) > 100
 
 
 def test_spots_are_one_in_a_coarse_cell_and_even_over_the_floor():

@@ -8,7 +8,6 @@ from dataclasses import replace
 import numpy as np
 import pyarrow.parquet as pq
 import pytest
-from scipy.optimize import brentq
 from simulated_events import grid, log_of, log_of_evidence, soft
 from striped_floor import K, fused, sampled
 from striped_floor import flight as over_stripes
@@ -101,7 +100,7 @@ def stripes(voxel_size=0.3, **options):
 
 
 def lever_by_hand(spots):
-    """How far the power law through disagreement at three distances falls to 0, in falls from the second to the first.
+    """How far the parabola through disagreement at three distances falls to 0, in falls from the second to the first.
 
     The third answers are two pixels away, of which the second ones are one.
     """
@@ -110,16 +109,7 @@ def lever_by_hand(spots):
     disagreement = [1 - psa(log.table())[log.voxel[again]].mean() for log in (first, second, third)]
     own, one = near[again].mean(), far[again].mean()
     distances = np.sqrt([own, one, own + 4 * (one - own)])
-    ratio = (disagreement[2] - disagreement[1]) / (disagreement[1] - disagreement[0])
-
-    def off(p):
-        first, second, third = distances**p
-        return (third - second) / (second - first) - ratio
-
-    power = brentq(off, 2 / 3, 2)
-    at_zero = (
-        disagreement[0] - distances[0] ** power * np.diff(disagreement[:2])[0] / np.diff(distances[:2] ** power)[0]
-    )
+    at_zero = np.polyfit(distances, disagreement, 2)[-1]
     return (disagreement[0] - at_zero) / (disagreement[1] - disagreement[0])
 
 

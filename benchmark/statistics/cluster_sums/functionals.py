@@ -85,9 +85,9 @@ that answer from the spot, as a border of two classes may lie between them. See 
 def lever_of(near: ClusterSums, far: ClusterSums) -> float:
     """Return by how much of the fall from first to second answers alpha lies above alpha of the first ones.
 
-    Disagreement is read at distance 0 from the power law D(d) = D(0) + c d^p through three answers at the root mean
-    square distances d < d' < d'': lever = (D - D(0)) / (D' - D). A sharp border of classes gives p = 1, one that models
-    place differently by more than a pixel p = 2, and labels finer than pixels less than 1.
+    The parabola through disagreement D, D', D'' at the root mean square distances d < d' < d'' of three answers is read
+    at 0: lever = (D - D(0)) / (D' - D). A sharp border of classes gives a line, one that models place differently by
+    more than a pixel a parabola, and labels finer than pixels a curve that levels off.
     """
     n = float(near["observations"].sum())
     if not n > 0:
@@ -96,11 +96,9 @@ def lever_of(near: ClusterSums, far: ClusterSums) -> float:
     return float(lever(near["square"].sum(), far["square"].sum(), *agreeing))
 
 
-LEAST_FALL = 1e-3
-"""Fall of agreement from first to second answers from on which its power is told, else it is 1."""
-
-LEAST_POWER, LARGEST_POWER, HALVINGS = 2 / 3, 2.0, 24
-"""The power is within these: 2 is that of any smooth function around 0. It is found by halving this range."""
+LEAST_FALL, LARGEST_RATIO = 1e-3, 3.0
+"""Fall of agreement from first to second answers from on which its form is told, else it is a line; and the largest
+ratio of the further fall to it, which a parabola around 0 has."""
 
 
 def lever(near: Any, far: Any, first: Any, second: Any, third: Any) -> Float64:
@@ -110,22 +108,12 @@ def lever(near: Any, far: Any, first: Any, second: Any, third: Any) -> Float64:
     """
     near, far, first, second, third = map(np.asarray, (near, far, first, second, third))
     with np.errstate(invalid="ignore", divide="ignore"):
-        d1 = np.sqrt(np.where(far > SAME * near, far / near, 4.0))  # with the distance of first answers as unit
-        d2 = np.sqrt(1 + 4 * (d1**2 - 1))  # third answers are two steps away, second ones one
-        falls = first - second > LEAST_FALL
-        ratio = np.where(falls, (second - third) / (first - second), (d2 - d1) / (d1 - 1))
-        power = _power(d1, d2, ratio)
-        return np.where(far > SAME * near, 1 / (d1**power - 1), 0.0)
-
-
-def _power(d1: Float64, d2: Float64, ratio: Float64) -> Float64:
-    """Return p (...,) of (d2^p - d1^p) / (d1^p - 1) = ratio, which grows with p."""
-    low, high = np.full(ratio.shape, LEAST_POWER), np.full(ratio.shape, LARGEST_POWER)
-    for _ in range(HALVINGS):
-        middle = (low + high) / 2
-        less = (d2**middle - d1**middle) / (d1**middle - 1) < ratio
-        low, high = np.where(less, middle, low), np.where(less, high, middle)
-    return high
+        d, d1 = np.ones_like(near, np.float64), np.sqrt(far / near)  # the last one is two steps away, not one
+        d2 = np.sqrt(1 + 4 * (d1**2 - 1))
+        ratio = np.where(first - second > LEAST_FALL, (second - third) / (first - second), (d2 - d1) / (d1 - d))
+        at_second, at_third = d * d2 / ((d - d1) * (d2 - d1)), d * d1 / ((d - d2) * (d1 - d2))
+        read = -at_second - at_third - at_third * np.clip(ratio, 0.0, LARGEST_RATIO)
+    return np.where(far > SAME * near, read, 0.0)
 
 
 SAME = 1.2
