@@ -10,8 +10,9 @@ import numpy as np
 
 from semstab.core.types import UInt8
 from semstab.data.labels import IGNORE_8BIT
+from semstab.datasets.city.hashing import hash_integers
 from semstab.datasets.city.mesh import BUILDING, ROAD, TREE
-from semstab.datasets.city.simulation import Simulation, View, hash_integers
+from semstab.datasets.city.simulation import Simulation, View
 
 CLASSES, BORDER, CELL, DRAWS = 8, 4, 2.0, 3
 """Classes of the taxonomy; pixels about a border without label; metres of a cell of one label; predictions to agree."""
