@@ -17,7 +17,7 @@ from semstab.datasets import GROUND_TRUTH, open_dataset
 from semstab.datasets.city import City, CityScene, SimulatedModel
 from semstab.datasets.city.hashing import splitmix64
 from semstab.datasets.city.labellers import LABELLERS
-from semstab.datasets.city.mesh import MOVERS, Surface
+from semstab.datasets.city.mesh import MOVERS, surface
 from semstab.datasets.city.options import CONFUSION
 from semstab.datasets.city.rendering import Caster
 from semstab.datasets.city.simulation import Simulation, View
@@ -91,7 +91,7 @@ def test_frames_depend_on_the_seed_and_not_on_the_order_of_calls(small) -> None:
 def test_depth_is_the_nearest_triangles(small: City) -> None:
     scene = small.scene("scene1")
     frame = scene.frame(1, GROUND_TRUTH)
-    surfaces = [scene.town.still, scene.town.traffic.at(frame.timestamp, frame.T_wc[:3, 3])]
+    surfaces = [scene.town.still, scene.town.moving(frame.timestamp, frame.T_wc[:3, 3])]
     rng = np.random.default_rng(5)
     errors = []
     for u, v in zip(rng.integers(0, 96, 12), rng.integers(0, 54, 12), strict=True):
@@ -151,17 +151,17 @@ def test_overlap_and_classes_are_as_in_the_paper(name: str, low: float, high: fl
 
 def test_moving_cars_move_and_a_surface_without_triangles_is_never_hit() -> None:
     town = full("scene0").town
-    before, after = (town.traffic.at(seconds, np.zeros(3)) for seconds in (1.0, 2.0))
+    before, after = (town.moving(seconds, np.zeros(3)) for seconds in (1.0, 2.0))
     assert set(np.unique(before.classes)) == set(MOVERS)
     assert not np.isin(town.still.classes, MOVERS).any(), "the class of a pixel tells whether what it shows moves"
     assert not np.array_equal(before.vertices, after.vertices)
-    for movers, slow, fast in ((town.traffic.cars, 6, 13), (town.traffic.people, 0.9, 1.7)):
+    for movers, slow, fast in zip(town.movers, (6, 0.9), (13, 1.7), strict=True):
         step = np.hypot(*(movers.spots(2.0) - movers.spots(1.0))[:, :2].T)
         within = step < 20  # others begin again at the other end
         assert within.mean() > 0.9
         assert (step[within] >= slow).all()
         assert (step[within] <= fast).all()
-    nothing = Caster(Surface.of_class(np.empty((0, 3)), np.empty((0, 3), dtype=np.int64), 0, (0.0, 0.0, 0.0)))
+    nothing = Caster(surface(np.empty((0, 3)), np.empty((0, 3)), 0))
     face = nothing.first(np.zeros((2, 3)), np.ones((2, 3)))
     assert (face == -1).all()
     assert np.isinf(nothing.depth(face, np.zeros(3), np.ones((2, 3)))).all()

@@ -181,7 +181,7 @@ class CityScene(Scene):
         with self._lock:
             if index in self.rendered:
                 return self.rendered[index]
-            moving = Caster(self.town.traffic.at(self._share(index) * self._flight.seconds, T[:3, 3]))
+            moving = Caster(self.town.moving(self._share(index) * self._flight.seconds, T[:3, 3]))
             size = (self._options.height, self._options.width)
             rendered = render((self.still, moving), T, self.camera, size)
             stored = sum(other.nbytes for other in self.rendered.values())

@@ -43,21 +43,19 @@ class Flight:
         c, s = np.cos(self.axis), np.sin(self.axis)
         return c * along - s * across, s * along + c * across
 
-    def heading(self, share: float) -> float:
-        """Return camera heading in radians: the path's direction and a swing about it."""
-        rate = self.sway * 2 * np.pi * self.waves * np.cos(2 * np.pi * self.waves * share) / self.length
-        return float(self.axis + 0.7 * np.arctan(rate) + self.swing * np.sin(2 * np.pi * 1.3 * share + self.number))
-
     def pose(self, share: float, ground: float, altitude: float) -> Float64:
-        """Return camera-to-world (4, 4), OpenCV axes, relative to the origin.
-
-        `altitude` metres above the height `ground`.
-        """
+        """Return camera to town (4, 4), OpenCV axes, `altitude` metres above the height `ground`."""
         x, y = self.path(np.array([share]))
+        rate = self.sway * 2 * np.pi * self.waves * np.cos(2 * np.pi * self.waves * share) / self.length
+        heading = self.axis + 0.7 * np.arctan(rate) + self.swing * np.sin(2 * np.pi * 1.3 * share + self.number)
         wobble = np.sin(2 * np.pi * np.array([2.1, 3.3, 1.7]) * share + self.number)
-        down = self.pitch + np.deg2rad(2.5) * wobble[0]
+        down, roll = self.pitch + np.deg2rad(2.5) * wobble[0], np.deg2rad(1.5) * wobble[1]
+        ahead = np.array([np.cos(heading) * np.cos(down), np.sin(heading) * np.cos(down), -np.sin(down)])
+        right = np.array([np.sin(heading), -np.cos(heading), 0.0])
+        below = np.cross(ahead, right)
+        c, s = np.cos(roll), np.sin(roll)
         pose = np.eye(4)
-        pose[:3, :3] = look(self.heading(share), down, np.deg2rad(1.5) * wobble[1])
+        pose[:3, :3] = np.stack([c * right + s * below, c * below - s * right, ahead], axis=1)
         pose[:3, 3] = x[0], y[0], ground + altitude + 2.0 * wobble[2]
         return pose
 
@@ -65,15 +63,6 @@ class Flight:
     def seconds(self) -> float:
         """Duration."""
         return self.length / SPEED
-
-
-def look(heading: float, down: float, roll: float) -> Float64:
-    """Return the rotation (3, 3) from camera axes (right, down, ahead) to the world's, for angles in radians."""
-    ahead = np.array([np.cos(heading) * np.cos(down), np.sin(heading) * np.cos(down), -np.sin(down)])
-    right = np.array([np.sin(heading), -np.cos(heading), 0.0])
-    below = np.cross(ahead, right)
-    c, s = np.cos(roll), np.sin(roll)
-    return np.stack([c * right + s * below, c * below - s * right, ahead], axis=1)
 
 
 FLIGHTS = {

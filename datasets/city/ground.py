@@ -8,7 +8,7 @@ import numpy as np
 import numpy.typing as npt
 
 from semstab.core.types import Float64, Int64
-from semstab.datasets.city.mesh import LOW_VEGETATION, ROAD, Shape, Surface
+from semstab.datasets.city.mesh import LOW_VEGETATION, ROAD, Surface, surface
 
 SPACING = 4.0
 """Metres between vertices of the ground; layers on it lie further apart than its triangles stray from `height`."""
@@ -75,10 +75,10 @@ class Ground:
         x, y = c * s - d * t, d * s + c * t
         return np.stack([x, y, self.height(x, y) + above], axis=-1)
 
-    def stand(self, shape: Shape, class_id: int, spots: Float64, size: Float64, tint: Float64, above: float) -> Surface:
-        """Return upright copies of a shape at `spots` (n, 3): plan coordinates s, t, and an angle in the plan."""
+    def stand(self, template: Surface, spots: Float64, size: Float64, tint: Float64, above: float) -> Surface:
+        """Return upright copies of a template at `spots` (n, 3): plan coordinates s, t, and an angle in the plan."""
         s, t, angle = spots.T
-        return shape.place(class_id, self.points(s, t, above), self.yaw + angle, size, tint)
+        return template.place(self.points(s, t, above), self.yaw + angle, size, tint)
 
     def drape(self, area: Rectangle, above: float, class_id: int, color: npt.ArrayLike) -> Surface:
         """Return a rectangle of the plan laid over the ground, in cells of at most SPACING."""
@@ -86,7 +86,7 @@ class Ground:
             np.linspace(low, high, int(np.ceil((high - low) / SPACING)) + 1)
             for low, high in ((area.s0, area.s1), (area.t0, area.t1))
         )
-        return Surface.of_class(self._grid(s, t, above), _grid_faces(len(s), len(t)), class_id, color)
+        return surface(self._grid(s, t, above), _grid_faces(len(s), len(t)), class_id, color)
 
     def land(self, town: Rectangle) -> Surface:
         """Return asphalt under the whole town, and grass around it in ever larger triangles up to the horizon."""

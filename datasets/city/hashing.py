@@ -8,20 +8,14 @@ import numpy as np
 
 from semstab.core.types import Float64, Int64, UInt64
 
-_GOLDEN = np.uint64(0x9E3779B97F4A7C15)
-_MIX1 = np.uint64(0xBF58476D1CE4E5B9)
-_MIX2 = np.uint64(0x94D049BB133111EB)
-
 
 def splitmix64(x: UInt64) -> UInt64:
     """Return the output function of splitmix64 (Steele, Lea, Flood 2014) for states x, an array with an axis."""
-    x = x + _GOLDEN
-    x ^= x >> np.uint64(30)
-    x *= _MIX1
-    x ^= x >> np.uint64(27)
-    x *= _MIX2
-    x ^= x >> np.uint64(31)
-    return x
+    x = x + np.uint64(0x9E3779B97F4A7C15)
+    for bits, odd in ((30, 0xBF58476D1CE4E5B9), (27, 0x94D049BB133111EB)):
+        x ^= x >> np.uint64(bits)
+        x *= np.uint64(odd)
+    return x ^ (x >> np.uint64(31))
 
 
 def salt(*parts: str | int) -> int:

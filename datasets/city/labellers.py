@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Callable, Mapping
+from functools import partial
 
 import cv2
 import numpy as np
@@ -20,24 +21,16 @@ CLASSES, BORDER, CELL, DRAWS = 8, 4, 2.0, 3
 Labeller = Callable[[UInt8, View, Simulation], UInt8]
 
 
-def _blurred(size: int) -> Labeller:
+def _blurred(predicted: UInt8, _view: View, _model: Simulation, size: int) -> UInt8:
     """Return the class that most pixels of a window have."""
-
-    def labels(predicted: UInt8, _view: View, _model: Simulation) -> UInt8:
-        shares = [cv2.blur((predicted == k).astype(np.float32), (size, size)) for k in range(CLASSES)]
-        return np.asarray(np.argmax(shares, axis=0), np.uint8)
-
-    return labels
+    shares = [cv2.blur((predicted == k).astype(np.float32), (size, size)) for k in range(CLASSES)]
+    return np.asarray(np.argmax(shares, axis=0), np.uint8)
 
 
-def _coarse(size: int) -> Labeller:
+def _coarse(predicted: UInt8, _view: View, _model: Simulation, size: int) -> UInt8:
     """Return the label of the pixel in the middle of a block, for all of it."""
-
-    def labels(predicted: UInt8, _view: View, _model: Simulation) -> UInt8:
-        v, u = (np.minimum(np.arange(n) // size * size + size // 2, n - 1) for n in predicted.shape)
-        return np.asarray(predicted[v[:, None], u])
-
-    return labels
+    v, u = (np.minimum(np.arange(n) // size * size + size // 2, n - 1) for n in predicted.shape)
+    return np.asarray(predicted[v[:, None], u])
 
 
 def _without_borders(predicted: UInt8, _view: View, _model: Simulation) -> UInt8:
@@ -66,10 +59,10 @@ def _by_row(predicted: UInt8, _view: View, _model: Simulation) -> UInt8:
 LABELLERS: Mapping[str, Labeller] = {
     "constant": lambda predicted, _view, _model: np.full_like(predicted, BUILDING),
     "two-class": lambda predicted, _view, _model: np.where(predicted == BUILDING, predicted, np.uint8(ROAD)),
-    "blur-31": _blurred(31),
-    "blur-81": _blurred(81),
-    "coarse-16": _coarse(16),
-    "coarse-48": _coarse(48),
+    "blur-31": partial(_blurred, size=31),
+    "blur-81": partial(_blurred, size=81),
+    "coarse-16": partial(_coarse, size=16),
+    "coarse-48": partial(_coarse, size=48),
     "border-ignoring": _without_borders,
     "hard-ignoring": _without_doubt,
     "world-locked": _locked_to_the_world,

@@ -10,7 +10,7 @@ import numpy as np
 
 from semstab.core.types import Float64
 from semstab.datasets.city.ground import Ground
-from semstab.datasets.city.mesh import HUMAN, MOVING_CAR, Shape, Surface, join
+from semstab.datasets.city.mesh import HUMAN, MOVING_CAR, Surface
 from semstab.datasets.city.things import PAINT, car, choose, person
 
 SIGHT = 140.0
@@ -29,8 +29,7 @@ class Street(NamedTuple):
 class Kind(NamedTuple):
     """What moves, how high above the ground, about how many metres apart, how far from the middle of a street."""
 
-    shape: Shape
-    class_id: int
+    template: Surface
     above: float
     spacing: float
     offset: float
@@ -73,27 +72,15 @@ class Movers:
         heading = np.where(along_s, 0.0, np.pi / 2) + np.where(speed < 0, np.pi, 0.0)
         return np.stack([np.where(along_s, along, at), np.where(along_s, at, along), heading], axis=1)
 
+    def at(self, seconds: float, camera: Float64, ground: Ground) -> Surface:
+        """Return the things at a time, those within SIGHT of the camera at (x, y, z)."""
+        spots = self.spots(seconds)
+        k = np.hypot(*(ground.points(*spots[:, :2].T)[:, :2] - camera[:2]).T) < SIGHT
+        return ground.stand(self.kind.template, spots[k], self.size[k], self.tint[k], self.kind.above)
 
-@dataclass(frozen=True)
-class Traffic:
-    """The moving cars and the people of a town."""
 
-    ground: Ground
-    cars: Movers
-    people: Movers
-
-    @classmethod
-    def random(cls, streets: Sequence[Street], ground: Ground, kerb: float, rng: np.random.Generator) -> Traffic:
-        """Return cars on the lanes, and people on the sidewalks, which begin `kerb` metres from a street's middle."""
-        cars = Kind(car(), MOVING_CAR, 0.0, spacing=38.0, offset=2.0, speeds=(6.0, 13.0))
-        people = Kind(person(), HUMAN, 0.12, spacing=22.0, offset=kerb + 1.0, speeds=(0.9, 1.7))
-        return cls(ground, Movers.random(cars, streets, rng), Movers.random(people, streets, rng))
-
-    def at(self, seconds: float, camera: Float64) -> Surface:
-        """Return the moving things at a time, those within SIGHT of the camera at (x, y, z)."""
-        surfaces = []
-        for movers in (self.cars, self.people):
-            (template, class_id, above, *_), spots = movers.kind, movers.spots(seconds)
-            k = np.hypot(*(self.ground.points(*spots[:, :2].T)[:, :2] - camera[:2]).T) < SIGHT
-            surfaces.append(self.ground.stand(template, class_id, spots[k], movers.size[k], movers.tint[k], above))
-        return join(surfaces)
+def traffic(streets: Sequence[Street], kerb: float, rng: np.random.Generator) -> tuple[Movers, Movers]:
+    """Return cars on the lanes, and people on the sidewalks, which begin `kerb` metres from a street's middle."""
+    cars = Kind(car(MOVING_CAR), 0.0, spacing=38.0, offset=2.0, speeds=(6.0, 13.0))
+    people = Kind(person(HUMAN), 0.12, spacing=22.0, offset=kerb + 1.0, speeds=(0.9, 1.7))
+    return Movers.random(cars, streets, rng), Movers.random(people, streets, rng)
