@@ -89,9 +89,9 @@ def render(casters: tuple[Caster, ...], T: Float64, intrinsics: Intrinsics, shap
     for rows in row_chunks(shape):
         y = (np.arange(rows.start, rows.stop) - intrinsics.cy) / intrinsics.fy
         rays = y[:, None, None] * T[:3, 1] + x[None, :, None] * T[:3, 0] + T[:3, 2]  # their parameter is planar depth
-        part = _cast(casters, T[:3, 3], rays.reshape(-1, 3))
-        for image, values in zip((depth, incidence, classes, color), part, strict=True):
-            image[rows] = values.reshape(image[rows].shape)
+        z, cosine, ids, rgb = _cast(casters, T[:3, 3], rays.reshape(-1, 3))
+        depth[rows], incidence[rows] = z.reshape(-1, shape[1]), cosine.reshape(-1, shape[1])
+        classes[rows], color[rows] = ids.reshape(-1, shape[1]), rgb.reshape(-1, shape[1], 3)
     return Rendered(depth, classes, incidence, color)
 
 

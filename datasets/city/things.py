@@ -53,7 +53,7 @@ def _buildings(
         ground.stand(box(BUILDING), spots, rows[:, 2:] + foundation, walls, -FOUNDATION),
         roof.place(top, np.full(len(rows), ground.yaw), size, tiles),
     ]
-    for floor in range(int(rows[:, 4].max() / STOREY)):
+    for floor in range(int(rows[:, 4].max(initial=0) / STOREY)):
         k = rows[:, 4] >= (floor + 1) * STOREY
         band = rows[k, 2:] * [1, 1, 0] + [0.06, 0.06, 1.3]
         surfaces.append(ground.stand(box(BUILDING, color=GLASS), spots[k], band, walls[k], floor * STOREY + 1))

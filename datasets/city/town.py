@@ -119,8 +119,8 @@ class _Site:
         cars, size = np.array(self.cars), rng.uniform([0.86, 0.95, 0.97], [1.08, 1.04, 1.2], size=(len(self.cars), 3))
         return [
             *self.laid,
-            *houses(np.array(self.houses), g, rng),
-            *flats(np.array(self.flats), g, rng),
+            *houses(np.array(self.houses).reshape(-1, 5), g, rng),
+            *flats(np.array(self.flats).reshape(-1, 5), g, rng),
             *trees(rng.permutation(self.trees), g, rng),
             g.stand(car(STATIC_CAR), cars, size, choose(PAINT, len(cars), rng), 0.08),
         ]
