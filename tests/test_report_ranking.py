@@ -32,7 +32,7 @@ def result(tmp_path_factory):
         "twin": ERRORS, "nervous": ERRORS | {"flicker": 0.3}, "other-twin": ERRORS,
         "constant": {"labeller": "constant"},
     }  # fmt: skip
-    options = {"frames": 12, "width": 128, "height": 72, "models": models}
+    options = {"frames": 12, "width": 128, "height": 72, "seed": 1, "models": models}
     city = {"dataset": {"name": "city", "options": options}, "scenes": ["scene0"], "voxel_size": 0.4}
     out = tmp_path_factory.mktemp("ranking") / "run"
     config = semstab.load_config(overrides={**city, "models": list(models), "check": None})

@@ -116,8 +116,8 @@ def load(folder: str | Path) -> Run:
         1  sim-flicker  usable
         >>> run.classes[["model", "class", "alpha", "alpha_low", "alpha_high"]].head(2).round(2)
                 model     class  alpha  alpha_low  alpha_high
-        0  sim-steady  building   0.92       0.90        0.93
-        1  sim-steady      road   0.94       0.93        0.95
+        0  sim-steady  building   0.93       0.91        0.94
+        1  sim-steady      road   0.90       0.89        0.92
     """
     return Run(Path(folder), load_result(folder))
 

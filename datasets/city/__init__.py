@@ -1,8 +1,8 @@
 """The built-in dataset `city`: a simulated UAV flight over a procedural town, with simulated models.
 
-Five towns (scene0 to scene4) with roads, buildings, trees, gardens, cars and people, every face of a uavid8 class.
-Depth is exact: the rays' triangles are found with embree, their planes are cut in float64. Errors of the
-models are set by `CityOptions.models`; `SimulatedModel` documents the error model.
+Five towns (scene0 to scene4) with roads, buildings, trees, cars and people, every face of a uavid8 class. Depth is
+exact. Read on in this order: `flight` (where the camera flies), `town` (streets and blocks) with `ground`, `things`,
+`traffic` and `mesh`, `rendering` (what the camera sees), `options` and `simulation` (how models err), `labellers`.
 """
 
 from __future__ import annotations
@@ -20,22 +20,28 @@ from semstab.config import nearest
 from semstab.core.types import Float64, UInt8
 from semstab.data.frames import Frame, Intrinsics
 from semstab.data.labels import LabelSpace
+from semstab.datasets.city.flight import FLIGHTS
 from semstab.datasets.city.labellers import relabelled
 from semstab.datasets.city.mesh import uavid8
-from semstab.datasets.city.options import FLIGHTS, CityOptions, SimulatedModel
-from semstab.datasets.city.simulation import Caster, Rendered, Simulation, View, render
-from semstab.datasets.city.world import World, build_world
+from semstab.datasets.city.options import CityOptions, SimulatedModel
+from semstab.datasets.city.rendering import Caster, Rendered, render
+from semstab.datasets.city.simulation import Simulation, View
+from semstab.datasets.city.town import Town, build_town
 from semstab.datasets.scene import GROUND_TRUTH, Dataset, Scene, fingerprint
 from semstab.errors import ConfigError, DataError
 
 __all__ = ["GENERATOR_VERSION", "City", "CityOptions", "CityScene", "SimulatedModel"]
 
-GENERATOR_VERSION = 1
+GENERATOR_VERSION = 2
 """Part of every digest: raise it with any change of the towns, the flights, the rendering or the error model."""
 
 
+FIELD_OF_VIEW = 60.0
+"""Of the camera, horizontal, degrees."""
+
+
 class City(Dataset):
-    """The dataset. The scene that was opened last stays in memory, so that its models share rendered frames."""
+    """The dataset. It keeps the scene that was opened last, so that its models share rendered frames."""
 
     Options: type[BaseModel] = CityOptions
 
@@ -91,7 +97,7 @@ class CityScene(Scene):
     def camera(self) -> Intrinsics:
         """The camera of every frame: square pixels, the optical axis in the middle of the image."""
         W, H = self._options.width, self._options.height
-        f = W / (2 * np.tan(np.deg2rad(self._options.field_of_view) / 2))
+        f = W / (2 * np.tan(np.deg2rad(FIELD_OF_VIEW) / 2))
         return Intrinsics(f, f, (W - 1) / 2, (H - 1) / 2)
 
     def label_space(self, model: str) -> LabelSpace:
@@ -118,52 +124,42 @@ class CityScene(Scene):
         labels: UInt8 | None = rendered.classes
         scores = None
         if simulated is not None:
-            view = View(index, rendered, self.camera, T_wc, self.origin)
+            view = View(index, rendered, self.camera, T)
             simulation = Simulation(simulated, self._options.seed, model, self.name)
-            labels, scores = (
-                (None, simulation.scores(view)) if simulated.softness else (relabelled(simulation, view), None)
-            )
+            labels = None if simulated.softness else relabelled(simulation, view)
+            scores = simulation.scores(view) if simulated.softness else None
         where = f"city/{self.name}/frame {index}"
+        files = {what: f"{where}, {what}" for what in ("depth", "pose", "labels", "scores", "color")}
         return Frame(
-            index=index,
-            depth=rendered.depth,
-            intrinsics=self.camera,
-            T_wc=T_wc,
-            labels=labels,
-            scores=scores,
-            color=rendered.color,
-            timestamp=float(self.timestamps[index]),
-            files={what: f"{where}, {what}" for what in ("depth", "pose", "labels", "scores", "color")},
-        )
+            index=index, depth=rendered.depth, intrinsics=self.camera, T_wc=T_wc, labels=labels, scores=scores,
+            color=rendered.color, timestamp=float(self.timestamps[index]), files=files,
+        )  # fmt: skip
 
     def digest(self, indices: list[int], model: str) -> str:
         """Return a hash of all settings that the frames depend on; nothing is rendered."""
         simulated = self._simulated(model)
-        content = {
-            "generator": GENERATOR_VERSION,
-            "options": self._options.model_dump(mode="json", exclude={"models", "cache_megabytes"}),
-            "scene": self.name,
-            "indices": [int(index) for index in indices],
-            "model": model,
-            "simulated": None if simulated is None else simulated.model_dump(mode="json"),
-        }
-        return hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()
+        errors = None if simulated is None else simulated.model_dump(mode="json")
+        content = self._drawn([int(index) for index in indices], model, errors)
+        return hashlib.sha256(content).hexdigest()
 
     def fingerprints(self, index: int) -> Mapping[str, str]:
         """Return a short hash of all settings that the frame's geometry depends on; nothing is rendered."""
-        drawn = self._options.model_dump(mode="json", exclude={"models", "cache_megabytes"})
-        content = json.dumps([GENERATOR_VERSION, drawn, self.name, index], sort_keys=True)
-        return {f"frame {index}": fingerprint(content.encode())}
+        return {f"frame {index}": fingerprint(self._drawn(index))}
+
+    def _drawn(self, *more: object) -> bytes:
+        """Return all that the scene's geometry depends on, and more, as bytes to hash."""
+        options = self._options.model_dump(mode="json", exclude={"models", "cache_megabytes"})
+        return json.dumps([GENERATOR_VERSION, options, self.name, *more], sort_keys=True).encode()
 
     @cached_property
-    def world(self) -> World:
+    def town(self) -> Town:
         """The town and its traffic, built when first asked for."""
-        return build_world(self._options.seed, self._flight)
+        return build_town(self._options.seed, self._flight)
 
     @cached_property
     def still(self) -> Caster:
         """Return the still part of the town, at which rays are cast."""
-        return Caster(self.world.still)
+        return Caster(self.town.still)
 
     def _share(self, index: int) -> float:
         """Return the share of the flight that is over at a frame."""
@@ -173,8 +169,8 @@ class CityScene(Scene):
         if not 0 <= index < len(self):
             raise DataError(f"city/{self.name}: there is no frame {index}; the scene has {len(self)} frames, from 0")
         with self._lock:  # the town is built once, by whoever asks first
-            terrain = self.world.terrain
-        ground = float(terrain.height(*self._flight.path(np.linspace(0, 1, 50))).mean())
+            land = self.town.ground
+        ground = float(land.height(*self._flight.path(np.linspace(0, 1, 50))).mean())
         return self._flight.pose(self._share(index), ground, self._options.altitude)
 
     def _render(self, index: int, T: Float64) -> Rendered:
@@ -185,9 +181,9 @@ class CityScene(Scene):
         with self._lock:
             if index in self.rendered:
                 return self.rendered[index]
-            moving = Caster(self.world.traffic.at(self._share(index) * self._flight.seconds, T[:3, 3]))
+            moving = Caster(self.town.moving(self._share(index) * self._flight.seconds, T[:3, 3]))
             size = (self._options.height, self._options.width)
-            rendered = render(self.still, moving, T, self.camera, size)
+            rendered = render((self.still, moving), T, self.camera, size)
             stored = sum(other.nbytes for other in self.rendered.values())
             if stored + rendered.nbytes <= self._options.cache_megabytes * 1_000_000:
                 self.rendered[index] = rendered

@@ -4,14 +4,16 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Callable, Mapping
+from functools import partial
 
 import cv2
 import numpy as np
 
 from semstab.core.types import UInt8
 from semstab.data.labels import IGNORE_8BIT
+from semstab.datasets.city.hashing import hash_integers
 from semstab.datasets.city.mesh import BUILDING, ROAD, TREE
-from semstab.datasets.city.simulation import Simulation, View, hash_integers
+from semstab.datasets.city.simulation import Simulation, View
 
 CLASSES, BORDER, CELL, DRAWS = 8, 4, 2.0, 3
 """Classes of the taxonomy; pixels about a border without label; metres of a cell of one label; predictions to agree."""
@@ -19,24 +21,16 @@ CLASSES, BORDER, CELL, DRAWS = 8, 4, 2.0, 3
 Labeller = Callable[[UInt8, View, Simulation], UInt8]
 
 
-def _blurred(size: int) -> Labeller:
+def _blurred(predicted: UInt8, _view: View, _model: Simulation, size: int) -> UInt8:
     """Return the class that most pixels of a window have."""
-
-    def labels(predicted: UInt8, _view: View, _model: Simulation) -> UInt8:
-        shares = [cv2.blur((predicted == k).astype(np.float32), (size, size)) for k in range(CLASSES)]
-        return np.asarray(np.argmax(shares, axis=0), np.uint8)
-
-    return labels
+    shares = [cv2.blur((predicted == k).astype(np.float32), (size, size)) for k in range(CLASSES)]
+    return np.asarray(np.argmax(shares, axis=0), np.uint8)
 
 
-def _coarse(size: int) -> Labeller:
+def _coarse(predicted: UInt8, _view: View, _model: Simulation, size: int) -> UInt8:
     """Return the label of the pixel in the middle of a block, for all of it."""
-
-    def labels(predicted: UInt8, _view: View, _model: Simulation) -> UInt8:
-        v, u = (np.minimum(np.arange(n) // size * size + size // 2, n - 1) for n in predicted.shape)
-        return np.asarray(predicted[v[:, None], u])
-
-    return labels
+    v, u = (np.minimum(np.arange(n) // size * size + size // 2, n - 1) for n in predicted.shape)
+    return np.asarray(predicted[v[:, None], u])
 
 
 def _without_borders(predicted: UInt8, _view: View, _model: Simulation) -> UInt8:
@@ -65,10 +59,10 @@ def _by_row(predicted: UInt8, _view: View, _model: Simulation) -> UInt8:
 LABELLERS: Mapping[str, Labeller] = {
     "constant": lambda predicted, _view, _model: np.full_like(predicted, BUILDING),
     "two-class": lambda predicted, _view, _model: np.where(predicted == BUILDING, predicted, np.uint8(ROAD)),
-    "blur-31": _blurred(31),
-    "blur-81": _blurred(81),
-    "coarse-16": _coarse(16),
-    "coarse-48": _coarse(48),
+    "blur-31": partial(_blurred, size=31),
+    "blur-81": partial(_blurred, size=81),
+    "coarse-16": partial(_coarse, size=16),
+    "coarse-48": partial(_coarse, size=48),
     "border-ignoring": _without_borders,
     "hard-ignoring": _without_doubt,
     "world-locked": _locked_to_the_world,

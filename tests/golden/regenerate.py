@@ -69,8 +69,8 @@ def golden_city():
         frame = scene.frame(2, "gt")
         labels = {model: scene.frame(2, model).labels for model in ("gt", "sim-steady", "sim-flicker")}
         content[name] = {
-            "still": surface_content(scene.world.still),
-            "traffic": surface_content(scene.world.traffic.at(3.0, frame.T_wc[:3, 3])),
+            "still": surface_content(scene.town.still),
+            "traffic": surface_content(scene.town.moving(3.0, frame.T_wc[:3, 3])),
             "pose": frame.T_wc.tolist(),
             "depth": float(frame.depth.mean()),
             "color": frame.color.mean(axis=(0, 1)).tolist(),

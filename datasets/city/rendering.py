@@ -1,0 +1,142 @@
+"""Ray casting: depth, class, incidence and colour of each pixel, with trimesh's embree intersector."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from semstab.core.types import Float32, Float64, Int64, Mask, UInt8
+from semstab.data.frames import Intrinsics
+from semstab.data.labels import IGNORE_8BIT
+from semstab.datasets.city.hashing import hash_integers, uniform
+from semstab.datasets.city.mesh import LOW_VEGETATION, TREE, Surface
+
+CHUNK = 1 << 18
+"""Rays cast at a time, which bounds the memory of a large image."""
+
+SUN = np.array([0.42, -0.38, 0.82]) / np.linalg.norm([0.42, -0.38, 0.82])
+AMBIENT, SUNLIGHT = 0.52, 0.60
+SKY = np.array([0.62, 0.72, 0.85])
+SHADOW_OFFSET = 0.02
+GRAIN = np.full((256, 2), 0.06)  # by class: share by which colour varies over 0.3 m and over 2.3 m
+GRAIN[TREE] = 0.34, 0.14
+GRAIN[LOW_VEGETATION] = 0.17, 0.13
+
+
+@dataclass(frozen=True)
+class Rendered:
+    """The image that the camera sees, shared by all models of a scene.
+
+    Attributes:
+        depth: (H, W) float32, planar z in metres; 0 where a ray hits nothing.
+        classes: (H, W) uint8 uavid8 ids; 255 where a ray hits nothing. `mesh.MOVERS` move, all others stand still.
+        incidence: (H, W) float32, cosine of the angle between ray and surface normal, 0..1.
+        color: (H, W, 3) uint8 RGB.
+    """
+
+    depth: Float32
+    classes: UInt8
+    incidence: Float32
+    color: UInt8
+
+    @property
+    def nbytes(self) -> int:
+        """Bytes of all images together."""
+        return self.depth.nbytes + self.classes.nbytes + self.incidence.nbytes + self.color.nbytes
+
+
+class Caster:
+    """Triangles to cast rays at: embree finds the triangle in float32, its plane gives the position in float64."""
+
+    def __init__(self, surface: Surface) -> None:
+        import trimesh
+        from trimesh.ray.ray_pyembree import RayMeshIntersector
+
+        self.surface = surface
+        corners = surface.vertices[surface.faces]
+        normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+        self.normals: Float64 = normals / np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-300)
+        self.offsets: Float64 = (self.normals * corners[:, 0]).sum(axis=1)
+        if len(surface.faces):
+            mesh = trimesh.Trimesh(surface.vertices, surface.faces, process=False, validate=False)
+            self._intersector: Any = RayMeshIntersector(mesh)
+
+    def first(self, origins: Float64, directions: Float64) -> Int64:
+        """Return the triangle that each ray (n, 3) hits first, -1 for none."""
+        if not len(self.normals):
+            return np.full(len(directions), -1)
+        return np.asarray(self._intersector.intersects_first(origins, directions)).astype(np.int64)
+
+    def depth(self, face: Int64, origin: Float64, directions: Float64) -> Float64:
+        """Return the parameter at which each ray from one origin meets the plane of its triangle; inf for none."""
+        depth = np.full(len(face), np.inf)
+        hit = np.flatnonzero(face >= 0)
+        normal = self.normals[face[hit]]
+        with np.errstate(divide="ignore", invalid="ignore"):
+            found = (self.offsets[face[hit]] - normal @ origin) / np.einsum("ij,ij->i", normal, directions[hit])
+        depth[hit] = np.where(np.isfinite(found) & (found > 0), found, np.inf)
+        return depth
+
+
+def render(casters: tuple[Caster, ...], T: Float64, intrinsics: Intrinsics, shape: tuple[int, int]) -> Rendered:
+    """Render (H, W) pixels from the pose T (4, 4), relative to the town's origin."""
+    depth, incidence = np.zeros((2, *shape), dtype=np.float32)
+    classes = np.full(shape, IGNORE_8BIT, dtype=np.uint8)
+    color = np.empty((*shape, 3), dtype=np.uint8)
+    x = (np.arange(shape[1]) - intrinsics.cx) / intrinsics.fx
+    for rows in row_chunks(shape):
+        y = (np.arange(rows.start, rows.stop) - intrinsics.cy) / intrinsics.fy
+        rays = y[:, None, None] * T[:3, 1] + x[None, :, None] * T[:3, 0] + T[:3, 2]  # their parameter is planar depth
+        z, cosine, ids, rgb = _cast(casters, T[:3, 3], rays.reshape(-1, 3))
+        depth[rows], incidence[rows] = z.reshape(-1, shape[1]), cosine.reshape(-1, shape[1])
+        classes[rows], color[rows] = ids.reshape(-1, shape[1]), rgb.reshape(-1, shape[1], 3)
+    return Rendered(depth, classes, incidence, color)
+
+
+def row_chunks(shape: tuple[int, ...]) -> list[slice]:
+    """Return slices of rows of at most CHUNK pixels."""
+    step = max(1, CHUNK // shape[1])
+    return [slice(top, min(top + step, shape[0])) for top in range(0, shape[0], step)]
+
+
+def _cast(casters: tuple[Caster, ...], origin: Float64, directions: Float64) -> tuple[Float64, Float64, UInt8, UInt8]:
+    """Return depth (0 where nothing is), incidence, class and colour for each ray (n, 3)."""
+    n = len(directions)
+    depth, normals, material = np.full(n, np.inf), -directions, np.tile(SKY, (n, 1))
+    classes = np.full(n, IGNORE_8BIT, dtype=np.uint8)
+    for caster in casters:
+        face = caster.first(np.broadcast_to(origin, directions.shape), directions)
+        found = caster.depth(face, origin, directions)
+        nearer = np.flatnonzero(found < depth)
+        hit = face[nearer]
+        depth[nearer], normals[nearer] = found[nearer], caster.normals[hit]
+        classes[nearer], material[nearer] = caster.surface.classes[hit], caster.surface.colors[hit]
+    seen = np.isfinite(depth)
+    depth[~seen] = 0.0
+    towards = np.einsum("ij,ij->i", normals, directions)
+    normals[towards > 0] *= -1
+    incidence = np.minimum(1.0, np.abs(towards) / np.sqrt(np.einsum("ij,ij->i", directions, directions)))
+    color = material * _brightness(casters, origin + directions * depth[:, None], normals, classes)[:, None]
+    color = np.clip(np.where(seen[:, None], color, SKY) * 255, 0, 255)
+    return depth, np.where(seen, incidence, 0.0), classes, color.astype(np.uint8)
+
+
+def _brightness(casters: tuple[Caster, ...], points: Float64, normals: Float64, classes: UInt8) -> Float64:
+    """Return Lambert's law under one sun with cast shadows, with grain that is tied to the position."""
+    light = np.maximum(normals @ SUN, 0.0)
+    lit = np.flatnonzero(light > 0)
+    start = points[lit] + SHADOW_OFFSET * (normals[lit] + SUN)
+    shadow: Mask = np.any([caster.first(start, np.broadcast_to(SUN, start.shape)) >= 0 for caster in casters], axis=0)
+    light[lit[shadow]] = 0.0
+    fine, coarse = GRAIN[classes].T
+    grain = 1 + fine * _noise(points, 0.3) + coarse * _noise(points, 2.3)
+    brightness: Float64 = (AMBIENT + SUNLIGHT * light) * grain
+    return brightness
+
+
+def _noise(points: Float64, cell: float) -> Float64:
+    """Return numbers in [-1, 1], one for each cubic cell of space."""
+    x, y, z = np.floor(points / cell).astype(np.int64).T
+    return 2 * uniform(hash_integers(17, x, y, z)) - 1
