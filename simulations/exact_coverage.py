@@ -1,7 +1,7 @@
 """Do intervals hold the exact alpha of the scene flown again, and is a level right as often as its probability says?
 
-    python simulations/exact_coverage.py [--only PATTERN] [--scenes 8] [--flights 25] [--save FLIGHTS.csv]
-    python simulations/exact_coverage.py --load FLIGHTS.csv
+    python simulations/simulate.py exact-coverage [--only PATTERN] [--scenes 8] [--flights 25] [--save FLIGHTS.csv]
+    python simulations/simulate.py exact-coverage --load FLIGHTS.csv
 
 Each condition has scenes of `exact_scenes.py`, and each of these is flown again: along another course, with other draws
 of the errors. A course has other places and directions of the cameras, and a circle begins at another angle; errors of
