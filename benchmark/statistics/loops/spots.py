@@ -284,6 +284,8 @@ def new_in_image(depth, camera, T, allowed, edge, share, low, stride, factor, de
             z = 1.0 / max(here + along_x * (u - column) + along_y * (v - row), 0.5 * here)
             px, py, pz = in_world((u - cx) / fx * z, (v - cy) / fy * z, z, T)
             if free(px, py, pz, edge, share, low, table, False) < 0:
+                if done == 1:
+                    break  # other places of the block were looked at in an earlier frame
                 continue
             there = smoothed(depth, row, column, here, u - column, v - row, allowed)
             z = 1.0 / (there if there > 0.5 * here else here)
