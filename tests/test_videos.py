@@ -14,7 +14,8 @@ from video_scene import CLASSES, COUNT, H, W, texture, views, write
 import semstab
 from semstab.datasets import open_dataset, recognise
 from semstab.errors import ConfigError, DataError
-from semstab.metrics.video_flicker import Motion, VideoFlickerMeter, lone_pixels
+from semstab.metrics.video_flicker import VideoFlickerMeter, lone_pixels
+from semstab.pixels.warp import Correspondence
 
 
 def options(folder, **more):
@@ -64,7 +65,7 @@ def test_the_frames_that_are_wrong_stand_out_and_not_those_beside_them(tmp_path)
 
 def test_a_pixel_stands_alone_where_both_neighbours_agree(tmp_path) -> None:
     first, middle, last = frames(write(tmp_path / "clip"))[:3]
-    still = Motion(np.arange(H * W).reshape(H, W), np.ones((H, W), bool))
+    still = Correspondence(np.arange(H * W, dtype=np.int32).reshape(H, W))
     own = lone_pixels(middle, [(first, still), (last, still)])
     a, b, c = first.labels, middle.labels, last.labels
     assert own.pixels == H * W

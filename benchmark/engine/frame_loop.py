@@ -6,13 +6,10 @@ import contextlib
 import functools
 import itertools
 import json
-import math
 from collections import defaultdict
 from collections.abc import Generator, Iterator, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
-
-import numpy as np
 
 from semstab.core.prefetch import Fetched, prefetch
 from semstab.core.process import Stopwatch
@@ -25,9 +22,9 @@ from semstab.engine.memory import MemoryBudget
 from semstab.engine.observer import Observers
 from semstab.engine.work import Job, Work
 from semstab.errors import DataError
-from semstab.metrics import macro_mean, matched_region_flicker
+from semstab.metrics import macro_mean
+from semstab.metrics.flicker import region_flicker
 from semstab.pixels.preparation import leave_out, perturb
-from semstab.pixels.warp import correspond
 
 
 def run_job(job: Job, observers: Observers | None = None) -> Iterator[Work]:
@@ -204,7 +201,7 @@ def _measured_regions(scene: Scene, work: Work) -> Work:
     """Return a unit of regions with the means over its pairs of sampled frames."""
     name = work.unit.name
     try:
-        rows = [_compared(*pair) for pair in itertools.pairwise(_region_frames(scene, work))]
+        rows = [region_flicker(*pair) for pair in itertools.pairwise(_region_frames(scene, work))]
         flicker, compensated, share = zip(*rows, strict=True) if rows else ((), (), ())
         means = macro_mean(flicker), macro_mean(compensated), macro_mean(share)
         digest = scene.digest([*work.frames], name.model)
@@ -229,16 +226,3 @@ def _region_frames(scene: Scene, work: Work) -> Iterator[Frame]:
     with contextlib.closing(fetched):
         for each in fetched:
             yield each.item
-
-
-def _compared(previous: Frame, current: Frame) -> tuple[float, float, float]:
-    """Return flicker, compensated flicker (percent), and the co-visible share of two successive frames."""
-    before, now = previous.predicted, current.predicted
-    flicker = math.nan
-    if previous.shape == current.shape:
-        flicker = matched_region_flicker(before, now, previous.valid & current.valid).flicker_percent
-    seen = correspond(current, previous)
-    both = current.valid & seen.bring(previous.valid, fill=False)
-    compensated = matched_region_flicker(seen.bring(before), now, both).flicker_percent
-    valid = np.count_nonzero(current.valid)
-    return flicker, compensated, np.count_nonzero(both) / valid if valid else math.nan

@@ -29,7 +29,8 @@ from semstab.engine.series import FrameRow, Series
 from semstab.engine.tiles import tiles_met
 from semstab.engine.work import Work
 from semstab.errors import ConfigError
-from semstab.metrics import FrameQualityMeter, VideoMeter, flicker_percent
+from semstab.metrics import FrameQualityMeter, VideoMeter
+from semstab.metrics.flicker import flicker_in_place
 from semstab.metrics.image_space import ImageSpaceMeter
 from semstab.pixels.scans import pictured
 from semstab.statistics import Sampler
@@ -259,15 +260,9 @@ class Stream:
 
     def measure(self, now: Prepared, reports: Mapping[LiveMap, FrameReport]) -> dict[LiveMap, FrameRow]:
         """Return flicker and stability in image coordinates with the reports of the maps: a row of each series."""
-        frame, decoded, flicker, compensated = now.frame, now.fetched.item, math.nan, math.nan
+        frame, decoded, compensated = now.frame, now.fetched.item, math.nan
         with self._watch("flicker") as lap:
-            if (
-                self._sequential
-                and self._previous is not None
-                and self._previous.shape == frame.shape
-                and not frame.is_scan
-            ):
-                flicker = flicker_percent(self._previous, frame)
+            flicker = flicker_in_place(self._previous, frame)
         if self.image_space is not None:
             with self._watch("image space"):
                 compensated = self.image_space.add(frame, now.truth)

@@ -24,7 +24,7 @@ from semstab.data.statistics import OutlyingFrames
 from semstab.data.videos import LonePicture, VideoRecord, VideoResult, VideoRow
 from semstab.datasets import Scene
 from semstab.errors import DataError
-from semstab.metrics import flicker_percent
+from semstab.metrics.flicker import flicker_in_place
 from semstab.metrics.image_space import PICTURED
 from semstab.metrics.video_flicker import Flows, VideoFlickerMeter, video_picture
 from semstab.metrics.video_measures import VideoMeter
@@ -231,8 +231,7 @@ class _Meter:
 
     def add(self, frame: Frame, truth: Frame | None) -> dict[str, float]:
         """Add the next frame; return its numbers."""
-        alike = self._previous is not None and self._previous.shape == frame.shape
-        flicker = flicker_percent(self._previous, frame) if alike and self._previous is not None else math.nan
+        flicker = flicker_in_place(self._previous, frame)
         compensated = self._meter.add(frame, truth)
         if self._video is not None:
             self._video.add(frame, truth)

@@ -105,7 +105,7 @@ def mean_over_scenes(rows: Iterable[ImageSpace]) -> ImageSpace:
 
 def lone_picture(frame: Frame, others: Sequence[Frame]) -> LonePicture:
     """Hold a frame against others, with the camera's motion removed."""
-    sample = frame.every(-(-max(frame.shape) // SIDE))
+    sample = frame.within(SIDE)
     alone = np.logical_and.reduce([changed_pixels(other, sample) for other in others])
     return picture_of(frame, sample, alone)
 
