@@ -10,9 +10,8 @@ import numpy as np
 
 from semstab.core.types import Float32
 from semstab.data.frames import Frame
-from semstab.data.videos import LonePicture
 from semstab.metrics.flicker import CompensatedFlicker, changed_pixels, compensated_flicker, covisible
-from semstab.metrics.image_space import SIDE, ImageSpaceMeter, picture_of
+from semstab.metrics.image_space import SIDE, ImageSpaceMeter, LonePicture, picture_of
 from semstab.metrics.temporal_consistency import image_flow, occluded
 from semstab.metrics.video_measures import image_of
 from semstab.pixels.warp import Correspondence
@@ -68,14 +67,24 @@ class VideoFlickerMeter(ImageSpaceMeter):
 
     Attributes:
         lone: How much of each frame stands alone, but of the first and the last, and beside a change of the size.
+        pixels: (K,) labelled pixels of each class.
+        size: (width, height) of the last image.
     """
 
-    def __init__(self, flows: Flows | None = None) -> None:
+    def __init__(self, num_classes: int, flows: Flows | None = None) -> None:
         super().__init__()
         self.lone: list[LonePixels] = []
+        self.pixels, self.size = np.zeros(num_classes, np.int64), (0, 0)
         self._flows = flows or Flows()
         self._earlier: tuple[Frame, Correspondence] | None = None
         """The sample two frames ago, and its pixels that show what the last frame shows."""
+
+    def add(self, frame: Frame, truth: Frame | None) -> float:
+        """Add the next frame, and its truth in the same label space if there is any; return compensated flicker."""
+        height, width = frame.shape if frame.color is None else frame.color.shape[:2]
+        self.size, K = (width, height), len(self.pixels)
+        self.pixels += np.bincount(frame.predicted[frame.valid], minlength=K)[:K]
+        return super().add(frame, truth)
 
     def between(self, previous: Frame, frame: Frame, sample: Frame) -> CompensatedFlicker:
         """Return flicker of the sample's pixels that the frame before shows, too."""

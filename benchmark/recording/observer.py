@@ -212,7 +212,9 @@ class Recording(Observer):
     def _log_frame(self, task: Task, frame: Frame, rows: Mapping[UnitName, FrameRow], voxels: int) -> None:
         stream, background = self._opened()
         self._clock.set(stream, frame.index, frame.timestamp)
-        group = self._group or self._begin(task, frame.T_wc[:3, 3])
+        group = self._group
+        if group is None or group.task.model != task.model:  # the models of a video take turns
+            group = self._begin(task, frame.T_wc[:3, 3])
         self._scenes[task.scene.name].log(stream, frame, background)
         group.log(stream, frame, rows, voxels, background)
 
@@ -269,8 +271,9 @@ class Recording(Observer):
             for record in records:
                 if record.series is not None:
                     timeline.log_file(stream, record.unit, task, record.series, self._clock)
-                factor, table = load_map(record, group.origin)
-                self._log_unit(group, record.summary, table, factor)
+                if record.pixels is None:
+                    factor, table = load_map(record, group.origin)
+                    self._log_unit(group, record.summary, table, factor)
             self._end_group()
         for scene in self._scenes:
             verdict = rr.TextDocument(verdict_report(result, scene), media_type=rr.MediaType.MARKDOWN)
@@ -327,7 +330,7 @@ class Recording(Observer):
         stream, _ = self._opened()
         scene, voxel_size = self._scenes[task.scene.name], self._plan.config.voxel_size
         if position is None:
-            position = task.scene.T_wc(task.indices[0])[:3, 3]
+            position = task.scene.T_wc(task.indices[0])[:3, 3] if task.scene.posed else np.zeros(3)
         origin = scene.begin(stream, position, voxel_size)
         self._group = GroupLog(self._planned(task), voxel_size, origin, self._fused)
         return self._group
@@ -344,10 +347,11 @@ class Recording(Observer):
     def _replay_frames(self, task: Task, summary: UnitSummary) -> None:
         """Read and fuse the frames of a task again; where the map would not fit into memory, drift is left out."""
         config, scene, K = self._plan.config, task.scene.name, summary.table.K
+        posed = task.scene.posed
         fits = expected_bytes(REPLAY, summary.table.voxels, 0, K, soft=True) < available_bytes() / 2
-        self._fused = create(REPLAY, voxel_size=config.voxel_size, num_classes=K) if fits else None
+        self._fused = create(REPLAY, voxel_size=config.voxel_size, num_classes=K) if fits and posed else None
         frames = prefetch(
-            lambda index: read(task, index, config.pixel_stride),
+            lambda index: read(task, index, config.pixel_stride, color=not posed),
             task.indices, threads=config.threads, size=lambda frame: frame.nbytes,
         )  # fmt: skip
         with contextlib.closing(frames):
@@ -431,6 +435,7 @@ class _ClosedScene:
     models: tuple[str, ...]
     up: Float64 | None
     of_scans: bool = False
+    posed: bool = True
 
     def T_wc(self, index: int) -> Float64:
         """Return the world's origin: poses are not in the folder."""
@@ -460,8 +465,9 @@ def _plan_of(run: Path, config: Config, result: Result) -> Plan:
     units = []
     for record in (*result.select(), *result.select(BACKENDS)):
         unit, up = record.unit, result.up.get(record.unit.scene)
-        scene = _ClosedScene(unit.scene, result.models, None if up is None else np.array(up))
-        classes = next(record.tiles()).classes
+        axis, posed = None if up is None else np.array(up), record.pixels is None
+        scene = _ClosedScene(unit.scene, result.models, axis, posed=posed)
+        classes = next(record.tiles()).classes if record.pixels is None else record.pixels.classes
         space = LabelSpace(record.summary.taxonomy, classes)
         if config.taxonomy is not None:
             with contextlib.suppress(SemstabError):
