@@ -9,6 +9,7 @@ import cv2
 import numpy as np
 import pytest
 from command_line import bench
+from rerun.chunk import RrdReader
 from video_scene import CLASSES, COUNT, H, W, texture, views, write
 
 import semstab
@@ -16,6 +17,7 @@ from semstab.datasets import open_dataset, recognise
 from semstab.errors import ConfigError, DataError
 from semstab.metrics.video_flicker import VideoFlickerMeter, lone_pixels
 from semstab.pixels.warp import Correspondence
+from semstab.recording import lacks_pictures, record_finished
 from semstab.task import open_scenes
 
 
@@ -302,3 +304,15 @@ def test_a_killed_run_goes_on_with_the_next_video(tmp_path, monkeypatch) -> None
     assert len(measured) == COUNT
     bench("run", *words, "--out", "out", cwd=tmp_path)
     assert len(measured) == COUNT
+
+
+def test_a_recording_is_made_again_from_the_folder(tmp_path) -> None:
+    folder, file = write(tmp_path / "clip", wrong=(5,)), tmp_path / "again.rrd"
+    semstab.run(options(folder), out=tmp_path / "out", report=False)
+    assert lacks_pictures(tmp_path / "out", file)
+    record_finished(tmp_path / "out", file)
+    assert not lacks_pictures(tmp_path / "out", file)
+    drawn = {name.partition(":")[0] for name in RrdReader(file).store().schema().column_names()}
+    assert {f"/clip/series/lone_percent/{model}" for model in ("right", "flips")} <= drawn
+    assert "/clip/camera/color" in drawn
+    assert not [name for name in drawn if name.startswith(("/clip/map", "/clip/trajectory", "/clip/depth"))]

@@ -186,6 +186,7 @@ class Recording(Observer):
         self._group: GroupLog | None = None  # the model on a scene that is being fused
         self._unfinished: set[UnitName] = set()  # of the group
         self._logged: set[UnitName] = set()
+        self._live: set[UnitName] = set()  # units whose rows were logged frame by frame
         self._not_assessed: set[tuple[str, str]] = set()  # scenes and models
         self._sent, self._outdated = 0, False  # layouts; whether maps have been finished since the last one
         self._others = "all other files are complete, and the same command makes the recording again"
@@ -206,6 +207,7 @@ class Recording(Observer):
 
     def frame_fused(self, task: Task, frame: Frame, rows: Mapping[UnitName, FrameRow]) -> None:
         """Log a row of each time series, the camera, and the map."""
+        self._live |= {*rows}
         voxels = next((row.report.map_voxels for unit, row in rows.items() if unit.backend == self._drawn(task)), 0)
         self._log_frame(task, frame, rows, voxels)
 
@@ -270,7 +272,8 @@ class Recording(Observer):
             group = self._group or self._begin(task)
             for record in records:
                 if record.series is not None:
-                    timeline.log_file(stream, record.unit, task, record.series, self._clock)
+                    only = ("lone_percent",) if record.unit in self._live and record.pixels is not None else ()
+                    timeline.log_file(stream, record.unit, task, record.series, self._clock, only)
                 if record.pixels is None:
                     factor, table = load_map(record, group.origin)
                     self._log_unit(group, record.summary, table, factor)

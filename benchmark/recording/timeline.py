@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import csv
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -131,8 +131,10 @@ def read_rows(file: Path) -> list[tuple[int, float | None, dict[str, str]]]:
         raise _damaged(file, error) from error
 
 
-def log_file(stream: rr.RecordingStream, unit: UnitName, task: Task, file: Path, clock: Clock) -> None:
-    """Log a unit's time series from its CSV.
+def log_file(
+    stream: rr.RecordingStream, unit: UnitName, task: Task, file: Path, clock: Clock, only: Sequence[str] = ()
+) -> None:
+    """Log a unit's time series from its CSV, all of them or `only` some.
 
     Raises:
         DataError: If it is damaged.
@@ -140,7 +142,7 @@ def log_file(stream: rr.RecordingStream, unit: UnitName, task: Task, file: Path,
     for frame, timestamp, cells in read_rows(file):
         try:
             clock.set(stream, frame, timestamp)
-            log_row(stream, unit, task, cells)
+            log_row(stream, unit, task, {name: cells[name] for name in only} if only else cells)
         except (LookupError, TypeError, ValueError, OverflowError) as error:
             raise _damaged(file, error) from error
 
