@@ -42,7 +42,7 @@ NO_MAP = BackendConfig(name="none", check=True)
 
 OF_MAPS = (
     "voxel_size", "backends", "check", "statistics", "events", "tile_size", "scope", "sweeps", "shared_taxonomy",
-    "critical_classes", "region_maps", "frame_quality", "check_geometry",
+    "critical_classes", "region_maps", "frame_quality",
 )  # fmt: skip
 """Settings that a video, which has no map, does not use."""
 
@@ -208,8 +208,7 @@ def fitting(config: Config, scenes: Mapping[str, Scene]) -> Config:
     default = Config()
     unset = {name: getattr(default, name) for name in OF_MAPS}
     unset |= {"backends": [NO_MAP], "check": None, "check_geometry": False}
-    unused = [name for name in OF_MAPS if getattr(config, name) not in (getattr(default, name), unset[name])]
-    if unused := [name for name in unused if name != "check_geometry"]:
+    if unused := [name for name in OF_MAPS if getattr(config, name) not in (getattr(default, name), unset[name])]:
         logger.warning("%s: a video has no map, so that this is not used", ", ".join(unused))
     return config.model_copy(update=unset)
 
