@@ -25,7 +25,6 @@ if TYPE_CHECKING:
     from semstab.online import FusedResult, TemporalStability, fuse
     from semstab.report.saved_run import load
     from semstab.statistics.acceptance import AcceptanceThresholds
-    from semstab.videos import run_videos
 
 __version__ = "0.4.0"
 
@@ -62,7 +61,6 @@ __all__ = [
     "relabel",
     "run",
     "run_study",
-    "run_videos",
     "statistics",
 ]  # fmt: skip
 
@@ -74,7 +72,7 @@ _HOMES = {
     "FusedResult": "online", "TemporalStability": "online", "compare": "compare_runs", "fuse": "online",
     "export": "exports", "gate": "gating.gate", "load": "report.saved_run",
     "load_config": "configure", "load_result": "engine.folder", "load_study": "configure", "relabel": "exports.relabel",
-    "run": "api", "run_study": "api", "run_videos": "videos",
+    "run": "api", "run_study": "api",
 }  # fmt: skip
 """The module of each public name; other public names are modules."""
 

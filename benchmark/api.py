@@ -13,6 +13,7 @@ from semstab.configure import as_config
 from semstab.core.files import ScratchFolder
 from semstab.data.records import Result
 from semstab.engine import Executor, Observer, execute
+from semstab.engine.folder import without_files
 from semstab.errors import DataError
 from semstab.report import Reporting
 
@@ -65,7 +66,7 @@ def run(
         first = result.failures[0]
         raise causes.get(first.message) or DataError(first.message)
     if out is None:
-        records = tuple(dataclasses.replace(record, voxels_file=None, truth_file=None) for record in result.records)
+        records = tuple(without_files(record) for record in result.records)
         return dataclasses.replace(result, records=records)
     return result
 

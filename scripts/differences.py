@@ -207,7 +207,7 @@ def of_parquet(path: Path) -> dict[str, Any]:
     if order := [name for name in ("ix", "iy", "iz", "frame", "part") if name in table.column_names]:
         table = table.sort_by([(name, "ascending") for name in order])
     columns = {name: table[name].combine_chunks() for name in table.column_names}
-    flat = {name: c.flatten() if pa.types.is_fixed_size_list(c.type) else c for name, c in columns.items()}
+    flat = {name: c.flatten() if hasattr(c, "flatten") else c for name, c in columns.items()}
     return {name: column.to_numpy(zero_copy_only=False) for name, column in flat.items()}
 
 

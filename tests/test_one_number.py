@@ -34,7 +34,6 @@ from semstab.recording.timeline import path
 from semstab.report import write_report
 from semstab.report.tables import save_tables, tables
 from semstab.report.terminal import print_answer
-from semstab.report.videos import screen as screen_of_videos
 
 CITY = {"name": "city", "options": {"frames": 14, "width": 192, "height": 108, "seed": 1}}
 KINDS = {
@@ -291,21 +290,21 @@ def test_the_leaderboard_has_the_numbers_of_the_runs(tmp_path):
 def test_a_video_has_its_flicker_on_every_screen(tmp_path):
     options = {"root": str(video_scene.write(tmp_path / "clip", wrong=(5, 12))), "classes": video_scene.CLASSES}
     folder = tmp_path / "run"
-    result = semstab.run_videos({"dataset": {"name": "video", "options": options}}, out=folder)
-    summary = json.loads((folder / "summary.json").read_text(encoding="utf-8"))["records"]
-    page, said = (folder / "report.html").read_text(encoding="utf-8"), [*screen_of_videos(result)]
+    result = semstab.run({"dataset": {"name": "video", "options": options}}, out=folder)
+    summary = json.loads((folder / "summary.json").read_text(encoding="utf-8"))["runs"]
+    page, said = (folder / "report.html").read_text(encoding="utf-8"), screen(result).splitlines()
     (table,) = (folder / "tables").glob("flicker*.csv")
     for record, content in zip(result.records, summary, strict=True):
         known = record.image_space
         assert content["image_space"]["compensated_flicker_percent"] == known.compensated_flicker_percent
-        (line,) = (line.split() for line in said if line.split()[:1] == [record.model])
+        (line,) = (line.split() for line in said if line.split()[:1] == [record.unit.model])
         assert agree(line[1], known.compensated_flicker_percent)
         assert agree(line[2], known.flicker_percent)
-        (row,) = (row for row in rows_of_csv(table) if record.model in row.values())
+        (row,) = (row for row in rows_of_csv(table) if record.unit.model in row.values())
         assert agree(row["compensated_flicker_percent"], known.compensated_flicker_percent)
         assert agree(row["flicker_percent"], known.flicker_percent)
         assert f"{known.compensated_flicker_percent:.2f}" in page
-        with (folder / "frames" / f"{record.slug}.csv").open(encoding="utf-8") as file:
+        with record.series.open(encoding="utf-8") as file:
             frames = [row["compensated_flicker_percent"] for row in csv.DictReader(file)]
         values = [float(value) for value in frames if value]
         assert sum(values) / len(values) == pytest.approx(known.compensated_flicker_percent)

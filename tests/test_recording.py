@@ -411,6 +411,7 @@ class Scene:
     models = ("net/x",)
     ground_truth = False
     of_scans = False
+    posed = True
     up = np.array([0.0, 0.1, 0.99])
 
 

@@ -121,7 +121,7 @@ def test_what_a_notebook_shows(run):
 
 def test_what_is_missing_is_told(run, tmp_path, monkeypatch):
     fails(DataError, "summary.json: cannot be read", semstab.load, tmp_path)
-    kept = record(voxels((1, 1, [1, 0, 0])), voxels_file=tmp_path / "v/x.parquet")
+    kept = record(voxels((1, 1, [1, 0, 0])), voxels_file=tmp_path / "v/x.parquet", series=tmp_path / "s__m__numpy.csv")
     bare = dataclasses.replace(run, result=study(kept))
     fails(ConfigError, "with --events", bare.events)
     fails(DataError, "s__m__numpy.csv: cannot be read", bare.series)

@@ -9,16 +9,24 @@ import cv2
 import numpy as np
 import pytest
 from command_line import bench
+from rerun.chunk import RrdReader
 from video_scene import CLASSES, COUNT, H, W, texture, views, write
 
 import semstab
 from semstab.datasets import open_dataset, recognise
 from semstab.errors import ConfigError, DataError
-from semstab.metrics.video_flicker import Motion, VideoFlickerMeter, lone_pixels
+from semstab.metrics.video_flicker import VideoFlickerMeter, lone_pixels
+from semstab.pixels.warp import Correspondence
+from semstab.recording import lacks_pictures, record_finished
+from semstab.task import open_scenes
 
 
 def options(folder, **more):
     return {"dataset": {"name": "video", "options": {"root": str(folder), "classes": CLASSES, **more}}}
+
+
+def rows_of(file):
+    return list(csv.DictReader(file.read_text().splitlines()))
 
 
 def frames(folder):
@@ -28,8 +36,8 @@ def frames(folder):
 
 def test_the_motion_is_removed(tmp_path) -> None:
     """Every frame is the one before, moved: no label changes at what is seen, though many do in place."""
-    result = semstab.run_videos(options(write(tmp_path / "clip")))
-    right = next(record for record in result.records if record.model == "right")
+    result = semstab.run(options(write(tmp_path / "clip")))
+    right = result.record(model="right")
     assert right.image_space.flicker_percent > 3
     assert right.image_space.compensated_flicker_percent < 0.4
     assert right.image_space.compensated_share > 0.9
@@ -45,26 +53,28 @@ def test_flicker_is_the_share_of_what_changed(tmp_path) -> None:
         own = labels.copy()
         own[:24] = k % 2
         cv2.imwrite(str(tmp_path / f"labels/net/{k}.png"), own)
-    (record,) = semstab.run_videos(options(tmp_path)).records
+    (record,) = semstab.run(options(tmp_path), out=tmp_path / "out", report=False).records
     assert record.image_space.flicker_percent == pytest.approx(25)
     assert record.image_space.compensated_flicker_percent == pytest.approx(25)
     assert record.image_space.compensated_share == 1
-    assert [row.lone_percent for row in record.rows[1:-1]] == [pytest.approx(25)] * 4
-    assert np.isnan([record.rows[0].lone_percent, record.rows[-1].lone_percent]).all()
+    alone = [row["lone_percent"] for row in rows_of(record.series)]
+    assert [float(share) for share in alone[1:-1]] == [pytest.approx(25)] * 4
+    assert alone[0] == alone[-1] == ""
 
 
 def test_the_frames_that_are_wrong_stand_out_and_not_those_beside_them(tmp_path) -> None:
-    result = semstab.run_videos(options(write(tmp_path / "clip", wrong=(5, 12))))
-    flips, right = (next(r for r in result.records if r.model == name) for name in ("flips", "right"))
-    assert sorted(each.name for each in flips.outlying.frames) == ["0005", "0012"]
-    assert right.outlying.frames == ()
-    assert [row.name for row in flips.rows if row.outlying] == ["0005", "0012"]
-    assert {picture.frame for picture in flips.pictures} == {5, 12}
+    result = semstab.run(options(write(tmp_path / "clip", wrong=(5, 12))), out=tmp_path / "out", report=False)
+    flips, right = (result.record(model=name) for name in ("flips", "right"))
+    assert sorted(each.name for each in flips.outlying_frames.frames) == ["0005", "0012"]
+    assert right.outlying_frames.frames == ()
+    assert [row["name"] for row in rows_of(flips.series) if row["outlying"] == "1"] == ["0005", "0012"]
+    with np.load(tmp_path / "out/overview/clip__flips.npz") as pictures:
+        assert {*pictures["lone_frames"].tolist()} == {5, 12}
 
 
 def test_a_pixel_stands_alone_where_both_neighbours_agree(tmp_path) -> None:
     first, middle, last = frames(write(tmp_path / "clip"))[:3]
-    still = Motion(np.arange(H * W).reshape(H, W), np.ones((H, W), bool))
+    still = Correspondence(np.arange(H * W, dtype=np.int32).reshape(H, W))
     own = lone_pixels(middle, [(first, still), (last, still)])
     a, b, c = first.labels, middle.labels, last.labels
     assert own.pixels == H * W
@@ -72,7 +82,7 @@ def test_a_pixel_stands_alone_where_both_neighbours_agree(tmp_path) -> None:
 
 
 def test_a_change_of_the_size_begins_anew(tmp_path) -> None:
-    meter, (one, two) = VideoFlickerMeter(), frames(write(tmp_path / "clip"))[:2]
+    meter, (one, two) = VideoFlickerMeter(len(CLASSES)), frames(write(tmp_path / "clip"))[:2]
     meter.add(one, None)
     assert np.isnan(meter.add(two.every(2), None))
     assert np.isfinite(meter.add(two.every(2), None))
@@ -88,25 +98,58 @@ def test_a_run_writes_what_it_found(tmp_path) -> None:
     assert "frames that stand out, flips: 2 of 18, 0005 0012" in text
     assert "need depth and poses" in text
     out = tmp_path / "out"
-    rows = list(csv.DictReader((out / "frames/clip__flips.csv").read_text().splitlines()))
+    rows = rows_of(out / "frames/clip__flips__none.csv")
     assert [row["name"] for row in rows if row["outlying"] == "1"] == ["0005", "0012"]
     assert len(rows) == COUNT
     summary = json.loads((out / "summary.json").read_text())
-    assert {record["model"] for record in summary["records"]} == {"right", "flips"}
-    assert (out / "summary.json").stat().st_size < 10_000
+    assert {run["model"] for run in summary["runs"]} == {"right", "flips"}
+    assert "voxels" not in rows[0]
     assert (out / "tables/flicker.csv").read_text().count("\n") == 3
     assert {path.stem for path in (out / "tables").glob("*.csv")} == {"flicker", "frames", "video_measures"}
     page = (out / "report.html").read_text()
-    assert "Least flicker first" in page
+    assert "least flicker first" in page
+    assert "a video has no depth and no poses" in page
     assert "flips, 0005: alone at" in page
     assert (out / "recording.rrd").stat().st_size > 10_000
-    bench(*words, "--video-measures", "dis", cwd=tmp_path)
-    refused = bench(*words, cwd=tmp_path, code=2)
-    assert "holds another run; choose another --out, or --overwrite" in refused.stderr
-    bench(*words, "--overwrite", cwd=tmp_path)
-    for command in ("show", "compare"):
-        other = [out] if command == "show" else [out, out]
-        assert bench(command, *other, cwd=tmp_path, code=2).stderr.count("\n") == 1
+    told = bench(*words, cwd=tmp_path).stderr
+    assert "earlier results of other settings (video_measures: dis there, None here) are replaced" in told
+    refused = bench(*words, "--frames", ":9", cwd=tmp_path, code=2)
+    assert "choose another --out, or --overwrite" in refused.stderr
+
+
+def test_runs_over_videos_are_shown_compared_and_gated(tmp_path) -> None:
+    folder = write(tmp_path / "clip", wrong=(3, 5, 8, 12, 16))
+    result = semstab.run(options(folder), out=tmp_path / "out", report=False)
+    right, flips = (result.record(model=name) for name in ("right", "flips"))
+    shown = bench("show", "out", cwd=tmp_path).stdout
+    assert "least flicker first: 1. right, 2. flips" in shown
+    assert "0005" in bench("show", "out", "frames", cwd=tmp_path).stdout
+    (scene,) = semstab.compare(tmp_path / "out:right", tmp_path / "out:flips").scenes
+    ((row,),) = (against.contrasts for against in scene.against)
+    (first, second) = (record.image_space.compensated_flicker_percent for record in (right, flips))
+    assert (row.measure, row.base, row.other) == (
+        "compensated_flicker_percent",
+        pytest.approx(first),
+        pytest.approx(second),
+    )
+    assert row.difference.value == pytest.approx(second - first)
+    bench("compare", "out:right", "out:flips", "--out", "compared", cwd=tmp_path)
+    page = (tmp_path / "compared/report.html").read_text()
+    assert f"{second:.2f} % against {first:.2f} %" in page
+    gated = ("gate", "out:flips", "--against", "out:right", "--rule")
+    assert "flicker rise" in bench(*gated, "flicker rise < 90", cwd=tmp_path).stdout
+    bench("gate", "out:right", "--rule", "flicker > 50", cwd=tmp_path, code=4)
+    refused = bench(*gated, "alpha drop < .1", cwd=tmp_path, code=2)
+    assert "clip is a video, without depth and poses; a rule may bound its flicker" in refused.stderr
+
+
+def test_other_processes_measure_the_same(tmp_path) -> None:
+    write(tmp_path / "clips/a", wrong=(5,))
+    write(tmp_path / "clips/b", wrong=(7,))
+    words = "--dataset", "video", "--data", "clips", "--option", f"classes=[{','.join(CLASSES)}]", "--report", "on"
+    for out, jobs in (("one", "1"), ("two", "2")):
+        bench("run", *words, "--out", out, "--jobs", jobs, cwd=tmp_path)
+    assert _numbers(tmp_path / "one") == _numbers(tmp_path / "two")
 
 
 def test_a_video_file_is_recognised_and_predicted_on(tmp_path) -> None:
@@ -165,11 +208,9 @@ def test_what_needs_a_map_says_so(tmp_path) -> None:
     assert "not used" not in bench("run", *given, *classes, "--out", "plain", cwd=tmp_path).stderr
     assert "a video, without depth and poses" in bench("check", *given, cwd=tmp_path, code=2).stderr
     with pytest.raises(ConfigError, match="without depth and poses"):
-        semstab.run(options(folder))
+        open_scenes(semstab.load_config(options(folder)))
     with pytest.raises(DataError, match="a video has no depth; use --video-measures dis"):
-        semstab.run_videos({**options(folder), "video_measures": "depth"})
-    with pytest.raises(ConfigError, match=r"use semstab\.run"):
-        semstab.run_videos({"dataset": {"name": "city"}})
+        semstab.run({**options(folder), "video_measures": "depth"})
     refused = bench("run", *given, "--predict", "colour-clusters", "--filter", "ema-warped:0.6", cwd=tmp_path, code=2)
     assert "looks at depth and pose, which a video does not have" in refused.stderr
 
@@ -187,11 +228,11 @@ def test_missing_labels_and_a_single_frame_are_named(tmp_path) -> None:
     folder = write(tmp_path / "clip")
     (folder / "labels/right/0003.png").unlink()
     with pytest.raises(DataError, match=r"1 missing: labels/right/0003.png"):
-        semstab.run_videos(options(folder))
-    result = semstab.run_videos(options(folder, incomplete="skip"))
-    assert result.records[0].frames == COUNT - 1
+        semstab.run(options(folder))
+    result = semstab.run(options(folder, incomplete="skip"))
+    assert result.records[0].summary.frames == COUNT - 1
     with pytest.raises(DataError, match="clip: a single frame is selected"):
-        semstab.run_videos({**options(folder), "frames": {"stop": 1}})
+        semstab.run({**options(folder), "frames": {"stop": 1}})
     with pytest.raises(DataError, match="no images here"):
         open_dataset("video", {"root": _empty(tmp_path)})
 
@@ -204,16 +245,22 @@ def _empty(tmp_path):
 def test_truth_gives_consistency_where_it_stays_the_same(tmp_path) -> None:
     folder = write(tmp_path / "clip", wrong=(5,))
     (folder / "labels/right").rename(folder / "truth")
-    (record,) = semstab.run_videos(options(folder, ground_truth="truth/{name}")).records
-    assert record.model == "flips"
+    (record,) = semstab.run(options(folder, ground_truth="truth/{name}")).records
+    assert record.unit.model == "flips"
     assert 0 < record.image_space.vc8 < 1
 
 
 def _numbers(out):
     """What a run leaves, without times and the command line."""
-    summary = json.loads((out / "summary.json").read_text())
-    files = {file.name: file.read_bytes() for file in sorted(out.glob("frames/*.csv")) + sorted(out.glob("tables/*"))}
-    return summary, files
+    runs = json.loads((out / "summary.json").read_text())["runs"]
+    runs = [{name: value for name, value in run.items() if "_ms" not in name} for run in runs]
+    series = {file.name: rows_of(file) for file in sorted(out.glob("frames/*.csv"))}
+    tables = {file.name: file.read_bytes() for file in sorted(out.glob("tables/*"))}
+    timeless = {
+        name: [{key: value for key, value in row.items() if not key.endswith("_ms")} for row in rows]
+        for name, rows in series.items()
+    }
+    return runs, timeless, tables
 
 
 def test_a_killed_run_goes_on_with_the_next_video(tmp_path, monkeypatch) -> None:
@@ -236,7 +283,8 @@ def test_a_killed_run_goes_on_with_the_next_video(tmp_path, monkeypatch) -> None
     assert len(measured) == 2 * COUNT
     assert "finished earlier: 2 of 4" in again.stderr
     assert _numbers(tmp_path / "out") == _numbers(tmp_path / "whole")
-    pages = [(tmp_path / folder / "report.html").read_text().split("manifest")[0] for folder in ("out", "whole")]
+    pages = [(tmp_path / folder / "report.html").read_text() for folder in ("out", "whole")]
+    pages = [page.partition("<title>")[2].partition('id="manifest"')[0] for page in pages]
     assert pages[0] == pages[1]
     assert "0005: alone at" in pages[0]
     assert (tmp_path / "out/recording.rrd").stat().st_size > 20_000
@@ -245,12 +293,26 @@ def test_a_killed_run_goes_on_with_the_next_video(tmp_path, monkeypatch) -> None
     changed = tmp_path / "clips/a/labels/flips/0007.png"
     assert cv2.imwrite(str(changed), np.zeros((H, W), np.uint8))
     bench("run", *words, "--out", "out", cwd=tmp_path)
-    assert len(measured) == 2 * COUNT
+    assert len(measured) == COUNT
 
     measured.clear()
-    (tmp_path / "out/units/b__flips.json").write_text("{")
+    units = {file: json.loads(file.read_text()) for file in (tmp_path / "out/units").glob("*.json")}
+    (file,) = (file for file, unit in units.items() if (unit["scene"], unit["model"]) == ("b", "flips"))
+    file.write_text("{")
     told = bench("run", *words, "--out", "out", cwd=tmp_path)
-    assert "b__flips.json: damaged; the video is measured again" in told.stderr
-    assert len(measured) == 2 * COUNT
+    assert "damaged; the unit is computed again" in told.stderr
+    assert len(measured) == COUNT
     bench("run", *words, "--out", "out", cwd=tmp_path)
-    assert len(measured) == 2 * COUNT
+    assert len(measured) == COUNT
+
+
+def test_a_recording_is_made_again_from_the_folder(tmp_path) -> None:
+    folder, file = write(tmp_path / "clip", wrong=(5,)), tmp_path / "again.rrd"
+    semstab.run(options(folder), out=tmp_path / "out", report=False)
+    assert lacks_pictures(tmp_path / "out", file)
+    record_finished(tmp_path / "out", file)
+    assert not lacks_pictures(tmp_path / "out", file)
+    drawn = {name.partition(":")[0] for name in RrdReader(file).store().schema().column_names()}
+    assert {f"/clip/series/lone_percent/{model}" for model in ("right", "flips")} <= drawn
+    assert "/clip/camera/color" in drawn
+    assert not [name for name in drawn if name.startswith(("/clip/map", "/clip/trajectory", "/clip/depth"))]

@@ -5,7 +5,6 @@ from __future__ import annotations
 import contextlib
 import gc
 import sys
-import textwrap
 import time
 from collections.abc import Iterator
 from pathlib import Path
@@ -20,7 +19,6 @@ if TYPE_CHECKING:
     from semstab.config import Config
     from semstab.data.records import Result
     from semstab.engine import Executor, Observer
-    from semstab.engine.videos import VideoObserver
 
 
 DISAGREE = 3
@@ -79,36 +77,6 @@ def _require_success(result: Result, out: Path) -> None:
         where = f" ({first.scene}, {first.model}: {first.first})" if first.first else ""
         say(f"error: the backends disagree{where}; the agreement in {out / 'summary.json'} shows where")
         raise typer.Exit(DISAGREE)
-
-
-def measure_videos(config: Config, out: Path, execution: Execution, *, quiet: bool) -> None:
-    """Measure flicker of videos, print the answer, and write the results."""
-    if execution.jobs > 1 or execution.scheduler is not None:
-        raise ConfigError("--jobs and --scheduler: videos are measured in one process; leave them out")
-    began = time.monotonic()
-    from semstab.core.console import Console
-    from semstab.report.videos import NEEDS, VideoProgress, screen
-    from semstab.videos import run_videos
-
-    report = _reported(execution)
-    observers: list[VideoObserver] = [VideoProgress(Console(stderr=True, quiet=quiet))]
-    if execution.rerun != "off":
-        from semstab.recording import Target, VideoRecording
-
-        observers.append(VideoRecording(Target.parse(execution.rerun, out / "recording.rrd")))
-    try:
-        result = run_videos(
-            config, out=out, observers=observers, command=sys.argv, report=report, overwrite=execution.overwrite
-        )
-    finally:
-        for observer in observers:
-            observer.close()
-    lines = [*screen(result), *textwrap.wrap(f"note: {NEEDS}", 80, initial_indent="  ", subsequent_indent="    ")]
-    lines.append(f"  {time.monotonic() - began:.0f} s")
-    for line, file in (("report  ", out / "report.html"), ("viewer  semstab-bench view ", out / "recording.rrd")):
-        if file.exists():
-            lines.append(f"  {line}{file}")
-    print_lines([*lines, f"  files   {out}"], quiet=quiet)
 
 
 def executor_of(jobs: int, scheduler: str | None) -> Executor:

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from semstab.cli import options as opt
-from semstab.cli.execution import execute, measure_videos, naming
+from semstab.cli.execution import execute, naming
 from semstab.cli.options import chosen, print_lines, say
 from semstab.errors import ConfigError
 
@@ -36,17 +36,12 @@ def run(
     """Fuse every selected model with every selected backend, measure and compare. This is the default command."""
     from datetime import datetime
 
-    from semstab.videos import is_video
-
     loaded = _configured(prediction, config, measurement.content(source, backend, tile_size))
     if measurement.device is not None:
         loaded = _on_device(loaded, measurement.device)
     out = out or Path("runs") / datetime.now().astimezone().strftime("%Y-%m-%d_%H-%M-%S")
     with naming(out):
-        if is_video(loaded):
-            measure_videos(loaded, out, execution, quiet=quiet)
-        else:
-            execute(loaded, out, execution, quiet=quiet, verbose=verbose)
+        execute(loaded, out, execution, quiet=quiet, verbose=verbose)
 
 
 def _configured(prediction: opt.Prediction, config: Path | None, content: dict[str, Any]) -> Config:

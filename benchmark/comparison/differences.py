@@ -76,6 +76,8 @@ def by_class(common: Common, base: Entry, number: int) -> tuple[Contrast, ...]:
 
     The locations follow from the ground truth, or else from all runs together, so that no run chooses its own.
     """
+    if common.basis == "images":
+        return ()
     names = base.classes or tuple(str(k) for k in range(base.sums.K))
     of_locations = list(_of_locations(common, names, number)) if common.tables else []
     rows = [*_against_all(common, names, number), *of_locations]
@@ -138,11 +140,11 @@ def _with_change(row: Contrast, p_holm: float, sign: float) -> Contrast:
 
 
 def _rows(common: Common, base: Entry, other: Entry, number: int) -> Iterator[Contrast]:
-    before, after = base.sums.without_truth(), other.sums.without_truth()
     for quantity in IN_SUMS:
         if _comparable(quantity, common):
             yield from _row(quantity, common.sums[0], common.sums[number], common)
-    if common.basis != "flights" and not common.sizes_differ:
+    if common.basis not in ("flights", "images") and not common.sizes_differ:
+        before, after = base.sums.without_truth(), other.sums.without_truth()
         change = sums_difference(COVERAGE.key, after, before, same_frames=common.same_frames)
         yield Contrast(COVERAGE.name, "", 1.0, 1 + change.value, change, math.nan, "")
     if base.flicker and (base.flicker.keys() == other.flicker.keys() or common.same_frames is False):

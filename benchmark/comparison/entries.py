@@ -36,7 +36,7 @@ from semstab.datasets import GROUND_TRUTH
 from semstab.engine.folder import load_result, run_and_model
 from semstab.errors import ConfigError, DataError, sanitize, summarize_error
 from semstab.statistics.cluster_sums import ClusterSums
-from semstab.statistics.verdict import ADVICE
+from semstab.statistics.verdict import ADVICE, LEAST_CLASSES
 
 Flicker = Mapping[int, float]
 """Percent of the pixels whose label differs from the label in the frame before, camera motion removed, by frame."""
@@ -88,6 +88,9 @@ class Entry(EntryNumbers):
         if self.small is not None:
             return self.small[0]
         assert self.record is not None
+        if (pixels := self.record.pixels) is not None:
+            nothing = np.zeros((0, 3), np.int32), np.zeros(0, np.int32), np.zeros((0, 0))
+            return ClusterSums(*nothing, {}, 1.0, classes=pixels.classes, fused=self.summary.frames)
         file = self.record.sums_file
         if file is None or not file.is_file():
             raise DataError(f"{self.where}: it has no sums by frame and cube of {self.record.unit.slug}; run it again")
@@ -116,6 +119,9 @@ class Entry(EntryNumbers):
     def caveat(self) -> str:
         """Why its agreement does not assess its labels, as its verdict has it; '' where it does."""
         statistics = self.summary.statistics
+        if self.record is not None and (pixels := self.record.pixels) is not None:
+            silent = pixels.effective_classes < LEAST_CLASSES
+            return f"uninformative: nearly all of its labels are {pixels.largest_class}" if silent else ""
         if statistics is None or statistics.verdict.level not in ("uninformative", "misleading"):
             return ""
         return f"{statistics.verdict.level}: {ADVICE[statistics.verdict.level]}"
@@ -352,8 +358,10 @@ def save_summary(
     request, which halves the file; `keep_spots` makes sums of the map coarser alone.
 
     Raises:
-        DataError: If even the coarsest sums need more.
+        DataError: If even the coarsest sums need more, or a scene is a video: it has no sums.
     """
+    if video := next((name for name, entry in run.scenes.items() if not entry.sums.layout), None):
+        raise DataError(f"{path}: {video} is a video, without a map to summarise; compare the folder of the run")
     scenes = tuple(
         _Scene(**_numbers(entry), name=name, frames=(*entry.flicker,), flicker=(*entry.flicker.values(),))
         for name, entry in run.scenes.items()

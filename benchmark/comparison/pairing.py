@@ -54,6 +54,8 @@ BY_CUBES += " left out: the areas that got worse"
 OTHER_SIZES = f"voxels of {{sizes}}: {BY_CUBES}, and measures that depend on their size (PSA, VSS, SBD, coverage, ECE)"
 
 
+OF_IMAGES = "a video has no depth and no poses: flicker alone is compared, frame by frame"
+
 LABELS_AND_SCORES = (
     "labels are compared with scores: alpha, and numbers of right fused labels, are of the likeliest classes; other"
     " measures, which depend on how scores spread their evidence, are left out"
@@ -115,6 +117,8 @@ def pair(entries: Sequence[Entry], names: Sequence[str], scope: Scope = THIS_SCE
 
 
 def _paired(entries: Sequence[Entry], names: Sequence[str]) -> Common:
+    if not all(entry.sums.layout for entry in entries):
+        return Common("images", (OF_IMAGES,), tuple(entry.sums for entry in entries))
     if note := _other_frame_of_reference(entries):
         return _apart(entries, note)
     if len(sizes := {entry.summary.table.voxel_size for entry in entries}) > 1:

@@ -65,9 +65,9 @@ class ComparedObservations:
         return self.order != self.order_ignored or not self.bounded
 
 
-Basis = Literal["observations", "voxels", "cubes", "flights"]
+Basis = Literal["observations", "voxels", "cubes", "flights", "images"]
 """The unit of pairing: observations (a spot in a view) that all made; voxels that all saw twice or more; cubes,
-each map with all its voxels; nothing, each flight by itself."""
+each map with all its voxels; nothing, each flight by itself; images of a video, which has no map."""
 
 
 @dataclass(frozen=True)

@@ -274,10 +274,10 @@ RESERVED = frozenset((
     "entropy_within",
     "evidence", "files", "flicker_percent", "frames", "frames_empty", "frames_left_out", "fuse_ms_per_frame",
     "image_space", "input", "iou", "key", "label", "left_out", "mean_op", "means", "miou", "model", "name", "notes",
-    "observation_accuracy", "observations", "op", "points", "precision", "psa", "quality", "recurrent", "reduced",
-    "sbd_excess", "sbd_null", "scene", "scores_left_out", "share", "sizes", "stages_ms", "statistics", "strata",
-    "summary", "table", "taxonomy", "truth_file", "unit", "up", "variation", "video_measures", "voxel_alpha",
-    "voxel_size", "voxels", "voxels_file", "well_seen", "wrong_of_consistent",
+    "observation_accuracy", "observations", "op", "pixels", "points", "precision", "psa", "quality", "recurrent",
+    "reduced", "sbd_excess", "sbd_null", "scene", "scores_left_out", "series", "share", "sizes", "stages_ms",
+    "statistics", "strata", "summary", "table", "taxonomy", "truth_file", "unit", "up", "variation",
+    "video_measures", "voxel_alpha", "voxel_size", "voxels", "voxels_file", "well_seen", "wrong_of_consistent",
 ))  # fmt: skip
 """Keys that no measure may have: fields beside its mean in JSON, other differences of maps, other compared numbers."""
 

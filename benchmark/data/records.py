@@ -18,7 +18,7 @@ from semstab.data.display import as_figure
 from semstab.data.georeference import Georeference
 from semstab.data.measures import measures
 from semstab.data.results import Agreement, UnitName, UnitSummary, VoxelAdvice
-from semstab.data.statistics import UNKNOWN, MapStatistics
+from semstab.data.statistics import UNKNOWN, MapStatistics, OutlyingFrames
 from semstab.data.voxels import VoxelTable
 from semstab.errors import ConfigError
 
@@ -182,6 +182,26 @@ class FrameQuality:
 
 
 @dataclass(frozen=True)
+class PixelStatistics:
+    """Statistics of the labelled pixels of a video: without depth and poses there is no map to assess.
+
+    Attributes:
+        size: (width, height) of an image.
+        classes: Names of the classes.
+        outlying_frames: The frames that stand alone more often than the others; their places are pixels.
+        largest_class, largest_share: The class of most labelled pixels, and its share of them, 0 to 1.
+        effective_classes: 1 / sum of the squares of the classes' shares: 1 if all pixels have one class.
+    """
+
+    size: tuple[int, int]
+    classes: tuple[str, ...]
+    outlying_frames: OutlyingFrames
+    largest_class: str
+    largest_share: float
+    effective_classes: float
+
+
+@dataclass(frozen=True)
 class Record:
     """What is kept of one finished unit: its numbers, and where its files are.
 
@@ -195,6 +215,8 @@ class Record:
         voxels_file: File of its voxel table, or the folder of its tiles, for the 'base' and 'backends' units; None
             elsewhere.
         truth_file: File of the ground truth's voxels of the same frames, where the statistics fused it.
+        series: File of its time series, in the folder of the run.
+        pixels: Statistics of the labelled pixels of a video; None for a unit with a map.
         input: Digest of its input. This and what follows stand in the unit's own file alone: a result that is loaded
             from its folder has them for all units together.
         up: The scene's up axis, where it is known or could be estimated.
@@ -212,6 +234,8 @@ class Record:
     video_measures: VideoMeasures | None = None
     voxels_file: Path | None = None
     truth_file: Path | None = None
+    series: Path | None = None
+    pixels: PixelStatistics | None = None
     input: str = ""
     up: tuple[float, float, float] | None = None
     files: Mapping[str, str] = field(default_factory=dict)
@@ -228,6 +252,13 @@ class Record:
     def statistics(self) -> MapStatistics | None:
         """Return the statistics of the map."""
         return self.summary.statistics
+
+    @property
+    def outlying_frames(self) -> OutlyingFrames | None:
+        """The frames that stand out, in the map or, of a video, in the images."""
+        if self.pixels is not None:
+            return self.pixels.outlying_frames
+        return None if self.statistics is None else self.statistics.outlying_frames
 
     @property
     def unit(self) -> UnitName:
@@ -254,11 +285,6 @@ class Record:
         if self.voxels_file is None:
             raise ValueError(f"{self.unit.slug}: the voxels of {self.variation} were not saved")
         return VoxelTable.iter_tiles(self.voxels_file)
-
-    @property
-    def series(self) -> Path | None:
-        """File of its time series, in the folder of the run."""
-        return self._companion(FRAMES, ".csv")
 
     @property
     def observations_file(self) -> Path | None:
@@ -373,7 +399,8 @@ class Result:
 
     def __repr__(self) -> str:
         units = f"{len(self.records)} unit{'' if len(self.records) == 1 else 's'}"
-        lines = [f"<{type(self).__name__} '{self.name}': {units}, fused by {self.backend}>"]
+        fused = f", fused by {self.backend}" if self.maps.records else ""
+        lines = [f"<{type(self).__name__} '{self.name}': {units}{fused}>"]
         lines += [f"  {run.stated}" for run in self.runs[:LISTED]]
         return "\n".join([*lines, *(["  ..."] if len(self.runs) > LISTED else [])])
 
@@ -419,6 +446,11 @@ class Result:
             f"{len(fitting)} units fit"
             + (f" ({units}); choose with --scene, --model (in Python: scene=, model=)" if fitting else "")
         )
+
+    @property
+    def maps(self) -> Result:
+        """The result without the units that have no map: a video has none."""
+        return replace(self, records=tuple(record for record in self.records if record.pixels is None))
 
     @property
     def scenes(self) -> tuple[str, ...]:

@@ -33,7 +33,7 @@ from semstab.engine.memory import planned_sizes
 from semstab.engine.observer import Observer, Observers
 from semstab.engine.run_result import UnitResults, advice_of, manifest, result_of
 from semstab.engine.tiled_units import TiledUnit
-from semstab.engine.units import Plan, Unit, make_plan
+from semstab.engine.units import Plan, Unit, fitting, make_plan
 from semstab.engine.work import Job, Start, Work, jobs_of
 from semstab.errors import ConfigError, DataError
 from semstab.task import open_scenes
@@ -66,7 +66,8 @@ def execute(
     """
     started, telling, executor = time.perf_counter(), Observers(observers), executor or InProcess()
     config = resolve(config)
-    scenes = open_scenes(config, out.absolute())
+    scenes = open_scenes(config, out.absolute(), posed=False)
+    config = fitting(config, scenes)
     config, gaps = with_invalid_depth(config, scenes) if config.check_geometry else (config, {})
     if gaps:
         scenes = open_scenes(config, out.absolute())

@@ -55,9 +55,6 @@ logger = logging.getLogger("semstab")
 LAYOUT = "# semstab, folder layout 4"
 """First line of config.yaml: a folder that begins otherwise is of another version."""
 
-VIDEO_LAYOUT = "# semstab, video folder 1"
-"""The first line of the settings of a run over videos, which has no map."""
-
 OF_MAPS = (
     "dataset", "taxonomy", "voxel_size", "pixel_stride", "top_k", "frames", "scene_frames", "exclude", "perturbation",
 )  # fmt: skip
@@ -220,7 +217,8 @@ class Folder:
             image_space=record.image_space if unit.image_space else ImageSpace(),
             quality=record.quality if unit.image_space else None,
             video_measures=record.video_measures if unit.image_space else None,
-            voxels_file=self.path / voxels if unit.stored else None,
+            voxels_file=self.path / voxels if unit.stored and unit.fuses else None,
+            series=self.path / FRAMES / f"{unit.name.slug}.csv" if unit.stored else None,
             truth_file=self.path / truth if unit.image_space and has_truth else None,
         )
 
@@ -288,7 +286,8 @@ def _wanted(unit: Unit, record: Record) -> list[str]:
     """Return the files that a unit must have."""
     name, wanted = unit.name, list[str]()
     if unit.stored:
-        wanted += [*(_in_tiles(record) or [f"{VOXELS}/{name.slug}.parquet"]), f"{FRAMES}/{name.slug}.csv"]
+        wanted += (_in_tiles(record) or [f"{VOXELS}/{name.slug}.parquet"]) if unit.fuses else []
+        wanted.append(f"{FRAMES}/{name.slug}.csv")
     if unit.stored and unit.assessed:
         wanted.append(f"{SUMS}/{name.slug}.parquet")
     if unit.stored and unit.config.events and keeps_log(name.backend):
@@ -350,8 +349,6 @@ def load_result(folder: str | Path) -> Result:
     path = folder / "summary.json"
     if not os.path.lexists(folder):
         raise DataError(f"{folder}: there is no such folder; give the folder of a finished run")
-    if _is_of_videos(folder):
-        raise DataError(f"{folder}: a run over videos, without a map; {folder / 'report.html'} and tables/ have it")
     if _is_earlier(folder):
         raise DataError(f"{folder}: holds results of an earlier version of semstab; run it again, into another folder")
     content = read_json(path)
@@ -377,16 +374,26 @@ def _contradiction(result: Result) -> str | None:
     for row in result.agreement:
         if lost := {"op", "evidence"} - row.differences.keys():
             return f"the agreement on {row.scene} has no {min(lost)}"
-    files = (file for record in result.records for file in (record.voxels_file, record.truth_file) if file is not None)
+    files = (file for record in result.records for name in FILES if (file := getattr(record, name)) is not None)
     outside = (file for file in files if file.is_absolute() or ".." in file.parts)
     return next((f"{file} is not in the folder" for file in outside), None)
+
+
+FILES = ("voxels_file", "truth_file", "series")
+"""Fields of a record that are paths."""
+
+
+def without_files(record: Record) -> Record:
+    """Return a record of which no file is kept."""
+    nothing: dict[str, Any] = dict.fromkeys(FILES)
+    return dataclasses.replace(record, **nothing)
 
 
 def _with_files(records: Sequence[Record], change: Callable[[Path], Path]) -> tuple[Record, ...]:
     """Return the records with other paths of their files: in summary.json as they are called in the folder."""
 
     def files(record: Record) -> dict[str, Any]:
-        return {name: (path := getattr(record, name)) and change(path) for name in ("voxels_file", "truth_file")}
+        return {name: (path := getattr(record, name)) and change(path) for name in FILES}
 
     return tuple(dataclasses.replace(record, **files(record)) for record in records)
 
@@ -397,8 +404,6 @@ def _claimed(path: Path) -> dict[str, Any] | None:
         return None
     if not path.is_dir():
         raise ConfigError(f"{path}: is a file; name a folder")
-    if _is_of_videos(path):
-        raise ConfigError(f"{path}: holds a run over videos; choose another folder")
     if _is_earlier(path):
         raise ConfigError(f"{path}: holds results of an earlier version of semstab; choose another folder")
     if (path / SETTINGS).exists():
@@ -410,16 +415,10 @@ def _claimed(path: Path) -> dict[str, Any] | None:
 
 
 def _is_earlier(folder: Path) -> bool:
-    return (folder / SETTINGS).exists() and _layout_of(folder) != LAYOUT
-
-
-def _is_of_videos(folder: Path) -> bool:
-    return (folder / SETTINGS).is_file() and _layout_of(folder) == VIDEO_LAYOUT
-
-
-def _layout_of(folder: Path) -> str:
+    if not (folder / SETTINGS).exists():
+        return False
     with (folder / SETTINGS).open(encoding="utf-8", errors="replace") as lines:
-        return lines.readline(200).rstrip("\n")
+        return lines.readline(200).rstrip("\n") != LAYOUT
 
 
 def _first_change(old: Mapping[str, Any], new: Mapping[str, Any], prefix: str = "") -> str | None:

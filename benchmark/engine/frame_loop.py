@@ -6,28 +6,25 @@ import contextlib
 import functools
 import itertools
 import json
-import math
 from collections import defaultdict
 from collections.abc import Generator, Iterator, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
-
-import numpy as np
 
 from semstab.core.prefetch import Fetched, prefetch
 from semstab.core.process import Stopwatch
 from semstab.data.frames import Frame
 from semstab.data.records import RegionFlicker
 from semstab.datasets import GROUND_TRUTH, Dataset, Scene, open_dataset
-from semstab.engine.live_maps import Decoded, LiveMap, frame_order, streams_of
+from semstab.engine.live_maps import Decoded, Decodings, LiveMap, Stream, frame_order, streams_of
 from semstab.engine.measurement import finish
 from semstab.engine.memory import MemoryBudget
 from semstab.engine.observer import Observers
 from semstab.engine.work import Job, Work
 from semstab.errors import DataError
-from semstab.metrics import macro_mean, matched_region_flicker
+from semstab.metrics import macro_mean
+from semstab.metrics.flicker import region_flicker
 from semstab.pixels.preparation import leave_out, perturb
-from semstab.pixels.warp import correspond
 
 
 def run_job(job: Job, observers: Observers | None = None) -> Iterator[Work]:
@@ -98,27 +95,43 @@ class Fusion:
                 task, config = stream.task, watched[0].work.unit.config
                 observers.tell(lambda observer: observer.group_started(task, config, backends))  # noqa: B023
 
-    def decoded_frames(self) -> Generator[Fetched[Decoded], None, None]:
+    def decoded_frames(self) -> Generator[Fetched[Decodings], None, None]:
         """Yield frames in order, decoded ahead by threads."""
-        fetched = prefetch(self._decode, self.order, threads=self._threads, size=lambda each: each.nbytes)
-        model = self.streams[0].task.model if self.streams else GROUND_TRUTH
-        with self._scene.reading(self.order, model), contextlib.closing(fetched):
-            for each in fetched:
-                in_network = min(each.waited, each.item.network) if each.item.network > 0 else 0.0
+        fetched = prefetch(
+            self._decode, self.order, threads=self._threads, size=lambda each: sum(own.nbytes for own in each.values())
+        )
+        with contextlib.ExitStack() as stack:
+            for model in dict.fromkeys(stream.task.model for stream in self.streams):
+                stack.enter_context(self._scene.reading(self.order, model))
+            for each in stack.enter_context(contextlib.closing(fetched)):
+                in_network = min(each.waited, sum(own.network for own in each.item.values() if own.network > 0))
                 self.watch.seconds["read"] += each.waited - in_network
                 if in_network:
                     self.watch.seconds["network"] += in_network
                 yield each
 
-    def _decode(self, index: int) -> Decoded:
-        """Decode a frame in a worker thread; an error fails the units that need the frame, not those that do not."""
-        scene, wanting = self._scene, [stream for stream in self.streams if index in stream.frames]
-        model = wanting[0].task.model
+    def _decode(self, index: int) -> Decodings:
+        """Decode a frame in a worker thread, with the labels of each model; its image and truth are decoded once."""
+        wanting = [stream for stream in self.streams if index in stream.frames]
+        color = self._observers.want_color or any(stream.wants_color or stream.shown == index for stream in wanting)
+        decodings: dict[str, Decoded] = {}
+        for model in dict.fromkeys(stream.task.model for stream in wanting):
+            own = [stream for stream in wanting if stream.task.model == model]
+            known = next((each for each in decodings.values() if each.error is None), None)
+            decodings[model] = self._decoded(index, model, own, known, color=color)
+        return decodings
+
+    def _decoded(
+        self, index: int, model: str, wanting: Sequence[Stream], known: Decoded | None, *, color: bool
+    ) -> Decoded:
+        """Decode a model's frame; an error fails the units that need the frame, not those that do not."""
+        scene, same = self._scene, None if known is None else known.frame
         try:
-            pictured = any(stream.shown == index for stream in self.streams)
-            color = self._observers.want_color or pictured or any(stream.wants_color for stream in wanting)
-            frame = scene.frame(index, model, color=color)
-            truth = _ground_truth(scene, index) if any(stream.truth_task is not None for stream in wanting) else None
+            frame = scene.frame(index, model, color=color and same is None)
+            frame = frame if same is None else replace(frame, color=same.color)
+            truth = None if known is None else known.truth
+            if known is None and any(stream.truth_task is not None for stream in wanting):
+                truth = _ground_truth(scene, index)
             measures_quality = any(stream.quality is not None for stream in wanting)
             name = scene.filtering(model).model if measures_quality else model  # without filters
             unfiltered = None if name == model else scene.frame(index, name, color=False)
@@ -204,7 +217,7 @@ def _measured_regions(scene: Scene, work: Work) -> Work:
     """Return a unit of regions with the means over its pairs of sampled frames."""
     name = work.unit.name
     try:
-        rows = [_compared(*pair) for pair in itertools.pairwise(_region_frames(scene, work))]
+        rows = [region_flicker(*pair) for pair in itertools.pairwise(_region_frames(scene, work))]
         flicker, compensated, share = zip(*rows, strict=True) if rows else ((), (), ())
         means = macro_mean(flicker), macro_mean(compensated), macro_mean(share)
         digest = scene.digest([*work.frames], name.model)
@@ -229,16 +242,3 @@ def _region_frames(scene: Scene, work: Work) -> Iterator[Frame]:
     with contextlib.closing(fetched):
         for each in fetched:
             yield each.item
-
-
-def _compared(previous: Frame, current: Frame) -> tuple[float, float, float]:
-    """Return flicker, compensated flicker (percent), and the co-visible share of two successive frames."""
-    before, now = previous.predicted, current.predicted
-    flicker = math.nan
-    if previous.shape == current.shape:
-        flicker = matched_region_flicker(before, now, previous.valid & current.valid).flicker_percent
-    seen = correspond(current, previous)
-    both = current.valid & seen.bring(previous.valid, fill=False)
-    compensated = matched_region_flicker(seen.bring(before), now, both).flicker_percent
-    valid = np.count_nonzero(current.valid)
-    return flicker, compensated, np.count_nonzero(both) / valid if valid else math.nan

@@ -29,8 +29,10 @@ from semstab.engine.series import FrameRow, Series
 from semstab.engine.tiles import tiles_met
 from semstab.engine.work import Work
 from semstab.errors import ConfigError
-from semstab.metrics import FrameQualityMeter, VideoMeter, flicker_percent
+from semstab.metrics import FrameQualityMeter, VideoMeter
+from semstab.metrics.flicker import flicker_in_place
 from semstab.metrics.image_space import ImageSpaceMeter
+from semstab.metrics.video_flicker import Flows, VideoFlickerMeter
 from semstab.pixels.scans import pictured
 from semstab.statistics import Sampler
 from semstab.statistics.observations import SpotObservations
@@ -108,7 +110,8 @@ class LiveMap:
         """Fuse a frame, and its ground truth, into the maps."""
         frame, K = prepared.frame, len(self.task.mapping.target)
         if self.backend is None:
-            return FrameReport(frame.index, points=0, voxels=0, new_voxels=0, drift_sum=0.0, seconds=0.0, map_voxels=0)
+            points = int(np.count_nonzero(frame.valid)) if self.work.tile is None else 0
+            return FrameReport(frame.index, points, voxels=0, new_voxels=0, drift_sum=0.0, seconds=0.0, map_voxels=0)
         config = self.config
         kind = (self.name.backend, json.dumps(config.backends[0].options), K, frame.scores is None)
         if kind not in _warm:  # let it load what it compiles, once a process: else the first frame costs more
@@ -202,11 +205,16 @@ class Decoded:
         return sum(frame.nbytes for frame in (self.frame, self.truth, self.model) if frame is not None)
 
 
+Decodings = Mapping[str, Decoded]
+"""A frame with the labels of each model that is measured in one pass: one, or of a video all."""
+
+
 @dataclass(frozen=True, eq=False)
 class Prepared:
     """A frame as maps fuse it: labels in the run's label space, without moving objects; and its ground truth."""
 
-    fetched: Fetched[Decoded]
+    fetched: Fetched[Decodings]
+    decoded: Decoded
     frame: Frame
     truth: Frame | None
 
@@ -214,7 +222,7 @@ class Prepared:
 class Stream:
     """Maps that fuse frames prepared alike: of one taxonomy, noise, pixel stride and selection of frames."""
 
-    def __init__(self, maps: Sequence[LiveMap], watch: Stopwatch, observers: Observers) -> None:
+    def __init__(self, maps: Sequence[LiveMap], watch: Stopwatch, observers: Observers, flows: Flows) -> None:
         self.maps, self._watch, self._observers = list(maps), watch, observers
         self.watched = [live for live in maps if live.work.watched]
         self.task = dataclasses.replace(maps[0].task, backends=tuple(live.name.backend for live in self.watched))
@@ -224,16 +232,17 @@ class Stream:
         self._previous: Frame | None = None
         base = any(live.work.unit.image_space and live.work.measures_images for live in maps)
         series = any(live.work.unit.stored and live.work.measures_images for live in maps)  # theirs hold flicker
-        voxel_size = maps[0].config.voxel_size
-        self.image_space = ImageSpaceMeter(voxel_size=voxel_size) if base or series else None
+        voxel_size, posed = maps[0].config.voxel_size, self.task.scene.posed
+        self.pixels = None if posed else VideoFlickerMeter(len(self.task.mapping.target), flows)
+        self.image_space = self.pixels or (ImageSpaceMeter(voxel_size=voxel_size) if base or series else None)
         quality = base and maps[0].config.frame_quality
         self.quality = FrameQualityMeter(len(self.task.mapping.target)) if quality else None
         flow = maps[0].config.video_measures if base else None
         self.video = None if flow is None else VideoMeter(len(self.task.mapping.target), flow)
-        self.wants_color = flow == "dis"
+        self.wants_color = flow == "dis" or not posed
         self.truth_task = truth_task(self.task) if base or maps[0].work.unit.compares_truth else None
         self._poses = Rows(POSE)
-        self._estimates_up = base and self.task.scene.up is None
+        self._estimates_up = base and posed and self.task.scene.up is None
         self.shown = self.task.indices[len(self.task.indices) // 2] if base else None
         self.overview: dict[str, Any] = {}
 
@@ -242,9 +251,9 @@ class Stream:
         """(F, 3, 3) down, forward and centre of cameras in the world; of none where up need not be estimated."""
         return self._poses.table().reshape(-1, 3, 3)
 
-    def prepare(self, fetched: Fetched[Decoded]) -> Prepared:
+    def prepare(self, fetched: Fetched[Decodings]) -> Prepared:
         """Return the frame as the stream's maps fuse it, with its colour only where an observer wants it."""
-        decoded = fetched.item
+        decoded = fetched.item[self.task.model]
         if decoded.error is not None:
             raise decoded.error
         assert decoded.frame is not None
@@ -255,19 +264,13 @@ class Stream:
             self.overview = _overview(self.task, decoded.frame)
             wanted = self._observers.want_color or self.wants_color
             frame = frame if wanted else dataclasses.replace(frame, color=None)
-        return Prepared(fetched, frame, truth)
+        return Prepared(fetched, decoded, frame, truth)
 
     def measure(self, now: Prepared, reports: Mapping[LiveMap, FrameReport]) -> dict[LiveMap, FrameRow]:
         """Return flicker and stability in image coordinates with the reports of the maps: a row of each series."""
-        frame, decoded, flicker, compensated = now.frame, now.fetched.item, math.nan, math.nan
+        frame, decoded, compensated = now.frame, now.decoded, math.nan
         with self._watch("flicker") as lap:
-            if (
-                self._sequential
-                and self._previous is not None
-                and self._previous.shape == frame.shape
-                and not frame.is_scan
-            ):
-                flicker = flicker_percent(self._previous, frame)
+            flicker = flicker_in_place(self._previous, frame)
         if self.image_space is not None:
             with self._watch("image space"):
                 compensated = self.image_space.add(frame, now.truth)
@@ -317,12 +320,13 @@ class Stream:
 def streams_of(maps: Iterable[LiveMap], watch: Stopwatch, observers: Observers) -> list[Stream]:
     """Return the maps by what they share of each frame; tiles share frames though each fuses those that see it."""
     groups: dict[Any, list[LiveMap]] = {}
+    flows = Flows()
     for live in maps:
         config = live.config
         same = (config.taxonomy, config.exclude, config.perturbation, config.pixel_stride, config.top_k)
         frames = None if live.work.within is not None else live.frames
-        groups.setdefault((*same, frames), []).append(live)
-    return [Stream(group, watch, observers) for group in groups.values()]
+        groups.setdefault((live.name.model, *same, frames), []).append(live)
+    return [Stream(group, watch, observers, flows) for group in groups.values()]
 
 
 def frame_order(streams: Iterable[Stream]) -> Sequence[int]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import math
 from collections.abc import Callable, Mapping
 from concurrent.futures import Future
 from dataclasses import replace
@@ -24,9 +25,19 @@ from semstab.data.evidence import stretches
 from semstab.data.frames import LeftOut
 from semstab.data.measures import RECURRENT, dominant, mean, measures, vss
 from semstab.data.parquet import Tile
-from semstab.data.records import EVENTS, FRAMES, OBSERVATIONS, OVERVIEW, SUMS, TRUTH, VOXELS, FrameQuality, Record
+from semstab.data.records import (
+    EVENTS,
+    FRAMES,
+    OBSERVATIONS,
+    OVERVIEW,
+    SUMS,
+    TRUTH,
+    VOXELS,
+    FrameQuality,
+    PixelStatistics,
+    Record,
+)
 from semstab.data.results import STAGES, Agreement, ReducedScores, UnitName, UnitSummary, slug
-from semstab.data.videos import LonePicture
 from semstab.data.voxels import VoxelTable
 from semstab.datasets import Scene
 from semstab.engine.live_maps import LiveMap, Stream
@@ -39,17 +50,22 @@ from semstab.engine.work import Start, Work
 from semstab.errors import DataError
 from semstab.metrics import compare
 from semstab.metrics.agreement import rows_of
-from semstab.metrics.image_space import PICTURED, ImageSpaceMeter, lone_picture, picture_arrays
+from semstab.metrics.image_space import PICTURED, ImageSpaceMeter, LonePicture, lone_picture, picture_arrays
 from semstab.metrics.summary import TableSums
 from semstab.metrics.up_axis import estimate_up
+from semstab.metrics.video_flicker import VideoFlickerMeter, video_picture
 from semstab.statistics import Analysis, MapSample, SpotObservations, analyse
 from semstab.statistics.agreement import alpha_of, alpha_sums, ratio_of
+from semstab.statistics.frame_disagreement import LoneDisagreement, by_frame, outlying_frames
 from semstab.statistics.places import worst_places
 from semstab.statistics.verdict import Limits
 from semstab.task import Task, read
 
 SMALL = 1 << 30
 """A process with fewer bytes keeps freed memory for the next table, but between tiles: there memory is short."""
+
+OfFrames = dict[int, dict[str, float]]
+"""How often each frame stands alone, by its index; see `semstab.statistics.frame_disagreement.by_frame`."""
 
 Savers = dict[str, Callable[[Path], None]]
 """A function that writes each file of a unit, by the file's path in the folder."""
@@ -75,7 +91,9 @@ def finish(live: LiveMap, stream: Stream, watch: Stopwatch) -> Work:
             if fused is not None and work.unit.assessed:
                 log = fused.events if config.statistics else None
                 sample = MapSample.draw(fused.table, log, fused.truth, edges=config.strata)
-            if fused is not None:
+            if not work.unit.fuses:
+                sums = TableSums.nothing(len(live.task.mapping.target), config.strata).arrays()
+            elif fused is not None:
                 sums = (TableSums.of(fused.table, config.strata) if sample is None else sample.summary).arrays()
             if sample is not None and tile is None:
                 analysis = analyse_sample(live.task, config, sample, observations)
@@ -94,25 +112,28 @@ def finish(live: LiveMap, stream: Stream, watch: Stopwatch) -> Work:
             poses=stream.poses,
             seen=np.concatenate([np.zeros((0, 3), np.int32), *live.tiles]),
         )
-        record = None
+        record, of_frames = None, OfFrames({} if analysis is None else analysis.of_frames())
         if tile is None:
-            assert fused is not None
             with watch("measure"):
                 record = record_of(work.unit, live.task, live.rows, result, analysis)
                 if work.unit.image_space:
-                    record = in_image_space(record, live.task, result, fused.table)
+                    points = np.zeros((0, 3)) if fused is None else fused.table
+                    record = in_image_space(record, live.task, result, points)
+                if stream.pixels is not None:
+                    pixels, of_frames = pixel_statistics(live.task, stream.pixels)
+                    record = replace(record, pixels=pixels)
         with watch("write"):
             beside.drain()
-            files.write(_savers(live, stream, fused, observations, sample, analysis))
+            files.write(_savers(live, stream, fused, observations, sample, analysis, of_frames))
             if fused is not None and config.statistics:
                 files.write(_map_savers(live, fused, analysis))
             if tile is not None:
                 files.write({f"{tile.folder}/{tile.name}.npz": replace(result, files={**files.digests}).save})
     if record is None:
         return replace(work, files=files.returned)
-    assert fused is not None
     record = replace(record, files=files.digests)
-    return replace(work, record=record, files=files.returned, table=fused.table if work.watched else None)
+    table = fused.table if fused is not None and work.watched else None
+    return replace(work, record=record, files=files.returned, table=table)
 
 
 class FusedMap(NamedTuple):
@@ -185,6 +206,30 @@ def analyse_sample(task: Task, config: Config, sample: MapSample, observations: 
     )  # fmt: skip
 
 
+def pixel_statistics(task: Task, meter: VideoFlickerMeter) -> tuple[PixelStatistics, OfFrames]:
+    """Return the statistics of a video's pixels, and how often each frame stands alone.
+
+    Raises:
+        DataError: If no pixel has a label.
+    """
+    classes, total = task.mapping.target.classes, meter.pixels.sum()
+    if not total:
+        raise DataError(
+            f"{task.scene.name}, {task.model}: no pixel of {len(task.indices)} frames has a label; check the ignore id"
+            " and the taxonomy"
+        )
+    share, largest = meter.pixels / total, int(meter.pixels.argmax())
+    known = [own for own in meter.lone if own.pixels]
+    alone = np.array([own.share for own in known], np.float64)
+    frames, places = (np.array([*each], np.int64) for each in ((o.frame for o in known), (o.pixels for o in known)))
+    lone = LoneDisagreement(frames, places, alone, np.full(len(alone), mean(alone)))
+    outlying = outlying_frames(lone, len(known), name=task.scene.frame_name)
+    found = PixelStatistics(
+        meter.size, tuple(classes), outlying, classes[largest], float(share[largest]), float(1 / (share**2).sum())
+    )
+    return found, by_frame(lone, outlying)
+
+
 def _quality(stream: Stream) -> FrameQuality | None:
     if stream.quality is None:
         return None
@@ -221,7 +266,7 @@ def record_of(unit: Unit, task: Task, rows: Series, result: TileResult, analysis
         unit=unit.name,
         taxonomy=task.mapping.target.name,
         frames=len(task.indices),
-        table=sums.summary(config.voxel_size, task.mapping.target.classes, config.strata),
+        table=sums.summary(config.voxel_size if unit.fuses else math.nan, task.mapping.target.classes, config.strata),
         flicker_percent=mean(rows.column("flicker_percent")),
         fuse_ms_per_frame=mean(1e3 * rows.column("seconds")),
         stages_ms={stage: mean(1e3 * rows.column(f"{stage}_seconds")) for stage in STAGES},
@@ -246,7 +291,7 @@ def record_of(unit: Unit, task: Task, rows: Series, result: TileResult, analysis
 def in_image_space(record: Record, task: Task, result: TileResult, points: VoxelTable | Float64) -> Record:
     """Return the record with what is measured in image coordinates, and the scene's up axis."""
     image_space = ImageSpaceMeter(result.image).result(record.summary.flicker_percent)
-    up = up_axis(task.scene, points, result.poses)
+    up = up_axis(task.scene, points, result.poses) if task.scene.posed else None
     return replace(record, image_space=image_space, up=up, quality=result.quality, video_measures=result.video_measures)
 
 
@@ -280,12 +325,13 @@ def _savers(
     observations: SpotObservations | None,
     sample: MapSample | None,
     analysis: Analysis | None,
+    of_frames: OfFrames,
 ) -> Savers:
     """Return the files of a unit, of a tile, or of the pass over the frames of tiles, but for those of its map."""
     work, config, tile, savers = live.work, live.config, live.work.tile, Savers()
     unit = work.unit
     if unit.image_space and stream.overview:
-        pictures = pictures_of_outlying(live.task, config, analysis)
+        pictures = pictures_of_outlying(live.task, config, of_frames)
         if fused is not None and tile is None and observations is not None and not live.task.scene.of_scans:
             places = worst_places((fused.table,), observations, PICTURED_PLACES)
             pictures |= pictures_of_places(live.task, places, config.pixel_stride)
@@ -293,7 +339,7 @@ def _savers(
     if tile is not None and observations is not None:
         savers[f"{tile.folder}/{tile.size}_{TILE_OBSERVATIONS}"] = observations.save
     if tile is None and unit.stored:
-        savers |= unit_savers(live.task, live.rows, observations, analysis)
+        savers |= unit_savers(live.task, live.rows, observations, analysis, of_frames)
     if fused is not None and len(fused.table) and tile is not None and sample is not None:
         savers[f"{tile.folder}/{tile.name}.sample"] = sample.below(tile.bound).save
     return savers
@@ -324,11 +370,12 @@ def _map_savers(live: LiveMap, fused: FusedMap, analysis: Analysis | None) -> Sa
     return savers
 
 
-def unit_savers(task: Task, rows: Series, observations: SpotObservations | None, analysis: Analysis | None) -> Savers:
+def unit_savers(
+    task: Task, rows: Series, observations: SpotObservations | None, analysis: Analysis | None, of_frames: OfFrames
+) -> Savers:
     """Return the files of a unit that do not depend on tiles: its time series, and what statistics rest on."""
     slug = task.units[0].slug
-    of_frames = {} if analysis is None else analysis.of_frames()
-    series = partial(rows.save_csv, names=task.scene.frame_name, of_frames=of_frames)
+    series = partial(rows.save_csv, names=task.scene.frame_name, of_frames=of_frames, maps=task.scene.posed)
     savers: Savers = {f"{FRAMES}/{slug}.csv": series}
     if observations is not None:
         savers[f"{OBSERVATIONS}/{slug}.parquet"] = observations.save
@@ -348,17 +395,21 @@ def save_overview(arrays: Mapping[str, Any], path: Path) -> None:
         np.savez_compressed(temporary, **arrays)
 
 
-def pictures_of_outlying(task: Task, config: Config, analysis: Analysis | None) -> dict[str, npt.NDArray[Any]]:
+def pictures_of_outlying(task: Task, config: Config, of_frames: OfFrames) -> dict[str, npt.NDArray[Any]]:
     """Return pictures of the first frames that stand out, which are read once more, as arrays by name; none of scans.
 
     A frame is held against those of the run before and after it, the first and the last one against the two nearest.
     """
-    outlying, pictures = None if analysis is None else analysis.summary.outlying_frames, list[LonePicture]()
-    for each in () if outlying is None or task.scene.of_scans else outlying.frames[:PICTURED]:
-        at = task.indices.index(each.frame)
+    excess = {k: own["lone_percent"] - own["lone_null_percent"] for k, own in of_frames.items() if own["outlying"]}
+    outlying = sorted(excess, key=lambda frame: -excess[frame])
+    pictures, posed = list[LonePicture](), task.scene.posed
+    for frame in () if task.scene.of_scans else outlying[:PICTURED]:
+        at = task.indices.index(frame)
         start = min(max(at - 1, 0), len(task.indices) - 3)
-        others = [read(task, task.indices[k], config.pixel_stride) for k in range(start, start + 3) if k != at]
-        pictures.append(lone_picture(read(task, each.frame, config.pixel_stride, color=True), others))
+        beside = [task.indices[k] for k in range(start, start + 3) if k != at]
+        others = [read(task, index, config.pixel_stride, color=not posed) for index in beside]
+        hold = lone_picture if posed else video_picture
+        pictures.append(hold(read(task, frame, config.pixel_stride, color=True), others))
     return picture_arrays(pictures)
 
 

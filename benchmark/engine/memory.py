@@ -160,7 +160,7 @@ def planned_sizes(config: Config, missing: Iterable[Unit], width: int) -> Sizing
     """Estimate the units that are to be fused; where one cannot be read, its computation reports the error."""
     sizing, together = Sizing(), dict[object, list[Unit]]()
     for each in missing:
-        if not each.regions:  # watched units of a sequence are in memory together; others can be put off
+        if each.fuses:  # watched units of a sequence are in memory together; others can be put off
             key = (each.name.scene, each.name.model) if each.stored else each.identity
             together.setdefault(key, []).append(each)
     for group in together.values():

@@ -27,7 +27,7 @@ class FrameColumn:
     Attributes:
         key: A field of the report or the row, 'drift', or NAME_ms for NAME_seconds.
         plot: Title of its plot in the recording, with the unit; '' for a column that is not drawn.
-        of_model: Whether it is the same for all backends.
+        of_model: Whether it is the same for all backends; the others are of a map.
     """
 
     key: str
@@ -36,9 +36,9 @@ class FrameColumn:
 
 
 COLUMNS = (
-    FrameColumn("frame"),
-    FrameColumn("timestamp"),
-    FrameColumn("points"),
+    FrameColumn("frame", of_model=True),
+    FrameColumn("timestamp", of_model=True),
+    FrameColumn("points", of_model=True),
     FrameColumn("voxels"),
     FrameColumn("new_voxels", "New voxels"),
     FrameColumn("drift", "Mean drift of updates (bits)"),
@@ -53,11 +53,9 @@ COLUMNS = (
     FrameColumn("wait_ms", "Waiting for a frame (ms)", of_model=True),
     FrameColumn("association_ms", "Fusion: association (ms)"),
     FrameColumn("update_ms", "Fusion: update (ms)"),
-    FrameColumn("left_out"),
+    FrameColumn("left_out", of_model=True),
 )
 """The first columns of the file, in order; drift in bits; an undefined number is an empty field."""
-
-_KEYS = tuple(column.key for column in COLUMNS)
 
 OF_FRAMES = ("lone_percent", "lone_null_percent", "outlying")
 """The next ones, which follow from all frames (`semstab.statistics.frame_disagreement`); the last one is the name."""
@@ -144,10 +142,18 @@ class Series:
         path: Path,
         names: Callable[[int], str] = str,
         of_frames: Mapping[int, Mapping[str, float]] = MappingProxyType({}),
+        *,
+        maps: bool = True,
     ) -> None:
-        """Write COLUMNS, OF_FRAMES by index and the frames' names as text, with a header, atomically."""
+        """Write COLUMNS, OF_FRAMES by index and the frames' names as text, with a header, atomically.
+
+        Without `maps` the columns of a map are left out.
+        """
+        keys = [column.key for column in COLUMNS if maps or column.of_model]
         with atomic_path(path) as temporary, temporary.open("w", encoding="utf-8", newline="") as file:
-            writer = csv.DictWriter(file, (*_KEYS, *OF_FRAMES, "name"), lineterminator="\n")
+            writer = csv.DictWriter(
+                file, (*keys, *OF_FRAMES, "name"), extrasaction="raise" if maps else "ignore", lineterminator="\n"
+            )
             writer.writeheader()
             for row in self:
                 index = row.report.frame

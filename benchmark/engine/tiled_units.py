@@ -154,12 +154,13 @@ def assembled(
         analysis = analyse_sample(task, config, sample, observations)
     files = {name: digest for each in (frames, *tiles) for name, digest in each.files.items()}
     files = {name: digest for name, digest in files.items() if not name.startswith(tasks[0].folder)}
-    if (pictures := pictures_of_outlying(task, config, analysis)) and overview_file(task) in files:
+    of_frames = {} if analysis is None else analysis.of_frames()
+    if (pictures := pictures_of_outlying(task, config, of_frames)) and overview_file(task) in files:
         with np.load(folder / overview_file(task)) as content:
             arrays = {name: content[name] for name in content.files}
         files |= written(start, {overview_file(task): partial(save_overview, arrays | pictures)})[0]
     if unit.stored:
-        savers = unit_savers(task, rows, observations, analysis)
+        savers = unit_savers(task, rows, observations, analysis, of_frames)
         if config.statistics and analysis is not None:
             for each in tasks:
                 savers |= _with_columns(each, unit.name.slug, analysis, folder)

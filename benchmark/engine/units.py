@@ -32,10 +32,19 @@ from semstab.data.records import REGIONS, Variation
 from semstab.data.results import UnitName
 from semstab.data.statistics import CONFIDENCE
 from semstab.datasets import GROUND_TRUTH, Scene
-from semstab.errors import ConfigError
+from semstab.errors import ConfigError, DataError
 from semstab.task import Task, applies, frame_indices, open_scenes, selected, tasks_of, truth_task
 
 logger = logging.getLogger("semstab")
+
+NO_MAP = BackendConfig(name="none", check=True)
+"""Stands for the backend of units that fuse nothing."""
+
+OF_MAPS = (
+    "voxel_size", "backends", "check", "statistics", "events", "tile_size", "scope", "sweeps", "shared_taxonomy",
+    "critical_classes", "region_maps", "frame_quality",
+)  # fmt: skip
+"""Settings that a video, which has no map, does not use."""
 
 FORMAT = 13
 """Part of every key: raise it with any change of the numbers that a unit's settings and input lead to, and with a
@@ -70,6 +79,7 @@ class Unit:
         stored: Whether its voxels and its time series are stored.
         assessed: Whether its map gets statistics: one that others are only checked against gets none.
         sampled: Whether its map is checked against the reference on a sample of its voxels.
+        fuses: Whether there is a map; a video has none.
     """
 
     name: UnitName
@@ -82,6 +92,7 @@ class Unit:
     stored: bool = False
     assessed: bool = True
     sampled: bool = False
+    fuses: bool = True
 
     @classmethod
     def of(cls, variation: Variation, config: Config, task: Task, identity: str, **wanted: bool) -> Unit:
@@ -173,8 +184,10 @@ def make_plan(config: Config, scenes: Mapping[str, Scene] | None = None) -> Plan
         ConfigError, DataError, MissingDependencyError: If something does not.
     """
     for backend in config.fused_by():  # a missing engine is reported before all else
-        create(backend.name, voxel_size=config.voxel_size, num_classes=2, **backend.options)
-    scenes = open_scenes(config) if scenes is None else scenes
+        if backend != NO_MAP:
+            create(backend.name, voxel_size=config.voxel_size, num_classes=2, **backend.options)
+    scenes = open_scenes(config, posed=False) if scenes is None else scenes
+    config = fitting(config, scenes)
     _check_names(config.scene_frames, [*scenes], "scene_frames")
     base = tuple(_base_units(config, scenes))
     units = (*base, *_varied_units(config, base, scenes))
@@ -186,6 +199,18 @@ def make_plan(config: Config, scenes: Mapping[str, Scene] | None = None) -> Plan
             " exclude.classes leaves out locations by their fused class"
         )
     return Plan(config, scenes, units, tuple(_planned_regions(config, scenes)))
+
+
+def fitting(config: Config, scenes: Mapping[str, Scene]) -> Config:
+    """Return settings that fit the scenes: without depth and poses nothing is fused, and settings of maps are unset."""
+    if all(scene.posed for scene in scenes.values()):
+        return config
+    default = Config()
+    unset = {name: getattr(default, name) for name in OF_MAPS}
+    unset |= {"backends": [NO_MAP], "check": None, "check_geometry": False}
+    if unused := [name for name in OF_MAPS if getattr(config, name) not in (getattr(default, name), unset[name])]:
+        logger.warning("%s: a video has no map, so that this is not used", ", ".join(unused))
+    return config.model_copy(update=unset)
 
 
 def _base_settings(config: Config, scene: str, models: list[str] | None) -> Config:
@@ -222,8 +247,18 @@ def _base_units(config: Config, scenes: Mapping[str, Scene]) -> Iterator[Unit]:
             sampled = _is_sampled(config, config.backends[0])
             if config.video_measures == "dis" and scene.missing(task.indices[0], color=True):
                 raise ConfigError(f"{name}: there are no images for optical flow; use --video-measures depth")
+            if not scene.posed:
+                _check_video(config, task)
             wanted = {"image_space": True, "stored": True, "sampled": sampled}
+            wanted |= {"assessed": scene.posed, "fuses": scene.posed}
             yield Unit.of(Variation(BASE), one, task, identity(one, task), **wanted)
+
+
+def _check_video(config: Config, task: Task) -> None:
+    if config.video_measures == "depth":
+        raise DataError(f"{task.scene.name}: a video has no depth; use --video-measures dis")
+    if len(task.indices) < 2:
+        raise DataError(f"{task.scene.name}: a single frame is selected; flicker takes two; change 'frames'")
 
 
 def _is_sampled(config: Config, backend: BackendConfig) -> bool:
@@ -252,7 +287,7 @@ def _planned_regions(config: Config, scenes: Mapping[str, Scene]) -> Iterator[Un
             task = Task(scene, model, frames, space.mapping_to(space), ("none",))
             content = settings.model_dump(mode="json", include=OF_REGIONS, exclude_defaults=True)
             key = _hash(content, {"regions": [name, model], "frames": frames})
-            yield Unit.of(Variation(REGIONS), settings, task, key)
+            yield Unit.of(Variation(REGIONS), settings, task, key, fuses=False)
 
 
 def _varied_units(config: Config, base: Sequence[Unit], scenes: Mapping[str, Scene]) -> Iterator[Unit]:

@@ -137,7 +137,7 @@ class Work:
     @property
     def fuses(self) -> bool:
         """Return whether there is a map."""
-        return self.tile is None or self.tile.index is not None
+        return self.unit.fuses and (self.tile is None or self.tile.index is not None)
 
     @property
     def watched(self) -> bool:
@@ -172,11 +172,13 @@ def _one_line(error: Exception) -> str:
 def jobs_of(works: Iterable[Work], width: int) -> list[Job]:
     """Return work by the sequence that it reads, in as many jobs as can run at once: the largest ones are halved.
 
-    Works that observers watch stay together: they are shown a frame once it went into all of these maps.
+    Works that observers watch stay together: they are shown a frame once it went into all of these maps. The models of
+    a video stay together, too: the motion between two images is found once.
     """
     sequences: dict[tuple[str, str], list[Work]] = {}
     for work in works:
-        sequences.setdefault((work.unit.name.scene, work.unit.name.model), []).append(work)
+        name, together = work.unit.name, not (work.unit.fuses or work.unit.regions)
+        sequences.setdefault((name.scene, "" if together else name.model), []).append(work)
     jobs: list[Job] = [tuple(sequence) for sequence in sequences.values()]
     while len(jobs) < width:
         divisible = [k for k, job in enumerate(jobs) if all(_halves(job))]

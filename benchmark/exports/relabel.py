@@ -80,7 +80,8 @@ def relabel(
     result = load_result(run)
     record = result.record(scene=scene, model=model, backend=backend)
     if record.voxels_file is None:
-        raise DataError(f"{run}: the run stored no voxels of {record.unit.slug}; run it again")
+        why = "the run stored no voxels; run it again" if record.pixels is None else "a video has no map"
+        raise DataError(f"{run}: {record.unit.slug}: {why}")
     belief, name = belief or Belief(), name or f"{record.unit.model}-fused"
     with contextlib.ExitStack() as open_parts:
         task, pixel_stride = open_parts.enter_context(task_of(run, record, result.manifest["inputs"], code))

@@ -134,7 +134,8 @@ class Chosen:
         thresholds: AcceptanceThresholds | None = None,
     ) -> None:
         if record.voxels_file is None:
-            raise ConfigError(f"{record.unit.slug}: its voxels were not stored; run it with a folder")
+            why = "its voxels were not stored; run it with a folder" if record.pixels is None else "a video has no map"
+            raise ConfigError(f"{record.unit.slug}: {why}")
         self._result, self._record = result, record
         self._columns, self._join = columns, join
         self._min_op, self._classes, self._thresholds = min_op, classes, thresholds

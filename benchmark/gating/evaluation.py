@@ -43,6 +43,10 @@ def require_data(rule: Rule, new: RunHandle, base: RunHandle | None, scenes: Seq
             )
         for entry in entries:
             if not _has(rule, entry):
+                if not entry.sums.layout:
+                    raise ConfigError(
+                        f"rule '{rule.text}': {scene} is a video, without depth and poses; a rule may bound its flicker"
+                    )
                 name, few = rule.measure.name, _few_known(rule, entry)
                 raise ConfigError(
                     f"rule '{rule.text}': {entry.where} has no {name} of {scene}{few}; {rule.measure.if_missing}"
@@ -60,7 +64,7 @@ def _has(rule: Rule, entry: Entry) -> bool:
     if rule.measure.quantity is FLICKER:
         return len(entry.flicker) > 1
     if rule.measure.quantity is COVERAGE:
-        return True
+        return bool(entry.sums.layout)
     key, k = rule.measure.quantity.key, _k(rule, entry)
     if not parts_of(entry.sums, functional(key, k)):
         return False

@@ -15,7 +15,7 @@ from semstab.data.information import entropy_bits
 from semstab.data.labels import flat
 from semstab.errors import ConfigError, DataError
 from semstab.pixels.scans import dominant_before
-from semstab.pixels.warp import DEPTH_TOLERANCE, correspond
+from semstab.pixels.warp import DEPTH_TOLERANCE, Correspondence, correspond
 
 
 def flicker_percent(previous: Frame, current: Frame) -> float:
@@ -38,6 +38,13 @@ def flicker_percent(previous: Frame, current: Frame) -> float:
     return 100.0 * changed / both if both else math.nan
 
 
+def flicker_in_place(previous: Frame | None, current: Frame) -> float:
+    """Return `flicker_percent`; NaN for a first frame, for frames of two sizes, and for scans."""
+    if previous is None or previous.shape != current.shape or current.is_scan:
+        return math.nan
+    return flicker_percent(previous, current)
+
+
 @dataclass(frozen=True)
 class CompensatedFlicker:
     """Flicker between two views of the same surface points.
@@ -52,8 +59,9 @@ class CompensatedFlicker:
 
 
 def compensated_flicker(
-    previous: Frame, current: Frame, *, depth_tolerance: float = DEPTH_TOLERANCE, voxel_size: float = math.nan
-) -> CompensatedFlicker:
+    previous: Frame, current: Frame, *, depth_tolerance: float = DEPTH_TOLERANCE, voxel_size: float = math.nan,
+    seen: Correspondence | None = None,
+) -> CompensatedFlicker:  # fmt: skip
     """Return flicker after the previous frame's labels are warped into the current one: camera motion is not counted.
 
     A pixel is co-visible where it is valid, the previous camera saw the same surface point (see
@@ -63,6 +71,8 @@ def compensated_flicker(
     Scans meet by voxels of that size, in metres: a point is compared with the label that most points of the previous
     scan have in its voxel (see `semstab.pixels.scans.dominant_before`).
 
+    `seen` has the pixels of the previous frame that show the same, if they do not follow from depth and pose.
+
     Raises:
         ConfigError: If depth_tolerance is not above 0 and below 1.
     """
@@ -70,12 +80,12 @@ def compensated_flicker(
         return _between_scans(previous, current, voxel_size)
     from semstab.data.kernels import count_changed_at
 
-    seen = correspond(current, previous, depth_tolerance=depth_tolerance).pixel
-    images = (seen, current.valid, current.predicted, previous.valid, previous.predicted)
-    covisible, changed = count_changed_at(*(flat(image) for image in images))
+    seen = correspond(current, previous, depth_tolerance=depth_tolerance) if seen is None else seen
+    images = (seen.pixel, current.valid, current.predicted, previous.valid, previous.predicted)
+    both, changed = count_changed_at(*(flat(image) for image in images))
     return CompensatedFlicker(
-        100.0 * changed / covisible if covisible else math.nan,
-        covisible / valid if (valid := int(np.count_nonzero(current.valid))) else math.nan,
+        100.0 * changed / both if both else math.nan,
+        both / valid if (valid := int(np.count_nonzero(current.valid))) else math.nan,
     )
 
 
@@ -83,19 +93,21 @@ def _between_scans(previous: Frame, current: Frame, voxel_size: float) -> Compen
     valid = int(np.count_nonzero(current.valid))
     before = dominant_before(previous, current, voxel_size)
     met = before >= 0
-    covisible = int(np.count_nonzero(met))
+    both = int(np.count_nonzero(met))
     changed = int(np.count_nonzero(before[met] != current.predicted[current.valid][met]))
-    return CompensatedFlicker(
-        100.0 * changed / covisible if covisible else math.nan, covisible / valid if valid else math.nan
-    )
+    return CompensatedFlicker(100.0 * changed / both if both else math.nan, both / valid if valid else math.nan)
 
 
-def changed_pixels(previous: Frame, current: Frame, *, depth_tolerance: float = DEPTH_TOLERANCE) -> Mask:
+def covisible(previous: Frame, current: Frame, seen: Correspondence) -> Mask:
+    """Return the valid pixels (H, W) of the current frame that the previous one shows at a valid pixel."""
+    both: Mask = current.valid & seen.bring(previous.valid, fill=False)
+    return both
+
+
+def changed_pixels(previous: Frame, current: Frame, seen: Correspondence | None = None) -> Mask:
     """Return the co-visible pixels (H, W) whose label changed since the previous frame; see `compensated_flicker`."""
-    seen = correspond(current, previous, depth_tolerance=depth_tolerance).pixel.reshape(current.shape)
-    at = np.maximum(seen, 0)
-    covisible: Mask = (seen >= 0) & current.valid & previous.valid.ravel()[at]
-    changed: Mask = covisible & (previous.predicted.ravel()[at] != current.predicted)
+    seen = correspond(current, previous) if seen is None else seen
+    changed: Mask = covisible(previous, current, seen) & (seen.bring(previous.predicted) != current.predicted)
     return changed
 
 
@@ -341,6 +353,30 @@ def matched_region_flicker(
         deaths=int(np.count_nonzero(table.previous_ids)) - len(pairs),
         variation_of_information=table.variation_of_information(),
     )
+
+
+def compensated_regions(
+    previous: Frame, current: Frame, counted: tuple[Mask, Mask] | None = None
+) -> tuple[RegionChange, float]:
+    """Return the change of regions after the previous frame is warped into the current one, and the co-visible share.
+
+    `counted` has the pixels of the previous and of the current frame that count, all by default; the share is of the
+    current ones.
+    """
+    seen = correspond(current, previous)
+    before, now = counted or (np.ones(previous.shape, bool), np.ones(current.shape, bool))
+    both, pixels = now & seen.bring(before, fill=False), np.count_nonzero(now)
+    change = matched_region_flicker(seen.bring(previous.predicted), current.predicted, both)
+    return change, np.count_nonzero(both) / pixels if pixels else math.nan
+
+
+def region_flicker(previous: Frame, current: Frame) -> tuple[float, float, float]:
+    """Return flicker of matched regions in place and with the camera's motion removed, percent, and the share."""
+    change, share = compensated_regions(previous, current, (previous.valid, current.valid))
+    if previous.shape != current.shape:
+        return math.nan, change.flicker_percent, share
+    plain = matched_region_flicker(previous.predicted, current.predicted, previous.valid & current.valid)
+    return plain.flicker_percent, change.flicker_percent, share
 
 
 @dataclass(frozen=True, eq=False)

@@ -5,17 +5,17 @@ from __future__ import annotations
 import dataclasses
 import math
 from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
 from semstab.core.arrays import Rows
-from semstab.core.types import Mask
+from semstab.core.types import Mask, UInt8
 from semstab.data.frames import Frame
 from semstab.data.measures import mean
 from semstab.data.records import ImageSpace
-from semstab.data.videos import LonePicture
 from semstab.metrics.flicker import (
     CompensatedFlicker,
     SelfConsistency,
@@ -103,9 +103,26 @@ def mean_over_scenes(rows: Iterable[ImageSpace]) -> ImageSpace:
     return ImageSpace(**{name: macro_mean([getattr(row, name) for row in known]) for name in names})
 
 
+@dataclass(frozen=True, eq=False)
+class LonePicture:
+    """A frame as a small picture, with the pixels at which it stands alone.
+
+    Attributes:
+        frame: Its index.
+        labels: (h, w) rows 0..K-1, and above where a pixel has none.
+        alone: (h, w) pixels whose label differs from that of each other frame, which all see the same surface point.
+        color: (h, w, 3) its image; None without an image.
+    """
+
+    frame: int
+    labels: npt.NDArray[Any]
+    alone: Mask
+    color: UInt8 | None
+
+
 def lone_picture(frame: Frame, others: Sequence[Frame]) -> LonePicture:
     """Hold a frame against others, with the camera's motion removed."""
-    sample = frame.every(-(-max(frame.shape) // SIDE))
+    sample = frame.within(SIDE)
     alone = np.logical_and.reduce([changed_pixels(other, sample) for other in others])
     return picture_of(frame, sample, alone)
 

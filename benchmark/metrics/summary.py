@@ -73,6 +73,14 @@ class TableSums:
     confusion: Float64
 
     @classmethod
+    def nothing(cls, K: int, edges: Sequence[int] = STRATA) -> TableSums:
+        """Return the sums of no voxel, of K classes."""
+        groups = (len(edges) + 1, K, 2, len(_steps(edges)) + 1)
+        stratum, kind, recurrence, step = (np.zeros((1 + 3 * len(measures()), n)) for n in groups)
+        C = K if K <= MOST_CONFUSED else 0
+        return cls(np.zeros(3), stratum, kind, recurrence, step, np.zeros(len(CATEGORIES)), np.zeros((C, C)))
+
+    @classmethod
     def of(cls, table: VoxelTable, edges: Sequence[int] = STRATA) -> TableSums:
         """Return the sums of a table."""
         steps = _steps(edges)

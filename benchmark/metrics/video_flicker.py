@@ -5,43 +5,16 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 
-from semstab.core.types import Float32, Mask
+from semstab.core.types import Float32
 from semstab.data.frames import Frame
-from semstab.data.videos import LonePicture
-from semstab.metrics.flicker import CompensatedFlicker
-from semstab.metrics.image_space import SIDE, ImageSpaceMeter, picture_of
+from semstab.metrics.flicker import CompensatedFlicker, changed_pixels, compensated_flicker, covisible
+from semstab.metrics.image_space import SIDE, ImageSpaceMeter, LonePicture, picture_of
 from semstab.metrics.temporal_consistency import image_flow, occluded
 from semstab.metrics.video_measures import image_of
-
-
-@dataclass(frozen=True, eq=False)
-class Motion:
-    """The motion from an image to another one.
-
-    Attributes:
-        pixel: (H, W) row of the pixel of the other image that shows the same, in its ravelled pixels.
-        seen: (H, W) whether the other image shows it: inside, and not hidden.
-    """
-
-    pixel: npt.NDArray[np.int64]
-    seen: Mask
-
-    @classmethod
-    def of(cls, flow: Float32, back: Float32) -> Motion:
-        """Return the motion of a flow (H, W, 2), pixels, with the flow back from the other image."""
-        H, W = flow.shape[:2]
-        column = np.clip(np.rint(np.arange(W) + flow[..., 0]), 0, W - 1).astype(np.int64)
-        row = np.clip(np.rint(np.arange(H)[:, None] + flow[..., 1]), 0, H - 1).astype(np.int64)
-        return cls(row * W + column, ~occluded(flow, back))
-
-    def bring(self, values: npt.NDArray[Any]) -> npt.NDArray[Any]:
-        """Return the other image's values (H, W) at the pixels that show the same."""
-        return np.asarray(values.ravel()[self.pixel])
+from semstab.pixels.warp import Correspondence
 
 
 @dataclass(frozen=True)
@@ -59,6 +32,14 @@ class LonePixels:
     share: float
 
 
+def by_flow(flow: Float32, back: Float32) -> Correspondence:
+    """Return the pixels of another image that show the same, by the flow (H, W, 2) to it, pixels, and the flow back."""
+    H, W = flow.shape[:2]
+    column = np.clip(np.rint(np.arange(W) + flow[..., 0]), 0, W - 1).astype(np.int32)
+    row = np.clip(np.rint(np.arange(H)[:, None] + flow[..., 1]), 0, H - 1).astype(np.int32)
+    return Correspondence(np.where(occluded(flow, back), np.int32(-1), row * np.int32(W) + column))
+
+
 class Flows:
     """The motions between the two images that were asked for last: all models of a video share them.
 
@@ -67,16 +48,16 @@ class Flows:
 
     def __init__(self) -> None:
         self._pair: tuple[int, int, tuple[int, ...]] | None = None
-        self._motions: tuple[Motion, Motion] | None = None
+        self._seen: tuple[Correspondence, Correspondence] | None = None
 
-    def between(self, frame: Frame, other: Frame, shape: tuple[int, int]) -> tuple[Motion, Motion]:
-        """Return the motion from a frame's image to another's and back, at (H, W) pixels."""
+    def between(self, frame: Frame, other: Frame, shape: tuple[int, int]) -> tuple[Correspondence, Correspondence]:
+        """Return the pixels of another image that show what a frame shows, and the reverse, at (H, W) pixels."""
         pair = frame.index, other.index, shape
-        if self._motions is None or pair != self._pair:
+        if self._seen is None or pair != self._pair:
             images = image_of(frame, shape), image_of(other, shape)
             there, back = image_flow(*images), image_flow(*images[::-1])
-            self._pair, self._motions = pair, (Motion.of(there, back), Motion.of(back, there))
-        return self._motions
+            self._pair, self._seen = pair, (by_flow(there, back), by_flow(back, there))
+        return self._seen
 
 
 class VideoFlickerMeter(ImageSpaceMeter):
@@ -86,14 +67,24 @@ class VideoFlickerMeter(ImageSpaceMeter):
 
     Attributes:
         lone: How much of each frame stands alone, but of the first and the last, and beside a change of the size.
+        pixels: (K,) labelled pixels of each class.
+        size: (width, height) of the last image.
     """
 
-    def __init__(self, flows: Flows | None = None) -> None:
+    def __init__(self, num_classes: int, flows: Flows | None = None) -> None:
         super().__init__()
         self.lone: list[LonePixels] = []
+        self.pixels, self.size = np.zeros(num_classes, np.int64), (0, 0)
         self._flows = flows or Flows()
-        self._earlier: tuple[Frame, Motion] | None = None
-        """The sample two frames ago, and the motion to it from the last frame."""
+        self._earlier: tuple[Frame, Correspondence] | None = None
+        """The sample two frames ago, and its pixels that show what the last frame shows."""
+
+    def add(self, frame: Frame, truth: Frame | None) -> float:
+        """Add the next frame, and its truth in the same label space if there is any; return compensated flicker."""
+        height, width = frame.shape if frame.color is None else frame.color.shape[:2]
+        self.size, K = (width, height), len(self.pixels)
+        self.pixels += np.bincount(frame.predicted[frame.valid], minlength=K)[:K]
+        return super().add(frame, truth)
 
     def between(self, previous: Frame, frame: Frame, sample: Frame) -> CompensatedFlicker:
         """Return flicker of the sample's pixels that the frame before shows, too."""
@@ -101,45 +92,30 @@ class VideoFlickerMeter(ImageSpaceMeter):
         if before.shape != sample.shape:
             self._earlier = None
             return CompensatedFlicker(math.nan, math.nan)
-        motion, to_next = self._flows.between(frame, previous, sample.shape)
+        seen, to_next = self._flows.between(frame, previous, sample.shape)
         if self._earlier is not None:
             self.lone.append(lone_pixels(before, [self._earlier, (sample, to_next)]))
-        self._earlier = before, motion
-        both = _met(sample, before, motion)
-        changed = np.count_nonzero(both & (motion.bring(before.predicted) != sample.predicted))
-        pixels, valid = np.count_nonzero(both), np.count_nonzero(sample.valid)
-        return CompensatedFlicker(
-            100.0 * changed / pixels if pixels else math.nan, pixels / valid if valid else math.nan
-        )
+        self._earlier = before, seen
+        return compensated_flicker(before, sample, seen=seen)
 
     def recall(self, sample: Frame) -> float:
         """Return NaN: there are no edges of depth."""
         return math.nan
 
 
-def lone_pixels(frame: Frame, neighbours: Sequence[tuple[Frame, Motion]]) -> LonePixels:
-    """Return how much of a frame differs from two neighbours that agree, given with the motions to them."""
-    both, alone = _alone(frame, neighbours)
+def lone_pixels(frame: Frame, neighbours: Sequence[tuple[Frame, Correspondence]]) -> LonePixels:
+    """Return how much of a frame differs from two neighbours that agree, given with the pixels that show the same."""
+    (first, in_first), (second, in_second) = neighbours
+    both = covisible(first, frame, in_first) & covisible(second, frame, in_second)
+    one, other = in_first.bring(first.predicted), in_second.bring(second.predicted)
     pixels = int(np.count_nonzero(both))
-    return LonePixels(frame.index, pixels, np.count_nonzero(alone) / pixels if pixels else math.nan)
+    alone = np.count_nonzero(both & (one == other) & (one != frame.predicted))
+    return LonePixels(frame.index, pixels, alone / pixels if pixels else math.nan)
 
 
 def video_picture(frame: Frame, others: Sequence[Frame]) -> LonePicture:
-    """Return a frame as a picture, with the pixels at which two others agree on another label."""
+    """Hold a frame against others, with the motion between their images removed."""
     sample, flows = frame.within(SIDE), Flows()
-    neighbours = [(other.within(SIDE), flows.between(frame, other, sample.shape)[0]) for other in others]
-    return picture_of(frame, sample, _alone(sample, neighbours)[1])
-
-
-def _alone(frame: Frame, neighbours: Sequence[tuple[Frame, Motion]]) -> tuple[Mask, Mask]:
-    """Return the pixels (H, W) that both neighbours show, and those of them where they agree on another label."""
-    (first, to_first), (second, to_second) = neighbours
-    both = _met(frame, first, to_first) & _met(frame, second, to_second)
-    one, other = to_first.bring(first.predicted), to_second.bring(second.predicted)
-    return both, both & (one == other) & (one != frame.predicted)
-
-
-def _met(frame: Frame, other: Frame, motion: Motion) -> Mask:
-    """Return the labelled pixels (H, W) that the other frame shows, with a label there."""
-    met: Mask = motion.seen & frame.valid & motion.bring(other.valid)
-    return met
+    seen = [flows.between(frame, other, sample.shape)[0] for other in others]
+    changed = [changed_pixels(other.within(SIDE), sample, own) for other, own in zip(others, seen, strict=True)]
+    return picture_of(frame, sample, np.logical_and.reduce(changed))

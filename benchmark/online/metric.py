@@ -22,15 +22,13 @@ from semstab.data.measures import SBD, VSS, mean
 from semstab.data.voxels import VoxelTable, index_columns
 from semstab.errors import ConfigError, DataError
 from semstab.metrics import compensated_flicker, summarise
+from semstab.metrics.image_space import SIDE
 from semstab.online.frames import as_array
 from semstab.online.summary import Summary
 from semstab.statistics import MapSample, Sampler, SpotObservations, Views, analyse, psa
 from semstab.statistics.accumulate import sums_of_spots
 from semstab.statistics.cluster_sums import value
 from semstab.statistics.sampler import BUDGET
-
-SIDE = 640
-"""The most pixels a side for flicker: it is measured on every n-th pixel of larger frames, as in a run."""
 
 MOST_VOXELS = 2_000_000
 

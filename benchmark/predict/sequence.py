@@ -20,8 +20,8 @@ from semstab.core.files import content_key, csv_text, write_text
 from semstab.core.prefetch import prefetch
 from semstab.datasets.formats.images import read_labels
 from semstab.metrics import RegionChange, macro_mean, matched_region_flicker
+from semstab.metrics.flicker import compensated_regions
 from semstab.models import Model, Streamed, ask, streamed
-from semstab.pixels.warp import warp
 from semstab.predict.folder import Kind, PredictionFolder, ScoreType, largest_only, resized
 from semstab.predict.images import ImageSequence, Picture, first_images, picture
 
@@ -77,8 +77,7 @@ def region_series(sequence: ImageSequence, indices: Sequence[int], file: Callabl
         plain.append(matched_region_flicker(previous, current))
         source, target = sequence.predicted(a, labels=previous), sequence.predicted(b, labels=current)
         if source is not None and target is not None:
-            brought, visible = warp(source.predicted, source, target)
-            compensated.append(matched_region_flicker(brought, target.predicted, visible))
+            compensated.append(compensated_regions(source, target)[0])
     return RegionSeries(names, tuple(plain), tuple(compensated))
 
 

@@ -33,10 +33,9 @@ from semstab.recording.layout import record_changes
 from semstab.recording.observer import Recording, lacks_pictures, record_finished
 from semstab.recording.target import Target, viewer_command
 from semstab.recording.timeline import SERIES
-from semstab.recording.videos import VideoRecording
 from semstab.recording.voxel_maps import color_modes
 
 __all__ = [
-    "SERIES", "Recording", "Target", "VideoRecording", "color_modes", "lacks_pictures", "record_changes",
+    "SERIES", "Recording", "Target", "color_modes", "lacks_pictures", "record_changes",
     "record_finished", "viewer_command",
 ]  # fmt: skip

@@ -74,7 +74,7 @@ class SceneLog:
         self._translation: Float64 = np.zeros(3)
         self._poses: dict[int, Float64] = {}
         self._intrinsics: tuple[Intrinsics, tuple[int, int]] | None = None
-        self._unread = False
+        self._unread, self._posed = False, tasks[0].scene.posed
 
     def log_static(self, stream: rr.RecordingStream) -> None:
         """Log the parts that hold in all frames: axes, legends, names and colours."""
@@ -114,6 +114,10 @@ class SceneLog:
         """Log the frame's pose, camera, colour and depth once, and the track up to it."""
         if frame.index in self._poses:
             return
+        if not self._posed:
+            self._poses[frame.index] = frame.T_wc
+            background.submit(frame.index, frame.timestamp, functools.partial(self._log_color, stream, frame))
+            return
         pose = self._poses[frame.index] = frame.T_wc.copy()
         pose[:3, 3] -= self._translation
         if self._intrinsics != (frame.intrinsics, frame.shape):
@@ -136,6 +140,9 @@ class SceneLog:
         depth = frame.depth[::stride, ::stride]
         depth = np.where(depth <= np.finfo(np.float16).max, depth, 0).astype(np.float16)  # to 0.05 %
         stream.log(path(self.name, "depth"), rr.DepthImage(depth, meter=1.0, colormap="turbo"))
+        self._log_color(stream, frame)
+
+    def _log_color(self, stream: rr.RecordingStream, frame: Frame) -> None:
         try:
             jpeg = color_of(frame)
         except DataError as error:

@@ -23,7 +23,7 @@ from semstab.engine.units import Plan
 from semstab.metrics import CATEGORIES, CATEGORY_COLORS
 from semstab.recording.drift import PICTURES
 from semstab.recording.target import Target, flush
-from semstab.recording.timeline import SERIES, entity, path
+from semstab.recording.timeline import OF_VIDEOS, SERIES, entity, path
 from semstab.recording.voxel_maps import CHUNKS, DIFFERENCE, chunk, color_modes, defaults, packed, thinned, visualizer
 from semstab.task import Task
 
@@ -247,6 +247,8 @@ def _scene(
     bounds: SceneBounds | None,
     not_assessed: Set[tuple[str, str]],
 ) -> rrb.Container:
+    if not tasks[0].scene.posed:
+        return _video(scene, tasks)
     flips = [_flips(scene, task, bounds) for task in tasks]
     comparisons = [
         _comparison(task, drawn(task), other, bounds)
@@ -255,6 +257,16 @@ def _scene(
         if other != drawn(task)
     ]
     return rrb.Tabs(_overview(scene, tasks, legend, bounds, not_assessed), *flips, *comparisons, name=scene)
+
+
+def _video(scene: str, tasks: list[Task]) -> rrb.Container:
+    """Return a video: the image and the label maps above, the answer and the series below."""
+    camera = path(scene, "camera")
+    views: list[rrb.View] = [rrb.Spatial2DView(origin=camera, contents=[f"{camera}/color"], name="Image")]
+    views += [_labels(scene, task) for task in tasks]
+    verdict = rrb.TextDocumentView(origin=path(scene, VERDICT), name="Answer")
+    plots = [_plot(scene, name, tasks) for name in OF_VIDEOS if not name.endswith("_ms")]
+    return rrb.Vertical(rrb.Grid(*views), rrb.Horizontal(verdict, *plots), name=scene, row_shares=[3, 2])
 
 
 def _overview(
@@ -344,14 +356,21 @@ def _camera(scene: str, task: Task, picture: str, over: list[str]) -> list[rrb.V
             rrb.Spatial3DView(origin=origin, contents=[f"{entity}/points"], background=BACKGROUND, name=title)
             for entity, title in titles.items()
         ]
-    seen_through: Any = {labels: rr.SegmentationImage.from_fields(opacity=0.6).visualizer()}
     title = f"{task.model}: {PICTURES[picture]}"
     return [
-        rrb.Spatial2DView(
-            origin=origin, contents=[color, labels], overrides=seen_through, name=f"{task.model}: labels"
-        ),
+        _labels(scene, task),
         rrb.Spatial2DView(origin=origin, contents=[color, shown, *over], name=title),
     ]
+
+
+def _labels(scene: str, task: Task) -> rrb.View:
+    """Return the labels of a model over the image."""
+    labels = path(scene, "camera", task.model, "labels")
+    seen_through: Any = {labels: rr.SegmentationImage.from_fields(opacity=0.6).visualizer()}
+    contents = [path(scene, "camera", "color"), labels]
+    return rrb.Spatial2DView(
+        origin=path(scene, "camera"), contents=contents, overrides=seen_through, name=f"{task.model}: labels"
+    )
 
 
 def _below(scene: str, tasks: list[Task]) -> rrb.Container:
@@ -381,7 +400,7 @@ def _plot(scene: str, name: str, tasks: list[Task]) -> rrb.TimeSeriesView:
     return rrb.TimeSeriesView(
         origin=path(scene, "series", name),
         contents=list(dict.fromkeys(lines)),
-        name=SERIES[name].plot,
+        name=(SERIES | OF_VIDEOS)[name].plot,
         plot_legend=legend,
     )
 

@@ -186,6 +186,7 @@ class Recording(Observer):
         self._group: GroupLog | None = None  # the model on a scene that is being fused
         self._unfinished: set[UnitName] = set()  # of the group
         self._logged: set[UnitName] = set()
+        self._live: set[UnitName] = set()  # units whose rows were logged frame by frame
         self._not_assessed: set[tuple[str, str]] = set()  # scenes and models
         self._sent, self._outdated = 0, False  # layouts; whether maps have been finished since the last one
         self._others = "all other files are complete, and the same command makes the recording again"
@@ -206,13 +207,16 @@ class Recording(Observer):
 
     def frame_fused(self, task: Task, frame: Frame, rows: Mapping[UnitName, FrameRow]) -> None:
         """Log a row of each time series, the camera, and the map."""
+        self._live |= {*rows}
         voxels = next((row.report.map_voxels for unit, row in rows.items() if unit.backend == self._drawn(task)), 0)
         self._log_frame(task, frame, rows, voxels)
 
     def _log_frame(self, task: Task, frame: Frame, rows: Mapping[UnitName, FrameRow], voxels: int) -> None:
         stream, background = self._opened()
         self._clock.set(stream, frame.index, frame.timestamp)
-        group = self._group or self._begin(task, frame.T_wc[:3, 3])
+        group = self._group
+        if group is None or group.task.model != task.model:  # the models of a video take turns
+            group = self._begin(task, frame.T_wc[:3, 3])
         self._scenes[task.scene.name].log(stream, frame, background)
         group.log(stream, frame, rows, voxels, background)
 
@@ -268,9 +272,11 @@ class Recording(Observer):
             group = self._group or self._begin(task)
             for record in records:
                 if record.series is not None:
-                    timeline.log_file(stream, record.unit, task, record.series, self._clock)
-                factor, table = load_map(record, group.origin)
-                self._log_unit(group, record.summary, table, factor)
+                    only = ("lone_percent",) if record.unit in self._live and record.pixels is not None else ()
+                    timeline.log_file(stream, record.unit, task, record.series, self._clock, only)
+                if record.pixels is None:
+                    factor, table = load_map(record, group.origin)
+                    self._log_unit(group, record.summary, table, factor)
             self._end_group()
         for scene in self._scenes:
             verdict = rr.TextDocument(verdict_report(result, scene), media_type=rr.MediaType.MARKDOWN)
@@ -327,7 +333,7 @@ class Recording(Observer):
         stream, _ = self._opened()
         scene, voxel_size = self._scenes[task.scene.name], self._plan.config.voxel_size
         if position is None:
-            position = task.scene.T_wc(task.indices[0])[:3, 3]
+            position = task.scene.T_wc(task.indices[0])[:3, 3] if task.scene.posed else np.zeros(3)
         origin = scene.begin(stream, position, voxel_size)
         self._group = GroupLog(self._planned(task), voxel_size, origin, self._fused)
         return self._group
@@ -344,10 +350,11 @@ class Recording(Observer):
     def _replay_frames(self, task: Task, summary: UnitSummary) -> None:
         """Read and fuse the frames of a task again; where the map would not fit into memory, drift is left out."""
         config, scene, K = self._plan.config, task.scene.name, summary.table.K
+        posed = task.scene.posed
         fits = expected_bytes(REPLAY, summary.table.voxels, 0, K, soft=True) < available_bytes() / 2
-        self._fused = create(REPLAY, voxel_size=config.voxel_size, num_classes=K) if fits else None
+        self._fused = create(REPLAY, voxel_size=config.voxel_size, num_classes=K) if fits and posed else None
         frames = prefetch(
-            lambda index: read(task, index, config.pixel_stride),
+            lambda index: read(task, index, config.pixel_stride, color=not posed),
             task.indices, threads=config.threads, size=lambda frame: frame.nbytes,
         )  # fmt: skip
         with contextlib.closing(frames):
@@ -431,6 +438,7 @@ class _ClosedScene:
     models: tuple[str, ...]
     up: Float64 | None
     of_scans: bool = False
+    posed: bool = True
 
     def T_wc(self, index: int) -> Float64:
         """Return the world's origin: poses are not in the folder."""
@@ -460,8 +468,9 @@ def _plan_of(run: Path, config: Config, result: Result) -> Plan:
     units = []
     for record in (*result.select(), *result.select(BACKENDS)):
         unit, up = record.unit, result.up.get(record.unit.scene)
-        scene = _ClosedScene(unit.scene, result.models, None if up is None else np.array(up))
-        classes = next(record.tiles()).classes
+        axis, posed = None if up is None else np.array(up), record.pixels is None
+        scene = _ClosedScene(unit.scene, result.models, axis, posed=posed)
+        classes = next(record.tiles()).classes if record.pixels is None else record.pixels.classes
         space = LabelSpace(record.summary.taxonomy, classes)
         if config.taxonomy is not None:
             with contextlib.suppress(SemstabError):

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import csv
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -86,21 +86,29 @@ UPDATED = FrameColumn("updated_voxels", "Updated voxels")
 SERIES = {column.key: column for column in (*COLUMNS, UPDATED) if column.plot}
 """The time series by name."""
 
+OF_VIDEOS = {name: column for name, column in SERIES.items() if column.plot and column.of_model}
+OF_VIDEOS |= {"lone_percent": FrameColumn("lone_percent", "Alone (%)", of_model=True)}
+"""The time series of videos, which have no map; how often a frame stands alone follows from all frames."""
+
 
 def entity(name: str, unit: UnitName) -> str:
     """Return the entity of a series."""
-    backend = () if SERIES[name].of_model else (unit.backend,)
+    backend = () if name in OF_VIDEOS else (unit.backend,)
     return path(unit.scene, "series", name, unit.model, *backend)
 
 
 def columns(unit: UnitName, task: Task) -> list[str]:
     """Return the names of the unit's series."""
-    return [name for name, own in SERIES.items() if not own.of_model or unit.backend == task.backends[0]]
+    if not task.scene.posed:
+        return [*OF_VIDEOS]
+    return [name for name in SERIES if name not in OF_VIDEOS or unit.backend == task.backends[0]]
 
 
 def log_row(stream: rr.RecordingStream, unit: UnitName, task: Task, cells: Mapping[str, Any]) -> None:
     """Log the defined values of a row of the CSV at the stream's time."""
-    row = {**cells, "updated_voxels": float(cells["voxels"]) - float(cells["new_voxels"])}
+    row = {**cells}
+    if task.scene.posed:
+        row["updated_voxels"] = float(cells["voxels"]) - float(cells["new_voxels"])
     for name in columns(unit, task):
         if row.get(name) not in (None, ""):
             stream.log(entity(name, unit), rr.Scalars(float(row[name])))
@@ -123,8 +131,10 @@ def read_rows(file: Path) -> list[tuple[int, float | None, dict[str, str]]]:
         raise _damaged(file, error) from error
 
 
-def log_file(stream: rr.RecordingStream, unit: UnitName, task: Task, file: Path, clock: Clock) -> None:
-    """Log a unit's time series from its CSV.
+def log_file(
+    stream: rr.RecordingStream, unit: UnitName, task: Task, file: Path, clock: Clock, only: Sequence[str] = ()
+) -> None:
+    """Log a unit's time series from its CSV, all of them or `only` some.
 
     Raises:
         DataError: If it is damaged.
@@ -132,7 +142,7 @@ def log_file(stream: rr.RecordingStream, unit: UnitName, task: Task, file: Path,
     for frame, timestamp, cells in read_rows(file):
         try:
             clock.set(stream, frame, timestamp)
-            log_row(stream, unit, task, cells)
+            log_row(stream, unit, task, {name: cells[name] for name in only} if only else cells)
         except (LookupError, TypeError, ValueError, OverflowError) as error:
             raise _damaged(file, error) from error
 
@@ -150,6 +160,6 @@ def log_styles(stream: rr.RecordingStream, plan: Plan) -> None:
             # The lines of backends that agree coincide; the viewer draws them by name, so each line is thinner.
             width = 2.0 + 2.5 * sum(backend > unit.backend for backend in task.backends)
             for name in columns(unit, task):
-                label = unit.model if SERIES[name].of_model else f"{unit.model}, {unit.backend}"
+                label = unit.model if name in OF_VIDEOS else f"{unit.model}, {unit.backend}"
                 line = rr.SeriesLines(colors=color, names=label, widths=width)
                 stream.log(entity(name, unit), line, static=True)

@@ -286,6 +286,8 @@ PENDING = "The verdict follows when all frames are fused."
 
 def verdict_report(result: Result, scene: str) -> str:
     """Return the answer of a run, and the verdict of each model on a scene, in Markdown, as the terminal has them."""
+    if not result.maps.records:
+        return "\n".join(f"{line}\n" for line in answers(result))
     rows = [row_of(record) for record in result.select(scene=scene)]
     heads = (f"| {' | '.join(head for head, _ in columns()[:TEXTS])} |", f"|{'---|' * TEXTS}")
     table = [f"| {' | '.join(row[:TEXTS])} |" for row in rows]

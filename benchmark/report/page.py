@@ -20,6 +20,7 @@ from semstab.data.results import slug
 from semstab.data.statistics import CONFIDENCE, Estimate, MapStatistics, short
 from semstab.data.topdown import EMPTY
 from semstab.metrics import CATEGORIES, CATEGORY_COLORS, NOT_ASSESSED, categories, macro_mean
+from semstab.metrics.image_space import mean_over_scenes
 from semstab.report.charts import Line, dot_chart, line_chart, sample
 from semstab.report.figures.located import Located
 from semstab.report.figures.maps import Overview, Views
@@ -81,7 +82,7 @@ def render(
         scenes=shown,
         maps=_script([_for_script(unit) for scene in shown for unit in scene["maps"]]),
         layers=_script({"categories": CATEGORIES, "colors": CATEGORY_COLORS, "sbd": SBD_END}),
-        charts_all=[*_by_op(result), *_sweeps(result)],
+        charts_all=[*_by_op(result.maps), *_sweeps(result.maps)],
         tables=views,
         failures=[_failure(row) for row in result.failures],
         facts=list(_facts(result.manifest)),
@@ -113,7 +114,7 @@ def _card(model: str, records: Sequence[Record]) -> dict[str, Any]:
     one = assessed[0] if len(assessed) == 1 else None
     return {
         "model": model,
-        "scenes": [_scene_verdict(record) for record in records[:12]],
+        "scenes": [_scene_verdict(record) for record in records[:12] if record.pixels is None],
         "more": max(0, len(records) - 12),
         "reasons": relations(one.verdict.line.partition(": ")[2]) if one is not None else "",
         "numbers": [(name, value, note) for name, value, note in _numbers(records, assessed, one) if value],
@@ -155,7 +156,15 @@ def _numbers(
         value, note = one.told_ranges.parts
         yield "reliable", value, note
     flicker = [record.image_space.compensated_flicker_percent for record in records]
-    yield "flicker", mean(flicker, "{:.1f} %"), f"of the {records[0].image_space.changing}, motion removed"
+    of_images = all(record.pixels is not None for record in records)
+    yield (
+        "flicker",
+        mean(flicker, "{:.2f} %" if of_images else "{:.1f} %"),
+        f"of the {records[0].image_space.changing}, motion removed",
+    )
+    if of_images:
+        yield from _of_images(records)
+        return
     together = pooled(records)
     yield "seen 3 times or more", f"{100 * together.recurrent.share:.0f} %", f"of {together.voxels:,} voxels"
     enough = together.recurrent.voxels >= ENOUGH
@@ -168,6 +177,19 @@ def _numbers(
     yield MIOU.named, short(macro_mean(right), digits=MIOU.digits[0]), "of the fused labels"
     wrong = [stats.headline.wrong_of_consistent_op3.value for stats in assessed]
     yield "consistent but wrong", mean(wrong, "{:.1f} %", 100), "of the consistent locations"
+
+
+def _of_images(records: Sequence[Record]) -> Iterator[tuple[str, str, str]]:
+    """Yield the further rows of a card of videos."""
+    mean = mean_over_scenes(record.image_space for record in records)
+    for name, value, form, note in (
+        ("pixel flicker", mean.flicker_percent, "{:.2f} %", "of the pixels per frame, motion included"),
+        ("co-visible", 100 * mean.compensated_share, "{:.0f} %", "of the pixels, in the frame before"),
+        ("VC8", mean.self_vc8, "{:.3f}", "of the pixels keep their label for 8 frames"),
+        ("VC16", mean.self_vc16, "{:.3f}", "for 16 frames"),
+        ("VC8, truth", mean.vc8, "{:.3f}", "where the truth stays the same"),
+    ):
+        yield name, "" if math.isnan(value) else form.format(value), note
 
 
 # --- A scene: the map, the time line, the classes ---------------------------------------------------------------------
@@ -199,6 +221,7 @@ def _scenes(result: Result, folder: Path, above: Mapping[str, FromAbove]) -> Ite
                 for record in drawn
             ],
             "unknown_up": up is None,
+            "video": all(record.pixels is not None for record in records),
             "models": _legend(result.models) if len(result.models) > 1 else [],
             "timeline": list(_timeline(records, colors)),
             "outlying": [text for record in records for text in _outlying(record, alone=len(records) == 1)],
@@ -289,20 +312,20 @@ def _timeline(records: Sequence[Record], colors: Mapping[str, int]) -> Iterator[
 
 def _outlying(record: Record, *, alone: bool) -> Iterator[str]:
     """Yield a sentence on the frames that stand out."""
-    outlying = None if record.statistics is None else record.statistics.outlying_frames
-    if outlying is not None:
+    if (outlying := record.outlying_frames) is not None:
         yield outlying_line(outlying, "" if alone else record.unit.model, most=len(outlying.frames))
 
 
 def _lone(record: Record, overview: Overview | None) -> Iterator[dict[str, Any]]:
     """Yield frames that stand out as small images: the image, its labels, and the pixels where it stands alone."""
-    outlying = None if record.statistics is None else record.statistics.outlying_frames
+    outlying = record.outlying_frames
     if overview is None or overview.lone is None or outlying is None:
         return
     lone, named = overview.lone, {each.frame: each for each in outlying.frames}
     for k, frame in enumerate(lone.frames.tolist()):
         outlier, color = named[frame], None if lone.color is None else lone.color[k]
         shares = f"alone at {100 * outlier.share:.0f} % of its places, other frames there at {100 * outlier.null:.0f} %"
+        shares = shares if record.pixels is None else f"alone at {100 * outlier.share:.0f} % of its pixels"
         pictures = lone_pictures(color, lone.labels[k], lone.alone[k], overview.palette)
         yield {"title": f"{record.unit.model}, {outlier.name}: {shares}", "pictures": pictures}
 
@@ -408,9 +431,11 @@ def _subtitle(result: Result) -> str:
     if records := result.select():
         run = records[0].summary
         classes = " and ".join(map(str, sorted({record.summary.table.K for record in records})))
-        parts += [f"{run.frames} frames", f"{classes} classes", f"voxels of {run.table.voxel_size:g} m"]
+        parts += [f"{run.frames} frames", f"{classes} classes"]
+        fused = [f"voxels of {run.table.voxel_size:g} m", f"fused by {result.backend}"]
+        parts += ["no depth, no poses"] if records[0].pixels is not None else fused
     definition = [f"definition {result.benchmark.partition('(')[2].rstrip(')')}"] if result.benchmark else []
-    return " · ".join([*parts, f"fused by {result.backend}", *definition])
+    return " · ".join([*parts, *definition])
 
 
 def _failure(failure: Failure) -> dict[str, str]:

@@ -12,6 +12,8 @@ from semstab.data.statistics import Estimate, short
 from semstab.metrics import macro_mean
 from semstab.report.filter_study import filter_studies
 from semstab.report.means import ENOUGH, by_model, pooled
+from semstab.report.narrative import nearly_all
+from semstab.statistics.verdict import LEAST_CLASSES
 
 
 def ranking(result: Result) -> Ranking:
@@ -20,7 +22,10 @@ def ranking(result: Result) -> Ranking:
 
 
 def answers(result: Result) -> Iterator[str]:
-    """Yield the answer: the difference of two models, or the ranks of more."""
+    """Yield the answer: the difference of two models, or the ranks of more; of videos the order by flicker."""
+    if not result.maps.records:
+        yield from _by_flicker(result)
+        return
     ranked = ranking(result)
     known = [each for each in ranked.differences if not math.isnan(each.low)]
     if len(ranked.differences) == 1 and known:
@@ -56,6 +61,35 @@ def answers(result: Result) -> Iterator[str]:
         yield f"not compared, as their classes differ: {', '.join(ranked.apart)}"
     elif ranked.apart:
         yield f"not compared, as the classes of the others differ: {', '.join(ranked.apart)}"
+
+
+def _by_flicker(result: Result) -> Iterator[str]:
+    """Yield the models of videos, the one with the least flicker first, and why the flicker of others says nothing."""
+    models = by_model(result.select())
+    silent = {name: text for name, records in models.items() if (text := _silence(records))}
+    ranked = [name for name in least_flicker_first(models) if name not in silent]
+    if len(ranked) > 1:
+        yield f"least flicker first: {', '.join(f'{k}. {name}' for k, name in enumerate(ranked, start=1))}"
+    yield from silent.values()
+
+
+def least_flicker_first(models: Mapping[str, Sequence[Record]]) -> list[str]:
+    """Return the models by their mean flicker over scenes; those without a number last."""
+    flicker = {
+        name: macro_mean([record.image_space.compensated_flicker_percent for record in records])
+        for name, records in models.items()
+    }
+    return sorted(flicker, key=lambda name: (math.isnan(flicker[name]), flicker[name]))
+
+
+def _silence(records: Sequence[Record]) -> str:
+    """Return why flicker of videos says nothing: nearly all of each is one class; '' where it does."""
+    pixels = [record.pixels for record in records if record.pixels is not None]
+    if not pixels or not all(each.effective_classes < LEAST_CLASSES for each in pixels):
+        return ""
+    least = min(pixels, key=lambda each: each.largest_share)
+    share, model = nearly_all(least.largest_share), records[0].unit.model
+    return f"uninformative: {share} of the labels of {model} are {least.largest_class}"
 
 
 CLEAR: Mapping[str, tuple[float, float]] = {"VSS (OP>=3)": (0.02, 0.0), "SBD": (0.002, 0.2), "mIoU": (0.02, 0.0)}

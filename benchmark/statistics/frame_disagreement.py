@@ -94,6 +94,16 @@ def lone_disagreement(spots: SpotObservations) -> LoneDisagreement:
     return LoneDisagreement(frame.astype(np.int64), places, share, null)
 
 
+def by_frame(lone: LoneDisagreement, outlying: OutlyingFrames | None) -> dict[int, dict[str, float]]:
+    """Return the numbers of each frame by its index, as the time series names them."""
+    named = {each.frame for each in outlying.frames} if outlying else set()
+    rows = zip(lone.frame.tolist(), lone.share.tolist(), lone.null.tolist(), strict=True)
+    return {
+        frame: {"lone_percent": 100 * share, "lone_null_percent": 100 * null, "outlying": int(frame in named)}
+        for frame, share, null in rows
+    }
+
+
 def stands_alone(log: Events) -> Mask:
     """Return the observations (m,) whose neighbours at the place, two or more, all have one class that is another."""
     label, rows = log.evidence.argmax(axis=1), np.arange(len(log))

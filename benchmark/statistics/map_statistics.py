@@ -58,7 +58,7 @@ from semstab.statistics.cube_sums import (
     row_columns,
 )
 from semstab.statistics.drift import expected_sbd
-from semstab.statistics.frame_disagreement import LoneDisagreement, lone_disagreement, outlying_frames
+from semstab.statistics.frame_disagreement import LoneDisagreement, by_frame, lone_disagreement, outlying_frames
 from semstab.statistics.geometry import losses
 from semstab.statistics.intervals import confidence_intervals, estimate, headline_specs, scope_of, spec_of
 from semstab.statistics.observations import SpotObservations
@@ -94,15 +94,7 @@ class Analysis:
 
     def of_frames(self) -> dict[int, dict[str, float]]:
         """Return the numbers of each frame by its index, as the time series names them; see `LoneDisagreement`."""
-        if self.lone is None:
-            return {}
-        outlying = self.summary.outlying_frames
-        named = {each.frame for each in outlying.frames} if outlying else set()
-        rows = zip(self.lone.frame.tolist(), self.lone.share.tolist(), self.lone.null.tolist(), strict=True)
-        return {
-            frame: {"lone_percent": 100 * share, "lone_null_percent": 100 * null, "outlying": int(frame in named)}
-            for frame, share, null in rows
-        }
+        return {} if self.lone is None else by_frame(self.lone, self.summary.outlying_frames)
 
     def columns(self, table: VoxelTable, truth: VoxelTable | None = None) -> Columns:
         """Return one value per voxel (n,) by name for the map or any part of it, NaN where undefined.

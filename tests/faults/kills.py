@@ -99,13 +99,6 @@ def of_run(out: Path) -> Any:
     return {**found, "runs": runs}, names, not recording.exists() or is_whole(recording)
 
 
-def of_videos(out: Path) -> Any:
-    """What a run over videos leaves, file by file, without times; pages and pictures by name."""
-    files = sorted(path for path in out.rglob("*") if path.is_file())
-    told = [path.read_bytes() for path in files if path.suffix == ".csv"]
-    return json.loads((out / "summary.json").read_text()), told, [str(path.relative_to(out)) for path in files]
-
-
 def of_files(out: Path) -> Any:
     """What a conversion or a prediction leaves, file by file; manifests without times and places."""
     manifests = ("conversion.json", "predictions.json", "relabelled.json")
@@ -142,7 +135,7 @@ def kinds(base: Path) -> dict[str, tuple[Callable[[Path], Words], Callable[[Path
             lambda out: [*common, "--tile-size", "8", "--jobs", "2", "--rerun", "off", "--out", str(out)],
             of_run,
         ),
-        "videos": (lambda out: [*videos, "--out", str(out)], of_videos),
+        "videos": (lambda out: [*videos, "--out", str(out)], of_run),
         "study": (lambda out: ["study", str(study), "--report", "off", "--quiet", "--out", str(out)], of_run),
         "predict": (
             lambda out: ["predict", "-m", "colour-clusters", "--data", str(flight), "--out", str(out), "--quiet"],

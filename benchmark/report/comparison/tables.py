@@ -9,7 +9,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 
 from semstab.comparison.locations import MOST
-from semstab.comparison.quantities import BY_CLASS, COVERAGE, HEADLINES, IOU, RECALL, by_name
+from semstab.comparison.quantities import BY_CLASS, COVERAGE, FLICKER, HEADLINES, IOU, RECALL, by_name
 from semstab.core.console import Console
 from semstab.data.contrast import (
     Against,
@@ -290,6 +290,7 @@ BASES: dict[Basis, str] = {
     "voxels": "paired on the voxels that all runs saw twice or more",
     "cubes": "paired on cubes of space",
     "flights": "not paired",
+    "images": "paired on frames",
 }
 
 
@@ -350,9 +351,26 @@ def _of_run(comparison: RunComparison, against: Against) -> Iterator[str]:
                 yield f"{against.other} in {scene.scene}: {_of_areas(areas, scene.crs)}."
 
 
+def _flicker(comparison: RunComparison, against: Against) -> str:
+    """Return the difference of flicker, the one measure of videos."""
+    row = next((row for row in against.contrasts if row.measure == FLICKER.name), None)
+    if row is None:
+        return f"Flicker of {against.other} and {comparison.base} cannot be compared: run both on the same frames."
+    change, p = row.difference, "" if math.isnan(row.p_holm) else f", p {row.p_holm:.2g} (Holm)"
+    relation = {"better": "flickers less than", "worse": "flickers more than"}.get(
+        row.change, "is not shown to differ from"
+    )
+    return (
+        f"{against.other} {relation} {comparison.base}: flicker {row.other:.2f} %"
+        f" against {row.base:.2f} %, {change.value:+z.2f} ({change.low:+z.2f} to {change.high:+z.2f}){p}."
+    )
+
+
 def _stability(comparison: RunComparison, against: Against) -> str:
     """Return the difference of alpha, on which verdicts rest."""
     row = next((row for row in against.contrasts if row.measure == ALPHA.name), None)
+    if row is None and all(scene.basis == "images" for scene in comparison.scenes):
+        return _flicker(comparison, against)
     if row is None:
         return f"Alpha of {against.other} or {comparison.base} is not known: run it with more overlap between frames."
     where = f" over {len(comparison.scenes)} scenes" if len(comparison.scenes) > 1 else ""

@@ -52,6 +52,9 @@ BUILDERS = (
 )  # fmt: skip
 """The functions that make tables, in the paper's order; without numbers for its tables a function returns none."""
 
+OF_IMAGES = (flicker, video_measures, frames)
+"""Those of them that also have rows for videos, which have no map."""
+
 WRITTEN = (
     "filters", "findings", "overview", "verdicts", "scenes", "persistence", "classes", "class_agreement",
     "temporal_agreement", "flicker", "ranges", "frames", "correctness", "video_measures", "sensitivity", "fusion",
@@ -68,7 +71,9 @@ FORMATS = (*(f".{suffix}" for suffix in TEXT_WRITERS), ".json")
 def tables(result: Result) -> list[Table]:
     """Return every table that the study has records for, in the paper's order."""
     shown = of_interest(result)
-    made = [*filter_tables(result), *(table for build in BUILDERS for table in build(shown))]
+    maps = shown.maps
+    built = (table for build in BUILDERS for table in build(shown if build in OF_IMAGES else maps))
+    made = [*filter_tables(result), *built]
     words = f" Benchmark {result.benchmark}." if result.benchmark else ""
     if n := len(result.failures):
         words += f" Without {n} unit{'' if n == 1 else 's'} that failed."

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable
 
 from semstab.data.records import ImageSpace, Result
 from semstab.metrics.image_space import mean_over_scenes
@@ -33,21 +33,15 @@ _REGIONS = (
 
 def flicker(result: Result) -> list[Table]:
     """Return flicker by model, and scene by scene (paper, Frame-wise Temporal Semantic Flicker)."""
-    regions = dict.fromkeys(row.model for row in result.regions)
-    what = _WHAT.format(motion="depth and pose", motion_of="camera motion")
-    return flicker_tables(_by_method(result), what + (_REGIONS.format(names=", ".join(regions)) if regions else ""))
-
-
-def flicker_of_videos(methods: Mapping[str, Mapping[str, ImageSpace]]) -> list[Table]:
-    """Return flicker of videos without depth and poses, by model and scene: with the motion removed by flow."""
-    motion = "optical flow between the images (OpenCV's DIS)"
-    return flicker_tables(methods, _WHAT.format(motion=motion, motion_of="motion of the camera and of things"))
-
-
-def flicker_tables(methods: Mapping[str, Mapping[str, ImageSpace]], what: str) -> list[Table]:
-    """Return flicker of each model by scene, and of all scenes; `what` explains the numbers."""
-    if not methods:
+    if not (methods := _by_method(result)):
         return []
+    if result.select() and not result.maps.records:
+        motion = "optical flow between the images (OpenCV's DIS)"
+        what = _WHAT.format(motion=motion, motion_of="motion of the camera and of things")
+    else:
+        what = _WHAT.format(motion="depth and pose", motion_of="camera motion")
+    regions = dict.fromkeys(row.model for row in result.regions)
+    what += _REGIONS.format(names=", ".join(regions)) if regions else ""
     groups = tuple(
         Group(
             name,

@@ -172,8 +172,8 @@ def drift(result: Result) -> list[Table]:
 def frames(result: Result) -> list[Table]:
     """Return the frames that stand out, by the names of their files; a map without any has one row that says so."""
     groups = []
-    for model, rows in assessed_records(result).items():
-        known = [(record, stats.outlying_frames) for record, stats in rows]
+    for model, records in by_model(result.select()).items():
+        known = [(record, record.outlying_frames) for record in records]
         lines = tuple(
             row for record, outlying in known if outlying is not None for row in _frame_rows(record, outlying)
         )
@@ -196,6 +196,8 @@ def frames(result: Result) -> list[Table]:
         " more. Places are the sampled ones that the frame saw, as two other views did at least. Frames with fewer than"
         f" {LEAST_PLACES} places are not judged, and none is where fewer than {LEAST_JUDGED} frames can be."
     )
+    if not result.maps.records:
+        caption += " The places of a video are pixels that the frames before and after it show, too, by optical flow."
     return [Table("frames", "Frames that stand out", caption, columns, tuple(groups))]
 
 

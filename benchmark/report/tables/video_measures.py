@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 
 import numpy as np
 
@@ -48,11 +48,6 @@ def video_measures(result: Result) -> list[Table]:
     for record in result.select():
         if record.video_measures is not None:
             scenes.setdefault(record.unit.model, {})[record.unit.scene] = record.video_measures
-    return video_measure_tables(scenes)
-
-
-def video_measure_tables(scenes: Mapping[str, Mapping[str, VideoMeasures]]) -> list[Table]:
-    """Return VC and TC of each model by scene."""
     if not scenes:
         return []
     groups = tuple(

@@ -87,7 +87,7 @@ def _class_shares(records: Sequence[Record]) -> dict[str, float]:
 def outlying_lines(records: Sequence[Record]) -> Iterator[str]:
     """Yield the frames that stand out; of several maps only where there are some."""
     for record in records:
-        outlying = None if record.statistics is None else record.statistics.outlying_frames
+        outlying = record.outlying_frames
         if outlying is None or (len(records) > 1 and not outlying.frames):
             continue
         scene = record.unit.scene if len({each.unit.scene for each in records}) > 1 else ""

@@ -25,14 +25,17 @@ LEAST_NAME = 9
 """The least columns of a model's name, which is cut where the terminal has no room for all of it."""
 
 
-def laid_out(rows: Sequence[Sequence[str]], width: int) -> list[str]:
-    """Return rows of cells as lines, each column as wide as its cells; names of models are cut to fit the width."""
+def laid_out(rows: Sequence[Sequence[str]], width: int, texts: int = TEXTS) -> list[str]:
+    """Return rows of cells as lines, each column as wide as its cells; names of models are cut to fit the width.
+
+    The first `texts` columns after the name are aligned left, numbers right.
+    """
     sizes = [max(map(len, column)) for column in zip(*rows, strict=True)]
     sizes[0] = min(sizes[0], max(LEAST_NAME, width - 2 - sum(sizes[1:]) - len(sizes[1:])))
     lines = []
     for name, *cells in rows:
         sized = zip(cells, sizes[1:], strict=True)
-        aligned = (f"{c:<{n}}" if k < TEXTS else f"{c:>{n}}" for k, (c, n) in enumerate(sized, 1))
+        aligned = (f"{c:<{n}}" if k < texts else f"{c:>{n}}" for k, (c, n) in enumerate(sized, 1))
         lines.append(" ".join(["", f" {cut(name, sizes[0]):<{sizes[0]}}", *aligned]).rstrip())
     return lines
 

@@ -22,6 +22,7 @@ from semstab.report.terminal.layout import WIDTH, wrapped
 from semstab.report.terminal.many_scenes import many_scenes
 from semstab.report.terminal.one_model import one_model
 from semstab.report.terminal.several_models import several_models
+from semstab.report.terminal.videos import videos
 
 MOST_WARNINGS = 3
 STAGE_NAMES = {
@@ -61,7 +62,9 @@ def screen(
     They are verdicts, the classes that disagree most, warnings, the check, the time and the files to open.
     """
     records, width = result.select(), max(width, WIDTH)
-    if len(records) == 1:
+    if not result.maps.records:
+        yield from videos(result, records, width)
+    elif len(records) == 1:
         yield from one_model(result, records[0], width)
     elif len(result.scenes) > 1:
         yield from many_scenes(result, records, width)

@@ -1,0 +1,44 @@
+"""Videos, without depth and poses: which model flickers least, and a row of numbers for each."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+
+from semstab.data.records import Record, Result
+from semstab.metrics.image_space import mean_over_scenes
+from semstab.report.means import by_model
+from semstab.report.ranking import answers, least_flicker_first
+from semstab.report.terminal.disagreement import outlying_lines
+from semstab.report.terminal.layout import laid_out, number, wrapped
+
+HEADS = ("", "flicker %", "pixel flicker %", "co-visible %", "VC8", "VC16")
+
+NEEDS = (
+    "agreement of places (alpha, VSS), drift (SBD), how often a place was seen (OP) and a verdict need depth and poses:"
+    " docs/datasets.md has what is read"
+)
+"""The line on what a video does not tell."""
+
+
+def videos(result: Result, records: Sequence[Record], width: int) -> Iterator[str]:
+    """Yield the videos, the answer, a row for each model over all videos, and the frames that stand out."""
+    frames = sorted({record.summary.frames for record in records})
+    counts = f"{frames[0]} to {frames[-1]}" if len(frames) > 1 else f"{frames[0]}"
+    sizes = " and ".join(dict.fromkeys(f"{w}x{h}" for w, h in (each.pixels.size for each in records if each.pixels)))
+    classes = " and ".join(map(str, sorted({record.summary.table.K for record in records})))
+    named = result.scenes[0] if len(result.scenes) == 1 else f"{len(result.scenes)} videos"
+    yield f"{named}    {counts} frames of {sizes}, {classes} classes    no depth, no poses"
+    yield ""
+    for text in answers(result):
+        yield from wrapped(text)
+    models, rows = by_model(records), [HEADS]
+    for name in least_flicker_first(models):
+        mean = mean_over_scenes(record.image_space for record in models[name])
+        flicker = number(mean.compensated_flicker_percent, 2), number(mean.flicker_percent, 2)
+        share = number(100 * mean.compensated_share, 0)
+        rows.append((name, *flicker, share, number(mean.self_vc8, 3), number(mean.self_vc16, 3)))
+    yield from laid_out(rows, width, texts=0)
+    yield "  flicker: pixels whose label differs from the frame before, motion removed by optical flow"
+    yield from outlying_lines(records)
+    yield from wrapped(f"note: {NEEDS}")
+    yield ""
