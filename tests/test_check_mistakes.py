@@ -10,7 +10,9 @@ import pytest
 from posed_writer import write_posed
 
 from semstab.check import quick_check
-from semstab.check.mistakes import MISTAKES, with_mistakes
+from semstab.check.conventions import Convention
+from semstab.check.geometry import with_mistakes
+from semstab.check.hypotheses import CAMERAS
 from semstab.check.reprojection import Sample, View
 from semstab.datasets import open_dataset
 
@@ -32,7 +34,7 @@ def test_a_mistake_of_files_is_named_with_what_to_do(name) -> None:
     found = verdict(planted.plant(doctor.scene(1)))
     assert found.state == "unsound"
     assert planted.said in found.text
-    (mend,) = (mistake.mend for mistake in MISTAKES if planted.said in mistake.name)
+    (mend,) = (mistake.mend for mistake in CAMERAS if planted.said in mistake.name)
     assert found.text.endswith(mend)
     assert found.fits[1][1].error < found.fits[0][1].error or not found.fits[0][1].has_evidence
 
@@ -56,9 +58,9 @@ def test_a_thinned_image_is_mirrored_to_the_pixel(axes) -> None:
     """641 columns and 480 rows, every third pixel: the first pixel of the mirrored image is not that of the file."""
     frame = dataclasses.replace(doctor.scene(0)[0], depth=np.arange(480 * 641, dtype=np.float32).reshape(480, 641) + 1,
                                 labels=np.zeros((480, 641), np.uint8))  # fmt: skip
-    (mistake,) = (m for m in MISTAKES if m.name.endswith({(0,): "down", (1,): "right", (0, 1): "degrees"}[axes]))
+    (mistake,) = (m for m in CAMERAS if m.name.endswith({(0,): "down", (1,): "right", (0, 1): "degrees"}[axes]))
     view = View.of(frame, 500)
-    mended = mistake.mended(view, None)
+    mended = mistake.change(Sample({0: view}, [], Convention())).views[0]
     K, k = mended.camera.every(view.stride), frame.intrinsics
     for v, u in zip(mended.v[:50], mended.u[:50], strict=True):
         row, column = np.divmod(int(mended.depth[v, u]) - 1, 641)

@@ -16,9 +16,9 @@ import numpy as np
 import numpy.typing as npt
 
 from semstab.check.conventions import Convention
-from semstab.check.geometry import Verdict
 from semstab.check.lost import lost_tracking, origin_of
 from semstab.check.reprojection import Matches, Pair, Sample, View, median_of_seen, motion, reader
+from semstab.check.verdict import Verdict
 from semstab.core.arrays import evenly
 from semstab.core.prefetch import prefetch
 from semstab.core.types import Float64, Mask
@@ -374,20 +374,16 @@ def with_continuity(verdict: Verdict, neighbours: Neighbours, chain: Chain) -> V
     many = len(misfits) > MOST_BAD * len(chain.positions)
     text = neighbours.said_of_lost() or (neighbours.said_of_many(chain, positions) if many else None)
     if text is not None:
-        return _unsound(verdict, text)
-    verdict = dataclasses.replace(verdict, remarks=(*verdict.remarks, *neighbours.said_of_misfits(chain, misfits)))
+        return verdict.refuted(text)
+    verdict = verdict.remarking(*neighbours.said_of_misfits(chain, misfits))
     if (text := neighbours.said_of_jumps(chain)) is not None:
-        return _unsound(verdict, text)
+        return verdict.refuted(text)
     if (shift := chain.without(positions).shift()) is None:
         return verdict
     text, (_, error, usual) = neighbours.said_of_shift(*shift), shift
     if error >= STRIKING_SHIFT * usual:
-        return _unsound(verdict, text)
-    return dataclasses.replace(verdict, remarks=(*verdict.remarks, text))
-
-
-def _unsound(verdict: Verdict, text: str) -> Verdict:
-    return dataclasses.replace(verdict, state="unsound", text=text, undetermined=(), reason="")
+        return verdict.refuted(text)
+    return verdict.remarking(text)
 
 
 class Neighbours:

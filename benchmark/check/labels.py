@@ -23,6 +23,7 @@ from semstab.check.coverage import CONSISTENT
 from semstab.check.geometry import shifts_and_turns
 from semstab.check.registration import grey_levels
 from semstab.check.reprojection import Pair, Sample, View
+from semstab.check.trials import Contrast
 from semstab.core.arrays import evenly
 from semstab.core.types import Float64, Int64, Mask
 from semstab.data.labels import LabelSpace
@@ -40,18 +41,12 @@ COLUMNS = 256
 POINTS = 1000
 """Points of a frame that are reprojected into another."""
 
-CLEAR = 4.0
-"""Standard errors by which an alternative must be better, in the mean over frames or pairs; ..."""
-
 BETTER = 1.15
 LEAST_FIT = 0.08
-"""... the factor by which its edges must fit better, and the correlation that is a fit; ..."""
+"""The factor by which the edges of an alternative must fit better, and the correlation that is a fit, ..."""
 
 FEWER = 0.85
-"""... or the part of the disagreement that remains; ..."""
-
-WON = 0.8
-"""... and the share of the frames or pairs in which it is better."""
+"""... or the part of the disagreement that remains."""
 
 LEAST_FRAMES = 4
 LEAST_POINTS = 50
@@ -351,43 +346,6 @@ class Run:
 
 
 # --- the comparison --------------------------------------------------------------------------------------------------
-
-
-@dataclass(frozen=True)
-class Contrast:
-    """An alternative against the given maps, over frames or pairs of them, in the same ones.
-
-    Attributes:
-        given, other: Means of the measure.
-        z: Mean difference over its standard error.
-        won: Share in which the alternative is better.
-        count: Number of frames or pairs.
-    """
-
-    given: float
-    other: float
-    z: float
-    won: float
-    count: int
-
-    @classmethod
-    def of(cls, given: Sequence[float], other: Sequence[float]) -> Contrast:
-        """Compare two measures, one pair of numbers for each frame or pair; NaN does not count."""
-        both = np.array([given, other], dtype=np.float64).reshape(2, -1)
-        both = both[:, np.isfinite(both).all(axis=0)]
-        n = both.shape[1]
-        if n < 2:
-            return cls(math.nan, math.nan, 0.0, 0.0, n)
-        gain = both[1] - both[0]
-        error = max(float(gain.std(ddof=1)) / math.sqrt(n), 1e-9)
-        return cls(
-            float(both[0].mean()), float(both[1].mean()), float(gain.mean()) / error, float(np.mean(gain > 0)), n
-        )
-
-    @property
-    def is_clear(self) -> bool:
-        """Return whether the alternative is better beyond chance."""
-        return self.count >= LEAST_FRAMES and self.z > CLEAR and self.won >= WON
 
 
 @dataclass(frozen=True)

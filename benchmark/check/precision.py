@@ -8,8 +8,9 @@ import math
 import numpy as np
 
 from semstab.check.coverage import BINS, plane_residuals
-from semstab.check.geometry import GOOD, LEAST_PAIRS, MIN_POINTS, MIN_SHARE, Verdict
-from semstab.check.reprojection import Pair, Sample, View, median_of_seen
+from semstab.check.geometry import LEAST_PAIRS
+from semstab.check.reprojection import Pair, Sample, View
+from semstab.check.verdict import GOOD, Verdict
 
 MEASURED = 1e-4
 """Noise of one frame, relative, from which on its depth is measured; below, it is rendered or of a surface."""
@@ -84,7 +85,5 @@ def _error(sample: Sample, pairs: list[Pair]) -> float:
     """Return the median error over pairs; NaN where they see too little of each other."""
     if len(pairs) < LEAST_PAIRS:
         return math.nan
-    chosen = dataclasses.replace(sample, pairs=pairs)
-    errors = np.concatenate([error[0] for error in chosen.errors(sample.configured, np.array([1.0]))])
-    seen = np.isfinite(errors)
-    return float(median_of_seen(errors)) if seen.sum() >= MIN_POINTS and seen.mean() >= MIN_SHARE else math.nan
+    fit = dataclasses.replace(sample, pairs=pairs).fit()
+    return fit.error if fit.has_evidence else math.nan

@@ -9,8 +9,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from semstab.check.conventions import OPTION
-from semstab.check.geometry import Verdict
 from semstab.check.reprojection import Pair, View
+from semstab.check.verdict import Verdict
 from semstab.core.arrays import evenly
 from semstab.core.types import Float32, Float64, Mask, UInt8
 from semstab.data.frames import Intrinsics

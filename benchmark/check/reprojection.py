@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import math
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, field
@@ -12,6 +13,7 @@ import numpy.typing as npt
 
 from semstab.check.conventions import INVERSE, Convention
 from semstab.check.loops import find_matches
+from semstab.check.verdict import Fit
 from semstab.core.prefetch import prefetch
 from semstab.core.types import Float32, Float64, Int64, Mask
 from semstab.data.frames import Frame, Intrinsics
@@ -27,6 +29,9 @@ MAX_PIXELS = 2**20
 
 STEPS = (0, 1, 2, 8, 27)
 """Frames of a cluster, counted from its first one: their pairs lie 1 to 27 selected frames apart."""
+
+PAIR_POINTS = 20
+"""Points of a pair of frames that are seen again, from which on its error counts."""
 
 Pair = tuple[int, int]
 
@@ -178,6 +183,31 @@ class Sample:
     configured: Convention
     _inverse: dict[int, Float32] = field(default_factory=dict, init=False, repr=False)
     _placed: dict[tuple[int, Convention], Placed] = field(default_factory=dict, init=False, repr=False)
+
+    def of(self, views: dict[int, View]) -> Sample:
+        """Return a sample of the same pairs, of which these are the views."""
+        return Sample(views, self.pairs, self.configured)
+
+    def by_pair(self, convention: Convention | None = None) -> Float64:
+        """Return (pairs,) the median error under a convention, as configured; NaN where few points are seen again."""
+        convention = convention or self.configured
+        errors = self.errors(convention, np.array([convention.factor]))
+        return np.array([median_of_seen(e)[0] if np.isfinite(e).sum() >= PAIR_POINTS else np.nan for e in errors])
+
+    def fit(self) -> Fit:
+        """Return the fit of the configured convention."""
+        return self.fits(self.configured, np.array([1.0]))[0]
+
+    def fits(self, convention: Convention, factors: Float64) -> list[Fit]:
+        """Return the fit under a convention with each of the factors (F,) on depth."""
+        errors = self.errors(convention, factors)
+        pooled = np.concatenate(errors, axis=1) if errors else np.empty((len(factors), 0))
+        points = np.isfinite(pooled).sum(axis=1)
+        medians = median_of_seen(pooled) if pooled.size else np.full(len(factors), np.nan)
+        return [
+            Fit(dataclasses.replace(convention, factor=f), median, n / max(1, pooled.shape[1]), n)
+            for f, median, n in zip(factors.tolist(), medians.tolist(), points.tolist(), strict=True)
+        ]
 
     def errors(self, convention: Convention, factors: Float64) -> list[Float64]:
         """Return for each pair the relative error (F, N) of the first view's sample in the second; inf if not seen."""

@@ -23,19 +23,20 @@ from semstab.check.coverage import (
     persistence,
     suggest,
 )
-from semstab.check.geometry import Verdict, assess, shifts_and_turns
+from semstab.check.geometry import assess, shifts_and_turns, with_mistakes
 from semstab.check.histogram import Histogram, Tally
 from semstab.check.intrinsics import with_intrinsics
 from semstab.check.label_order import remarks_on_maps, wrong_ids
 from semstab.check.labels import LabelFindings, check_labels
-from semstab.check.mistakes import with_mistakes
 from semstab.check.no_depth import with_invalid_depth
 from semstab.check.precision import with_precision
 from semstab.check.registration import assess_surface, match_images, notes
 from semstab.check.reprojection import Sample, View, clusters, frames_at, label_source, pairs_within, reader
-from semstab.check.scans import ScanCoverage, ScanSample, assess_scans, quick_sample_of_scans
+from semstab.check.scan_sample import ScanSample, quick_sample_of_scans
+from semstab.check.scans import ScanCoverage, assess_scans
 from semstab.check.sweep import with_sweep
 from semstab.check.timing import with_lateness
+from semstab.check.verdict import Verdict
 from semstab.config import Config
 from semstab.core.arrays import evenly
 from semstab.core.json_form import to_json

@@ -8,7 +8,7 @@ from collections.abc import Mapping
 
 from semstab.check.coverage import Coverage, Stays, suggested_size
 from semstab.check.reprojection import Sample, clusters
-from semstab.check.scans import quick_sample_of_scans
+from semstab.check.scan_sample import quick_sample_of_scans
 from semstab.check.scene_check import CLUSTERS, POINTS, Inspection
 from semstab.config import Config
 from semstab.core.arrays import evenly
