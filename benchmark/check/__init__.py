@@ -1,9 +1,9 @@
 """A check that a dataset makes sense: poses, depth, units, intrinsics, labels, and what voxels it can carry."""
 
+from semstab.check.labels import Ordered
 from semstab.check.no_depth import with_invalid_depth
 from semstab.check.scene_check import (
     SCHEMA,
-    Ordered,
     SceneCheck,
     check,
     check_scene,

@@ -1,6 +1,6 @@
 """The mistakes of files that are looked for in scenes of cameras and of scans, beside other conventions of a camera.
 
-A new one is an entry of `CAMERAS` or `SCANS`.
+A new one is an entry of `CAMERAS` or `SCANS`: its name, what it changes, and the mend in words.
 """
 
 from __future__ import annotations
@@ -76,7 +76,7 @@ FIRST_NUMBER_LAST, LAST_NUMBER_FIRST = quaternions((1, 2, 3, 0)), quaternions((3
 # --- cameras ----------------------------------------------------------------------------------------------------------
 
 
-def _views(change: Callable[[View, Convention], View]) -> Callable[[Sample], Sample]:
+def views(change: Callable[[View, Convention], View]) -> Callable[[Sample], Sample]:
     """Return the change of a sample whose views change."""
     return lambda sample: sample.of({at: change(view, sample.configured) for at, view in sample.views.items()})
 
@@ -94,10 +94,10 @@ def _mirrored(*axes: int) -> Callable[[Sample], Sample]:
         camera = dataclasses.replace(camera, cx=cx, cy=cy)
         return dataclasses.replace(view, depth=np.flip(view.depth, axes), camera=camera, v=places[0], u=places[1])
 
-    return _views(mended)
+    return views(mended)
 
 
-def _poses(change: PoseChange) -> Callable[[Sample], Sample]:
+def camera_poses(change: PoseChange) -> Callable[[Sample], Sample]:
     """Return how to read poses whose matrices in the file, (4, 4), would be others."""
 
     def mended(view: View, configured: Convention) -> View:
@@ -109,7 +109,7 @@ def _poses(change: PoseChange) -> Callable[[Sample], Sample]:
         pose[:3, :3] = pose[:3, :3] @ CAMERA_AXES[configured.axes]
         return dataclasses.replace(view, T_wc=pose)
 
-    return _views(mended)
+    return views(mended)
 
 
 def _in_pixels(view: View, _: Convention) -> View:
@@ -144,14 +144,16 @@ CAMERAS: tuple[Hypothesis[Sample], ...] = (
     mistake("depth images upside down", _mirrored(0), OR_LEFT_HANDED),
     mistake("depth images turned by 180 degrees", _mirrored(0, 1), ANEW),
     mistake(
-        "poses with transposed rotations", _poses(rotations(np.transpose)), "transpose the rotation (3, 3) of each"
+        "poses with transposed rotations",
+        camera_poses(rotations(np.transpose)),
+        "transpose the rotation (3, 3) of each",
     ),
-    mistake("quaternions w x y z that are read as x y z w", _poses(FIRST_NUMBER_LAST), "write them as x y z w"),
-    mistake("quaternions x y z w that are read as w x y z", _poses(LAST_NUMBER_FIRST), "write them as w x y z"),
-    mistake("intrinsics with cx and cy exchanged", _views(_exchanged), "exchange them", applies=_is_off_centre),
+    mistake("quaternions w x y z that are read as x y z w", camera_poses(FIRST_NUMBER_LAST), "write them as x y z w"),
+    mistake("quaternions x y z w that are read as w x y z", camera_poses(LAST_NUMBER_FIRST), "write them as w x y z"),
+    mistake("intrinsics with cx and cy exchanged", views(_exchanged), "exchange them", applies=_is_off_centre),
     mistake(
         "intrinsics as shares of the image's size",
-        _views(_in_pixels),
+        views(_in_pixels),
         "multiply fx and cx by its width, fy and cy by its height",
         applies=_as_shares,
     ),
@@ -162,7 +164,7 @@ CAMERAS: tuple[Hypothesis[Sample], ...] = (
 # --- scans ------------------------------------------------------------------------------------------------------------
 
 
-def _of(change: PoseChange) -> Callable[[ScanSample], ScanSample]:
+def scan_poses(change: PoseChange) -> Callable[[ScanSample], ScanSample]:
     """Return the change of scans whose poses change."""
     return lambda sample: sample.posed(change)
 
@@ -177,7 +179,7 @@ def _nearer_to_their_sensors(sample: ScanSample) -> bool:
 SCANS: tuple[Hypothesis[ScanSample], ...] = (
     Hypothesis(
         "inverse poses",
-        _of(lambda T: np.linalg.inv(T).astype(np.float64)),
+        scan_poses(lambda T: np.linalg.inv(T).astype(np.float64)),
         "invert the poses: they map the world to the sensor",
         {
             ("pose_convention", "camera_to_world"): "pose_convention: world_to_camera",
@@ -186,34 +188,38 @@ SCANS: tuple[Hypothesis[ScanSample], ...] = (
     ),
     Hypothesis(
         "poses of a camera, not of the LiDAR",
-        _of(lambda T: np.linalg.inv(TO_CAMERA) @ T @ TO_CAMERA),
+        scan_poses(lambda T: np.linalg.inv(TO_CAMERA) @ T @ TO_CAMERA),
         "the calibration from the LiDAR to the camera is forgotten: apply it",
         {("pose_frame", "lidar"): "pose_frame: camera"},
     ),
     Hypothesis(
         "poses of the LiDAR, to which a camera's calibration was applied",
-        _of(lambda T: TO_CAMERA @ T @ np.linalg.inv(TO_CAMERA)),
+        scan_poses(lambda T: TO_CAMERA @ T @ np.linalg.inv(TO_CAMERA)),
         "leave the calibration away",
         {("pose_frame", "camera"): "pose_frame: lidar"},
     ),
     Hypothesis(
         "points that are in the world already",
-        _of(lambda T: np.eye(len(T))),
+        scan_poses(lambda T: np.eye(len(T))),
         "carry the points into the axes of the sensor",
         {("coordinates", "sensor"): "coordinates: world"},
         _nearer_to_their_sensors,
     ),
     Hypothesis(
         "points that are in the sensor's axes already",
-        _of(lambda T: T @ T),
+        scan_poses(lambda T: T @ T),
         "carry the points into the axes of the sensor once",
         {("coordinates", "world"): "coordinates: sensor"},
     ),
-    Hypothesis("quaternions w x y z", _of(FIRST_NUMBER_LAST), "write quaternions as x y z w"),
-    Hypothesis("quaternions x y z w", _of(LAST_NUMBER_FIRST), "write quaternions as w x y z"),
-    Hypothesis("poses in millimetres", _of(positions(0.001)), "divide the positions of the poses by 1000"),
-    Hypothesis("poses in kilometres", _of(positions(1000.0)), "multiply the positions of the poses by 1000"),
-    Hypothesis("angles in degrees, read as radians", _of(angles(math.pi / 180)), "convert the angles to radians"),
-    Hypothesis("angles in radians, read as degrees", _of(angles(180 / math.pi)), "convert the angles to degrees"),
+    Hypothesis("quaternions w x y z", scan_poses(FIRST_NUMBER_LAST), "write quaternions as x y z w"),
+    Hypothesis("quaternions x y z w", scan_poses(LAST_NUMBER_FIRST), "write quaternions as w x y z"),
+    Hypothesis("poses in millimetres", scan_poses(positions(0.001)), "divide the positions of the poses by 1000"),
+    Hypothesis("poses in kilometres", scan_poses(positions(1000.0)), "multiply the positions of the poses by 1000"),
+    Hypothesis(
+        "angles in degrees, read as radians", scan_poses(angles(math.pi / 180)), "convert the angles to radians"
+    ),
+    Hypothesis(
+        "angles in radians, read as degrees", scan_poses(angles(180 / math.pi)), "convert the angles to degrees"
+    ),
 )
 """Other readings of the poses of scans than the configured one."""

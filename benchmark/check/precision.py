@@ -7,7 +7,7 @@ import math
 
 import numpy as np
 
-from semstab.check.coverage import BINS, plane_residuals
+from semstab.check.coverage import by_distance, plane_residuals, said
 from semstab.check.geometry import LEAST_PAIRS
 from semstab.check.reprojection import Pair, Sample, View
 from semstab.check.verdict import GOOD, Verdict
@@ -63,22 +63,16 @@ def _noise(view: View) -> float:
 def _drift(sample: Sample) -> str | None:
     """Return the line on poses that fit nearby frames and not distant ones."""
     near: tuple[tuple[int, int], float] | None = None
-    for low, high in BINS:
-        pairs = [(a, b) for a, b in sample.pairs if low <= abs(a - b) <= high]
+    for (low, high), pairs in by_distance(sample.pairs):
         error = _error(sample, pairs)
         if near is not None and error > max(GOOD, GROWS * near[1]):
             return (
-                f"poses drift: depth reprojects with {near[1]:.2%} error in frames {_apart(near[0])} apart, but with"
+                f"poses drift: depth reprojects with {near[1]:.2%} error in frames {said(near[0])} apart, but with"
                 f" {error:.1%} in those {low} to {high} apart"
             )
         if near is None and math.isfinite(error):
             near = (low, high), error
     return None
-
-
-def _apart(distances: tuple[int, int]) -> str:
-    low, high = distances
-    return str(low) if low == high else f"{low} to {high}"
 
 
 def _error(sample: Sample, pairs: list[Pair]) -> float:

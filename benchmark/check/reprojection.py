@@ -30,10 +30,14 @@ MAX_PIXELS = 2**20
 STEPS = (0, 1, 2, 8, 27)
 """Frames of a cluster, counted from its first one: their pairs lie 1 to 27 selected frames apart."""
 
+CONSISTENT = 0.05
+"""A point that is seen again is taken for the same surface where the two depths differ by at most this share."""
+
 PAIR_POINTS = 20
 """Points of a pair of frames that are seen again, from which on its error counts."""
 
 Pair = tuple[int, int]
+Ids = npt.NDArray[Any]
 
 
 @dataclass(frozen=True, eq=False)
@@ -81,14 +85,6 @@ class View:
             pose = np.linalg.inv(pose).astype(np.float64)
         pose[:3, :3] = pose[:3, :3] @ CAMERA_AXES[convention.axes]
         return pose
-
-    def read_as(self, convention: Convention, configured: Convention) -> Float32:
-        """Return depth (H, W) of the file as that convention reads it, but for the length of rays and the factor."""
-        if (convention.depth == INVERSE) == (configured.depth == INVERSE):
-            return self.depth
-        with np.errstate(divide="ignore", over="ignore"):
-            inverse: Float32 = np.where(self.depth > 0, 1 / self.depth, np.float32(0)).astype(np.float32)
-        return inverse
 
     def sampled_camera(self, convention: Convention) -> Intrinsics:
         """Return the intrinsics of every stride-th pixel."""
@@ -238,11 +234,13 @@ class Sample:
         return placed
 
     def _read_as(self, convention: Convention, position: int) -> Float32:
-        """Return depth (H, W) of a view as a convention reads it; an inverse is kept."""
+        """Return depth (H, W) as a convention reads it, but for rays and the factor; an inverse is kept."""
         if (convention.depth == INVERSE) == (self.configured.depth == INVERSE):
             return self.views[position].depth
         if position not in self._inverse:
-            self._inverse[position] = self.views[position].read_as(convention, self.configured)
+            depth = self.views[position].depth
+            with np.errstate(divide="ignore", over="ignore"):
+                self._inverse[position] = np.where(depth > 0, 1 / depth, np.float32(0)).astype(np.float32)
         return self._inverse[position]
 
     def motions(self, convention: Convention) -> list[tuple[Float64, Float64]]:
@@ -269,6 +267,28 @@ class Matches:
     depth: Float64
     inside: Mask
     error: Float64
+
+
+@dataclass(frozen=True, eq=False)
+class Shared:
+    """Pixels of two views that see the same points: rows and columns (n,) in each, and which of the sample they are."""
+
+    first: tuple[Int64, Int64]
+    second: tuple[Int64, Int64]
+    chosen: Mask
+
+    @classmethod
+    def of(cls, view: View, matches: Matches) -> Shared:
+        """Return the pixels of a view's sample that lie on one surface with the pixels that they meet."""
+        same = matches.error[0] <= CONSISTENT
+        return cls((view.v[same], view.u[same]), (matches.v[0][same], matches.u[0][same]), same)
+
+    def labels(self, first: Ids | None, second: Ids | None, *ignored: int) -> Ids:
+        """Return (2, n) the labels of the points in two maps, those that have one in both; none without maps."""
+        if first is None or second is None:
+            return np.empty((2, 0), dtype=np.int64)
+        both = np.stack([first[self.first], second[self.second]]).astype(np.int64)
+        return both[:, (both[0] != ignored[0]) & (both[1] != ignored[-1])]
 
 
 def _lens(camera: Intrinsics) -> tuple[float, float, float, float]:

@@ -13,8 +13,8 @@ import numpy as np
 
 from semstab.backends.shared.association import in_world
 from semstab.check.conventions import Convention
-from semstab.check.coverage import CONSISTENT
-from semstab.check.reprojection import Pair, clusters, frames_at, motion, pairs_within, reader
+from semstab.check.coverage import Noise, Overlap, by_distance
+from semstab.check.reprojection import CONSISTENT, Pair, clusters, frames_at, motion, pairs_within, reader
 from semstab.check.surfaces import LEAST_RANGE, Surfaces
 from semstab.check.verdict import Fit
 from semstab.core.arrays import evenly
@@ -63,6 +63,11 @@ class ScanSample:
         fused: Number of scans, evenly spaced, that are read for fusion too.
         passing_over: Leave out scans that cannot be read, instead of raising what reading them raises.
     """
+
+    reasons = (
+        "{:.0%} of the points have the nearest one of another scan in the same voxel",
+        "{:.0%} of a scan's points lie on the surfaces of the next one",
+    )
 
     def __init__(
         self,
@@ -149,6 +154,26 @@ class ScanSample:
         clouds = [self._clouds[position] for position in {pair[0] for pair in self.pairs}]
         own = [cloud.tree.query(cloud.sought, k=2)[0][:, 1] for cloud in clouds]
         return float(np.median(np.concatenate(own))) if own else math.nan
+
+    def overlaps(self) -> list[Overlap]:
+        """Return one row a distance between scans."""
+        return [self._overlap(apart, pairs) for apart, pairs in by_distance(self.pairs)]
+
+    def _overlap(self, apart: tuple[int, int], pairs: Sequence[Pair]) -> Overlap:
+        error = np.concatenate([self.met[pair].error for pair in pairs])
+        agree = np.concatenate([self.agree(pair) for pair in pairs])
+        share, agreement = float(np.mean(error <= CONSISTENT)), float(agree.mean()) if len(agree) else math.nan
+        return Overlap(apart, len(pairs), share, share, float(np.median(error)), agreement)
+
+    def noise(self) -> Noise:
+        """Return the distance of points from the nearest of another scan and of their own, and between rays."""
+        ranges = np.concatenate([met.range for met in self.met.values()])
+        angle = float(np.median([scan.ray_angle for scan in self.scans.values()]))
+        return Noise(self.between, self.spacing, angle * float(np.median(ranges)))
+
+    def pixel_stride(self, voxel_size: float | None) -> tuple[int | None, str]:
+        """Return that all points are fused."""
+        return 1, "all points"
 
     def agree(self, pair: Pair) -> Mask:
         """Return whether labels agree, of the points met that have one in both scans."""

@@ -7,30 +7,13 @@ by the range of the point, is its error. Each other reading of the poses is asse
 from __future__ import annotations
 
 import dataclasses
-import math
-from collections.abc import Sequence
-from dataclasses import dataclass
 
 import numpy as np
 
-from semstab.backends import create
-from semstab.check.coverage import (
-    BINS,
-    CONSISTENT,
-    FRAMES_LEFT,
-    SHARED,
-    Noise,
-    Overlap,
-    Persistence,
-    Suggestion,
-    distribution,
-    suggested_size,
-)
 from semstab.check.hypotheses import SCANS
 from semstab.check.scan_sample import ScanSample
 from semstab.check.trials import ranked
 from semstab.check.verdict import Verdict
-from semstab.errors import DataError
 
 BETTER = 0.67
 """Another reading of the poses is right where its error is at most this part of the configured one."""
@@ -86,62 +69,3 @@ def assess_scans(sample: ScanSample) -> Verdict:
         undetermined=tuple(each.name for each in SCANS if each.name in open_),
         reason="the sensor hardly moves or turns" if open_ else "",
     )
-
-
-# What a check reports beside the verdict.
-
-
-@dataclass(frozen=True, eq=False)
-class ScanCoverage:
-    """What scans share, how far their points lie apart, and the voxels that this carries."""
-
-    sample: ScanSample
-
-    def overlaps(self) -> list[Overlap]:
-        """Return one row a distance between scans."""
-        rows = []
-        for low, high in BINS:
-            pairs = [pair for pair in self.sample.pairs if low <= pair[1] - pair[0] <= high]
-            if pairs:
-                error = np.concatenate([self.sample.met[pair].error for pair in pairs])
-                agree = np.concatenate([self.sample.agree(pair) for pair in pairs])
-                share = float(np.mean(error <= CONSISTENT))
-                agreement = float(agree.mean()) if len(agree) else math.nan
-                rows.append(Overlap((low, high), len(pairs), share, share, float(np.median(error)), agreement))
-        return rows
-
-    def noise(self) -> Noise:
-        """Return the distance of points from the nearest of another scan and of their own, and between rays."""
-        ranges = np.concatenate([met.range for met in self.sample.met.values()])
-        angle = float(np.median([scan.ray_angle for scan in self.sample.scans.values()]))
-        return Noise(self.sample.between, self.sample.spacing, angle * float(np.median(ranges)))
-
-    def suggestion(self, overlaps: Sequence[Overlap], scans: int, stride: int) -> Suggestion:
-        """Return voxel size and stride that suit so many scans, whose own stride is `stride`."""
-        size = suggested_size(self.sample)
-        stays = math.nan if size is None else self.sample.stays(size)
-        shared = {row.apart[0]: row.covisible for row in overlaps}
-        times = max((n for n in shared if shared[n] >= SHARED and scans >= FRAMES_LEFT * n), default=1)
-        share = shared.get(times, math.nan)
-        return Suggestion(
-            voxel_size=size,
-            voxel_size_reason=f"{stays:.0%} of the points have the nearest one of another scan in the same voxel",
-            pixel_stride=1,
-            pixel_stride_reason="all points",
-            frame_stride=stride * times,
-            frame_stride_reason=f"{share:.0%} of a scan's points lie on the surfaces of the next one",
-        )
-
-    def persistence(self, voxel_size: float) -> Persistence | None:
-        """Fuse the scans that were read for it, and count how often each voxel is seen.
-
-        None where points lie so far out that voxels of that size cannot be counted.
-        """
-        backend = create("numba", voxel_size=voxel_size, num_classes=2)
-        for position in self.sample.fused:
-            scan = self.sample.scans[position]
-            try:
-                backend.integrate(dataclasses.replace(scan, labels=np.zeros(scan.shape, np.uint8), scores=None))
-            except DataError:
-                return None
-        return distribution(backend.table().op, voxel_size, self.sample.stays(voxel_size))

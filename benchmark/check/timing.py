@@ -13,11 +13,12 @@ import numpy as np
 
 from semstab.check.conventions import Reading
 from semstab.check.geometry import LEAST_PAIRS
-from semstab.check.reprojection import Sample
+from semstab.check.reprojection import Pair, Sample
 from semstab.check.trials import clearly_falls, falls, fitted, middle
 from semstab.check.verdict import GOOD, MIN_GAIN, SIMPLER, Verdict
 from semstab.core.types import Float64
 from semstab.datasets import Scene
+from semstab.datasets.geometry.cameras import at_times
 from semstab.errors import DataError
 
 REACH = 2
@@ -111,12 +112,8 @@ def find_lateness(scene: Scene, sample: Sample, *, stamped: bool) -> Lateness | 
         sample: Frames that are compared.
         stamped: Whether poses are looked up by time, so that any shift can be mended.
     """
-    moved = PoseShift(scene, sample)
-    if len(moved.pairs) < LEAST_PAIRS:
-        return None
-    errors = functools.cache(moved.errors)
-    present = errors(0.0)
-    if not (before := middle(present)) > MIN_GAIN:
+    pairs, errors = _moved(scene, sample)
+    if len(pairs) < LEAST_PAIRS or not (before := middle(present := errors(0.0))) > MIN_GAIN:
         return None
     best = fitted(0.0, MOVES, errors)
     if not stamped and middle(errors(float(round(best)))) <= SIMPLER * middle(errors(best)):
@@ -134,40 +131,22 @@ def _period(scene: Scene) -> float:
     return float(np.median(np.diff(times))) if times is not None and len(times) > 1 else math.nan
 
 
-class PoseShift:
-    """The frames of a sample with the poses of other times.
+def _moved(scene: Scene, sample: Sample) -> tuple[list[Pair], Callable[[float], Float64]]:
+    """Return the pairs of frames that have poses within reach, and their errors with the poses so many frames later."""
+    known, views = dict(_poses_around(scene, sample)), sample.views
+    reach = {at for at, v in views.items() if all(v.index + k in known for k in range(-REACH, REACH + 1))}
+    pairs = [pair for pair in sample.pairs if {*pair} <= reach]
+    used = {at: views[at] for pair in pairs for at in pair}
+    indices, poses = np.array([*known], dtype=np.float64), np.array([*known.values()])
 
-    Attributes:
-        pairs: The pairs of frames that have poses within reach.
-    """
+    @functools.cache
+    def errors(shift: float) -> Float64:
+        wanted = np.array([view.index + shift for view in used.values()])
+        there = at_times(indices, poses, wanted, 1.0, "interpolate")
+        moved = {at: dataclasses.replace(view, T_wc=T) for (at, view), T in zip(used.items(), there, strict=True)}
+        return Sample(moved, pairs, sample.configured).by_pair()
 
-    def __init__(self, scene: Scene, sample: Sample) -> None:
-        self._sample = sample
-        self._poses = dict(_poses_around(scene, sample))
-        self.pairs = [(a, b) for a, b in sample.pairs if self._reaches(a) and self._reaches(b)]
-
-    def _reaches(self, position: int) -> bool:
-        index = self._sample.views[position].index
-        return all(index + k in self._poses for k in range(-REACH, REACH + 1))
-
-    def errors(self, shift: float) -> Float64:
-        """Return (pairs,) median relative error of depth with the poses `shift` frames later; NaN where few see."""
-        used = {position: self._sample.views[position] for pair in self.pairs for position in pair}
-        views = {at: dataclasses.replace(view, T_wc=self._between(view.index + shift)) for at, view in used.items()}
-        return Sample(views, self.pairs, self._sample.configured).by_pair()
-
-    def _between(self, at: float) -> Float64:
-        from scipy.spatial.transform import Rotation, Slerp
-
-        before = math.floor(at + 1e-9)
-        part, first = at - before, self._poses[before]
-        if part < 1e-6:
-            return first
-        second, T = self._poses[before + 1], np.eye(4)
-        rotations = Rotation.from_matrix(np.stack([first[:3, :3], second[:3, :3]]))
-        T[:3, :3] = Slerp([0, 1], rotations)([part]).as_matrix()[0]
-        T[:3, 3] = (1 - part) * first[:3, 3] + part * second[:3, 3]
-        return T
+    return pairs, errors
 
 
 def _poses_around(scene: Scene, sample: Sample) -> Iterator[tuple[int, Float64]]:

@@ -25,6 +25,9 @@ WON = 0.8
 LEAST_TOLD = 4
 """... of so many that tell."""
 
+BETTER_FIT, LEAST_FIT = 1.15, 0.08
+"""The factor by which edges of labels must correlate better with those of depth and colour, and the least."""
+
 TINY = 1e-9
 """Errors below this are none."""
 
@@ -39,12 +42,13 @@ class Judged(Protocol):
         """Return (pairs,) the error of each pair; NaN where it tells nothing."""
 
 
+T = TypeVar("T")
 D = TypeVar("D", bound=Judged)
 P = TypeVar("P", bound=Hashable)
 
 
 @dataclass(frozen=True)
-class Hypothesis(Generic[D]):
+class Hypothesis(Generic[T]):
     """A mistake that data may have.
 
     Attributes:
@@ -56,10 +60,10 @@ class Hypothesis(Generic[D]):
     """
 
     name: str
-    change: Callable[[D], D]
+    change: Callable[[T], T]
     mend: str
     options: Mapping[tuple[str, str], str] = field(default_factory=dict)
-    applies: Callable[[D], bool] = lambda data: True
+    applies: Callable[[T], bool] = lambda data: True
 
 
 @dataclass(frozen=True, eq=False)
@@ -128,6 +132,11 @@ class Contrast:
     def is_clear(self) -> bool:
         """Return whether the change is better beyond chance: one that was searched for always is a little."""
         return self.count >= LEAST_TOLD and self.z > CLEAR and self.won >= WON
+
+    @property
+    def fits_better(self) -> bool:
+        """Return whether correlations of edges are clearly better, and some."""
+        return self.is_clear and self.other >= max(LEAST_FIT, BETTER_FIT * self.given)
 
 
 def falls(errors: Float64, present: Float64, least: float = 0.0) -> Contrast:
