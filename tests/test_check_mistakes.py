@@ -12,7 +12,7 @@ from posed_writer import write_posed
 from semstab.check import geometry, quick_check
 from semstab.check.conventions import Convention
 from semstab.check.geometry import with_mistakes
-from semstab.check.hypotheses import CAMERAS, camera_poses, mistake
+from semstab.check.hypotheses import CAMERAS, angles, camera_poses, mistake
 from semstab.check.reprojection import Sample, View
 from semstab.datasets import open_dataset
 
@@ -80,18 +80,11 @@ def test_nothing_is_said_of_files_that_are_right(seed) -> None:
 
 
 def test_a_new_hypothesis_is_one_entry(monkeypatch) -> None:
-    """Positions whose x and y were exchanged: they are named once an entry says what it changes."""
-    exchange = np.eye(4)[[1, 0, 2, 3]]
-
-    def exchanged(T):
-        return np.column_stack([T[:, :3], exchange @ T[:, 3]])
-
-    frames = [dataclasses.replace(f, T_wc=exchanged(f.T_wc)) for f in doctor.scene(1)]
-    assert "positions with x and y exchanged" not in verdict(frames).text
-    entry = mistake("positions with x and y exchanged", camera_poses(exchanged), "exchange them")
+    """Angles twice as large: they are named once an entry says what it changes."""
+    frames = [dataclasses.replace(f, T_wc=angles(2.0)(f.T_wc)) for f in doctor.scene(1)]
+    entry = mistake("angles twice as large", camera_poses(angles(0.5)), "halve them")
     monkeypatch.setattr(geometry, "CAMERAS", (*CAMERAS, entry))
     found = verdict(frames)
     assert found.state == "unsound"
-    assert found.text.startswith("positions with x and y exchanged, as it seems")
-    assert found.text.endswith("; exchange them")
-    assert verdict(doctor.scene(1)).state == "sound"
+    assert found.text.startswith("angles twice as large, as it seems")
+    assert found.text.endswith("; halve them")
