@@ -20,8 +20,10 @@ import cases
 import cv2
 import numpy as np
 
+from semstab.check.inspection import Inspection
+from semstab.check.labels import label_findings
 from semstab.check.reprojection import clusters
-from semstab.check.scene_check import CLUSTERS, POINTS, Inspection, label_findings, quick_sample
+from semstab.check.scene_check import CLUSTERS, POINTS, quick_sample
 from semstab.data.frames import Frame, Intrinsics
 from semstab.data.labels import LabelSpace
 from semstab.datasets import Scene

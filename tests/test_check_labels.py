@@ -11,7 +11,10 @@ from command_line import bench
 from PIL import Image
 from posed_writer import write_posed
 
-from semstab.check.labels import alternatives, check_labels, id_remarks
+from semstab.check.label_ids import id_remarks
+from semstab.check.label_maps import MAPS, Run, Seen
+from semstab.check.labels import check_labels
+from semstab.check.reprojection import View
 from semstab.data.labels import LabelSpace
 
 NAMES = [f"{k:03d}" for k in range(doctor.FRAMES)]
@@ -94,7 +97,11 @@ def test_a_first_class_that_may_be_missing_is_no_remark():
     assert not [*id_remarks(maps, 255, void, maps)]
 
 
-def test_every_alternative_has_the_shape_of_the_map():
-    labels = np.arange(6 * 8, dtype=np.uint8).reshape(6, 8)
-    for each in alternatives(8, 6):
-        assert each.change(labels, 255).shape == labels.shape
+def test_every_hypothesis_has_maps_of_the_shape_of_the_given_ones(frames):
+    views = [View.of(frame, 500) for frame in frames[:5]]
+    run = Run([Seen(view, (), view.labels) for view in views])
+    assert all(each.applies(run) for each in MAPS)
+    others = [(each, each.change(run).maps) for each in MAPS]
+    assert {len(maps) for each, maps in others if "frame" not in each.name} == {5}
+    assert {len(maps) for each, maps in others if "frame" in each.name} == {3, 4}
+    assert all(labels.shape == views[0].labels.shape for _, maps in others for labels, _ in maps.values())

@@ -9,8 +9,10 @@ import numpy as np
 import pytest
 from posed_writer import write_posed
 
-from semstab.check import quick_check
-from semstab.check.mistakes import MISTAKES, with_mistakes
+from semstab.check import geometry, quick_check
+from semstab.check.conventions import Convention
+from semstab.check.geometry import with_mistakes
+from semstab.check.hypotheses import CAMERAS, angles, camera_poses, mistake
 from semstab.check.reprojection import Sample, View
 from semstab.datasets import open_dataset
 
@@ -32,7 +34,7 @@ def test_a_mistake_of_files_is_named_with_what_to_do(name) -> None:
     found = verdict(planted.plant(doctor.scene(1)))
     assert found.state == "unsound"
     assert planted.said in found.text
-    (mend,) = (mistake.mend for mistake in MISTAKES if planted.said in mistake.name)
+    (mend,) = (mistake.mend for mistake in CAMERAS if planted.said in mistake.name)
     assert found.text.endswith(mend)
     assert found.fits[1][1].error < found.fits[0][1].error or not found.fits[0][1].has_evidence
 
@@ -56,9 +58,9 @@ def test_a_thinned_image_is_mirrored_to_the_pixel(axes) -> None:
     """641 columns and 480 rows, every third pixel: the first pixel of the mirrored image is not that of the file."""
     frame = dataclasses.replace(doctor.scene(0)[0], depth=np.arange(480 * 641, dtype=np.float32).reshape(480, 641) + 1,
                                 labels=np.zeros((480, 641), np.uint8))  # fmt: skip
-    (mistake,) = (m for m in MISTAKES if m.name.endswith({(0,): "down", (1,): "right", (0, 1): "degrees"}[axes]))
+    (mistake,) = (m for m in CAMERAS if m.name.endswith({(0,): "down", (1,): "right", (0, 1): "degrees"}[axes]))
     view = View.of(frame, 500)
-    mended = mistake.mended(view, None)
+    mended = mistake.change(Sample({0: view}, [], Convention())).views[0]
     K, k = mended.camera.every(view.stride), frame.intrinsics
     for v, u in zip(mended.v[:50], mended.u[:50], strict=True):
         row, column = np.divmod(int(mended.depth[v, u]) - 1, 641)
@@ -75,3 +77,14 @@ def test_nothing_is_said_of_files_that_are_right(seed) -> None:
     sample = Sample(views, [(0, 3), (1, 4), (2, 5), (5, 0)], found.fits[0][1].convention)
     assert (found.state, found.remarks) == ("sound", ())
     assert with_mistakes(found, sample) is found
+
+
+def test_a_new_hypothesis_is_one_entry(monkeypatch) -> None:
+    """Angles twice as large: they are named once an entry says what it changes."""
+    frames = [dataclasses.replace(f, T_wc=angles(2.0)(f.T_wc)) for f in doctor.scene(1)]
+    entry = mistake("angles twice as large", camera_poses(angles(0.5)), "halve them")
+    monkeypatch.setattr(geometry, "CAMERAS", (*CAMERAS, entry))
+    found = verdict(frames)
+    assert found.state == "unsound"
+    assert found.text.startswith("angles twice as large, as it seems")
+    assert found.text.endswith("; halve them")

@@ -11,7 +11,9 @@ from command_line import bench
 from street import IDS, Street, write_street
 
 import semstab
-from semstab.check import check
+from semstab.check import check, scans
+from semstab.check.hypotheses import SCANS, scan_poses
+from semstab.check.trials import Hypothesis
 from semstab.configure import load_config
 from semstab.data.frames import Frame, Intrinsics
 from semstab.datasets import open_dataset
@@ -142,6 +144,14 @@ def test_a_mistake_of_the_poses_is_named_with_the_option_that_mends_it(name, fol
     (checked,) = check(config)
     assert checked.verdict.state == "unsound"
     assert mend in checked.verdict.text
+
+
+def test_a_new_hypothesis_of_scans_is_one_entry(street, monkeypatch, tmp_path):
+    turned = np.diag([1.0, -1, -1, 1])
+    write_street(tmp_path / "00", Street(street.scans, street.ids, [T @ turned for T in street.poses]))
+    entry = Hypothesis("poses turned about x", scan_poses(lambda T: T @ turned), "turn them back")
+    monkeypatch.setattr(scans, "SCANS", (*SCANS, entry))
+    assert checked_street(tmp_path).text.endswith("with poses turned about x; turn them back")
 
 
 @pytest.mark.parametrize(("seed", "rows"), [(0, 16), (1, 64)])

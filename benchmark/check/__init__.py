@@ -1,10 +1,9 @@
 """A check that a dataset makes sense: poses, depth, units, intrinsics, labels, and what voxels it can carry."""
 
-from semstab.check.geometry import Verdict
+from semstab.check.labels import Ordered
 from semstab.check.no_depth import with_invalid_depth
 from semstab.check.scene_check import (
     SCHEMA,
-    Ordered,
     SceneCheck,
     check,
     check_scene,
@@ -13,6 +12,7 @@ from semstab.check.scene_check import (
     refuse_unsound,
     require_sound,
 )
+from semstab.check.verdict import Verdict
 from semstab.check.voxel_size import advise, faces_in_surface, with_voxel_size
 
 __all__ = [

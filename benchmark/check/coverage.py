@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import contextlib
 import itertools
 import math
-from collections.abc import Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any, Protocol
 
@@ -12,13 +13,11 @@ import numpy as np
 import numpy.typing as npt
 
 from semstab.backends import create
-from semstab.check.reprojection import Pair, Sample, View
-from semstab.core.types import Float64, Int32, Int64, Mask
+from semstab.check.reprojection import Pair, Sample, Shared, View
+from semstab.core.types import Float64, Int64, Mask
 from semstab.data.frames import Frame
 from semstab.data.labels import IGNORE_8BIT
-
-CONSISTENT = 0.05
-"""A point that is seen again is taken for the same surface where the two depths differ by at most this share."""
+from semstab.errors import DataError
 
 FUSED_FRAMES = 24
 """Frames that are fused for the distribution of OP, evenly spaced over the selected ones."""
@@ -48,6 +47,23 @@ FRAMES_LEFT = 20
 
 BINS = ((1, 1), (2, 2), (3, 8), (9, 27))
 """Distances between frames that are reported together."""
+
+
+def by_distance(pairs: Iterable[Pair]) -> Iterator[tuple[tuple[int, int], list[Pair]]]:
+    """Yield the distances between frames that are reported together, with the pairs that lie so far apart, if any."""
+    known = [*pairs]
+    for low, high in BINS:
+        if near := [(a, b) for a, b in known if low <= abs(a - b) <= high]:
+            yield (low, high), near
+
+
+def said(apart: tuple[int, int]) -> str:
+    """Return distances between frames in words.
+
+    >>> said((1, 1)), said((3, 8))
+    ('1', '3 to 8')
+    """
+    return " to ".join(map(str, dict.fromkeys(apart)))
 
 
 @dataclass(frozen=True)
@@ -154,6 +170,11 @@ class Faces:
 class Coverage:
     """The share of a scene that the views of a sample have in common under the configured convention."""
 
+    reasons = (
+        "{:.0%} of the points stay in such a voxel when another frame sees them",
+        "successive frames share {:.0%} of their view",
+    )
+
     def __init__(self, sample: Sample) -> None:
         self.sample = sample
         one = np.array([1.0])
@@ -162,12 +183,7 @@ class Coverage:
 
     def overlaps(self) -> list[Overlap]:
         """Return one row a distance between frames."""
-        rows = []
-        for low, high in BINS:
-            pairs = [(a, b) for a, b in self.sample.pairs if low <= abs(a - b) <= high]
-            if pairs:
-                rows.append(self._overlap((low, high), pairs))
-        return rows
+        return [self._overlap(apart, pairs) for apart, pairs in by_distance(self.sample.pairs)]
 
     def noise(self) -> Noise:
         """Return how far depth is off, between frames and within one."""
@@ -203,6 +219,14 @@ class Coverage:
         names = tuple(name for name, is_one in zip("xyz", axes.tolist(), strict=True) if is_one)
         return Faces(voxel_size, names, self.stays(voxel_size), _mean(np.all(off, axis=1)))
 
+    def pixel_stride(self, voxel_size: float | None) -> tuple[int | None, str]:
+        """Return the pixel stride that leaves some pixels along a voxel's edge, and the reason."""
+        views = self.sample.views.values()
+        far = float(np.percentile(np.concatenate([view.depth[view.v, view.u] for view in views]), 95))
+        footprint = far / min(view.camera.fx for view in views)
+        pixels = None if voxel_size is None else max(1, int(voxel_size / (PIXELS_ACROSS * footprint)))
+        return pixels, f"{PIXELS_ACROSS} pixels or more along a voxel's edge at {far:.3g} m"
+
     def _same_along(self, voxel_size: float, phase: Float64) -> Mask:
         """Return (n, 3) whether points seen again lie between the same faces of a grid moved by a part of a voxel."""
         seen = [one for one in self._seen.values() if len(one.first)]
@@ -227,21 +251,17 @@ class Coverage:
     def _same_surface(self, pair: Pair) -> Seen:
         a, b = self.sample.views[pair[0]], self.sample.views[pair[1]]
         match = self._matches[pair]
-        same = match.error[0] <= CONSISTENT
-        u, v, depth = match.u[0][same], match.v[0][same], match.depth[0][same]
-        agree = np.empty(0, dtype=np.bool_)
-        if a.labels is not None and b.labels is not None:
-            first, second = a.labels[a.v[same], a.u[same]], b.labels[v, u]
-            agree = (first == second)[(first != a.ignore_id) & (second != b.ignore_id)]
+        same = Shared.of(a, match)
+        first, second = same.labels(a.labels, b.labels, a.ignore_id, b.ignore_id)
         return Seen(
-            offset=np.abs(depth - match.z[0][same]),
-            first=world_points(a, a.u[same], a.v[same]),
-            second=world_points(b, u, v),
-            agree=agree,
+            offset=np.abs(match.depth - match.z)[0][same.chosen],
+            first=world_points(a, *same.first),
+            second=world_points(b, *same.second),
+            agree=first == second,
         )
 
 
-def world_points(view: View, u: Int64, v: Int64) -> Float64:
+def world_points(view: View, v: Int64, u: Int64) -> Float64:
     """Return (N, 3) world coordinates of sampled pixels, metres."""
     K = view.camera.every(view.stride)
     depth = view.depth[v, u].astype(np.float64)
@@ -264,23 +284,19 @@ def plane_residuals(view: View) -> Float64:
     return finite
 
 
-def persistence(views: Sequence[View], coverage: Coverage, voxel_size: float, pixel_stride: int) -> Persistence:
-    """Fuse the views, every n-th pixel of them, and count how often each voxel is seen.
+def persistence(frames: Iterable[Frame], coverage: Covers, voxel_size: float) -> Persistence | None:
+    """Fuse frames and count how often each voxel is seen.
 
-    Raises:
-        DataError: If a point lies further out than voxels of that size are counted.
+    None where points lie so far out that voxels of that size cannot be counted.
     """
     backend = create("numba", voxel_size=voxel_size, num_classes=2)
-    for view in views:
-        backend.integrate(_without_labels(view, pixel_stride))
-    return distribution(backend.table().op, voxel_size, coverage.stays(voxel_size))
-
-
-def distribution(op: Int32, voxel_size: float, stays: float) -> Persistence:
-    """Return the distribution of OP (n,) over voxels of that size, in which that share of the points stays."""
-    edges = [0, 1, 2, 5, np.inf]
-    shares = tuple(_mean((low < op) & (op <= high)) for low, high in itertools.pairwise(edges))
-    return Persistence(voxel_size, len(op), _mean(op), shares, stays)
+    with contextlib.suppress(DataError):
+        for frame in frames:
+            backend.integrate(frame)
+        op, edges = backend.table().op, [0, 1, 2, 5, np.inf]
+        shares = tuple(_mean((low < op) & (op <= high)) for low, high in itertools.pairwise(edges))
+        return Persistence(voxel_size, len(op), _mean(op), shares, coverage.stays(voxel_size))
+    return None
 
 
 def fused_stride(size: tuple[int, int], pixel_stride: int) -> int:
@@ -288,23 +304,39 @@ def fused_stride(size: tuple[int, int], pixel_stride: int) -> int:
     return max(pixel_stride, math.ceil(math.sqrt(size[0] * size[1] / FUSED_PIXELS)))
 
 
-def _without_labels(view: View, pixel_stride: int) -> Frame:
+def without_labels(view: View, pixel_stride: int) -> Frame:
+    """Return every n-th pixel of a view, as a frame of one class."""
     step = max(1, fused_stride(view.size, pixel_stride) // view.stride)
     labels = np.where((view.depth > 0) & (view.depth < np.inf), 0, IGNORE_8BIT).astype(np.uint8)
     return Frame(view.index, view.depth, view.camera.every(view.stride), view.T_wc, labels=labels).every(step)
 
 
-class Stays(Protocol):
-    """What tells which share of the points stays in its voxel."""
+class Covers(Protocol):
+    """What frames, or scans, share with each other.
+
+    Attributes:
+        reasons: Why a voxel size is suggested, and a frame stride, with a place for the share of the points.
+    """
+
+    reasons: tuple[str, str]
+
+    def overlaps(self) -> list[Overlap]:
+        """Return one row a distance between frames."""
+
+    def noise(self) -> Noise:
+        """Return how far points are off, between frames and within one."""
 
     def stays(self, voxel_size: float) -> float:
-        """Return that share for a voxel size in metres; NaN where no point is seen again."""
+        """Return the share of the points that stay in their voxel; NaN where no point is seen again."""
 
     def faces(self, voxel_size: float) -> Faces | None:
         """Return the axes along which faces of voxels lie in a surface; None where they do not."""
 
+    def pixel_stride(self, voxel_size: float | None) -> tuple[int | None, str]:
+        """Return the pixel stride that suits a voxel size, and the reason."""
 
-def suggested_size(coverage: Stays) -> float | None:
+
+def suggested_size(coverage: Covers) -> float | None:
     """Return the smallest voxel size in which points fall again, metres; None where frames do not see the same.
 
     Where faces of voxels lie in a surface, the grid is taken half a voxel off: a larger voxel does not mend that.
@@ -312,36 +344,30 @@ def suggested_size(coverage: Stays) -> float | None:
     return next((size for size in SIZES if _stays_off_faces(coverage, size) >= STAYS), None)
 
 
-def _stays_off_faces(coverage: Stays, size: float) -> float:
+def _stays_off_faces(coverage: Covers, size: float) -> float:
     faces = coverage.faces(size)
     return coverage.stays(size) if faces is None else faces.moved
 
 
-def suggest(coverage: Coverage, overlaps: Sequence[Overlap], frames: int, stride: int) -> Suggestion:
+def suggest(coverage: Covers, overlaps: Sequence[Overlap], frames: int, stride: int) -> Suggestion:
     """Return voxel size, pixel stride and frame stride that suit so many frames, whose own stride is `stride`."""
-    voxel_size = suggested_size(coverage)
-    views = coverage.sample.views.values()
-    far = float(np.percentile(np.concatenate([view.depth[view.v, view.u] for view in views]), 95))
-    footprint = far / min(view.camera.fx for view in views)
-    pixels = None if voxel_size is None else max(1, int(voxel_size / (PIXELS_ACROSS * footprint)))
+    size = suggested_size(coverage)
     shared = {row.apart[0]: row.in_view for row in overlaps}
     times = max((n for n in shared if shared[n] >= SHARED and frames >= FRAMES_LEFT * n), default=1)
-    stays = math.nan if voxel_size is None else _stays_off_faces(coverage, voxel_size)
-    off = voxel_size is not None and stays != coverage.stays(voxel_size)
+    stays = math.nan if size is None else _stays_off_faces(coverage, size)
+    off = size is not None and stays != coverage.stays(size)
+    share, (of_voxels, of_frames) = shared.get(times, math.nan), coverage.reasons
     return Suggestion(
-        voxel_size=voxel_size,
-        voxel_size_reason=f"{stays:.0%} of the points stay in such a voxel when another frame sees them"
-        f"{', where its faces lie in no surface' if off else ''}",
-        pixel_stride=pixels,
-        pixel_stride_reason=f"{PIXELS_ACROSS} pixels or more along a voxel's edge at {far:.3g} m",
+        size,
+        f"{of_voxels.format(stays)}{', where its faces lie in no surface' if off else ''}",
+        *coverage.pixel_stride(size),
         frame_stride=stride * times,
-        frame_stride_reason=_shared(shared.get(times, math.nan)),
+        frame_stride_reason=f"{of_frames.format(share)}{_few(share)}",
     )
 
 
-def _shared(share: float) -> str:
-    few = f", less than {SHARED:.0%}: more frames help" if share < SHARED else ""
-    return f"successive frames share {share:.0%} of their view{few}"
+def _few(share: float) -> str:
+    return f", less than {SHARED:.0%}: more frames help" if share < SHARED else ""
 
 
 def _mean(values: npt.NDArray[Any]) -> float:

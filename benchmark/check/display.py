@@ -11,7 +11,7 @@ from rich.markup import escape
 from rich.padding import Padding
 from rich.table import Table
 
-from semstab.check.coverage import FUSED_FRAMES
+from semstab.check.coverage import FUSED_FRAMES, said
 from semstab.check.scene_check import SceneCheck
 from semstab.core.console import Console
 from semstab.data.labels import IGNORE_16BIT
@@ -105,10 +105,9 @@ def _overlap_table(checked: SceneCheck) -> Table:
     numbers = ("pairs", "in view\n%", "co-visible\n%", "error\n%", f"labels{of}\nagree %")
     table = _table(("frames apart",), numbers)
     for row in checked.overlaps:
-        low, high = row.apart
         shares = (row.in_view, row.covisible)
         table.add_row(
-            str(low) if low == high else f"{low} to {high}",
+            said(row.apart),
             str(row.pairs),
             *(_percent(share, 1) for share in shares),
             _percent(row.error, 2),

@@ -8,15 +8,16 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Iterator
 from functools import cached_property
-from typing import Any, Literal
 
 import numpy as np
 
-from semstab.check.conventions import Convention, Reading, alternatives
-from semstab.check.reprojection import Sample, median_of_seen
+from semstab.check.conventions import Reading, alternatives
+from semstab.check.hypotheses import CAMERAS
+from semstab.check.reprojection import Sample
+from semstab.check.trials import falls, ranked
+from semstab.check.verdict import GOOD, LEAST_OF_OTHER, SIMPLER, Fit, State, Verdict
 from semstab.core.types import Float64
 
 DECADES: Float64 = np.power(10.0, np.arange(-5, 6))
@@ -26,26 +27,8 @@ FINE: Float64 = np.power(10.0, np.arange(-30, 31) / 6)
 LARGEST_FACTOR = 1e4
 """Factors from 1 / this to this are reported."""
 
-MIN_POINTS = 100
-MIN_SHARE = 0.03
-"""A convention under which fewer points are seen again, in number or share, has no evidence for or against it."""
-
-LEAST_OF_OTHER = 0.2
-"""The least part of what the configured convention sees that an alternative must see again, too."""
-
-BETTER = 0.75
-MIN_GAIN = 0.001
-"""An error is clearly lower where it is at most this part of the other one, and lower by this (0.1 points)."""
-
-WON_PAIRS = 0.8
-"""An alternative must also be better in this share of the pairs of frames that both see, of those with ..."""
-
-PAIR_POINTS = 20
 LEAST_PAIRS = 3
-"""The least pairs with enough points seen again; where fewer have, it must stand out from all others instead."""
-
-GOOD = 0.05
-"""A convention with a larger error is not proposed, and as configured it is not called sound."""
+"""The least pairs with enough points seen again; where fewer have, an alternative must stand out from all others."""
 
 MOST_ERROR = {3: 0.02, 4: 0.02, 5: 0.02}
 """The largest error of a convention that changes so many settings at once: of many combinations one fits a little."""
@@ -67,85 +50,17 @@ SCALE_APART = 2.5
 LEAST_SCALE_ERROR = 1.1
 """Depth that is too long or too short by less is measurement, not a wrong unit."""
 
+MISTAKEN = 0.5
+"""A mistake is named where its mend leaves at most this part of the error; files have to be written anew for it."""
+
 MOST_CANDIDATES = 3
 """Alternatives that are named in addition to the best one, where they fit as well."""
-
-SIMPLER = 1.1
-"""The factor within which errors of conventions count as equal: the one with the fewest changes is taken."""
 
 HARDLY_MOVES = 0.01
 HARDLY_TURNS = 1.0
 HARDLY_DEEP = 1.05
 """Limits below which a reason says what frames cannot tell: motion as a share of depth, degrees, and the ratio of
 the 90th to the 10th percentile of depth."""
-
-State = Literal["sound", "imprecise", "unsound", "unclear"]
-
-
-@dataclass(frozen=True)
-class Fit:
-    """The error of depth that is reprojected under a convention.
-
-    Attributes:
-        error: Median relative depth error of the points that are seen again; NaN where none is.
-        share: Share of the sampled points that are seen again, 0 to 1.
-        points: Their number.
-    """
-
-    convention: Convention
-    error: float
-    share: float
-    points: int
-
-    @property
-    def has_evidence(self) -> bool:
-        """Return whether enough points are seen again for the error to count."""
-        return self.points >= MIN_POINTS and self.share >= MIN_SHARE
-
-    def clearly_beats(self, other: Fit) -> bool:
-        """Return whether its error is clearly lower; one with enough overlap beats one with too little."""
-        if not other.has_evidence or other.share < LEAST_OF_OTHER * self.share:
-            return True
-        return self.error <= min(BETTER * other.error, other.error - MIN_GAIN)
-
-
-@dataclass(frozen=True)
-class Verdict:
-    """The outcome of a check of the geometry.
-
-    Attributes:
-        state: Sound; imprecise, where depth agrees far worse than its noise explains; unsound; or unclear, where the
-            frames do not tell.
-        text: The reason, in one line.
-        mend: Lines of configuration that would mend it, where they are known.
-        error, share: Those of the configured convention, see `Fit`.
-        frames, pairs: Numbers of those that were looked at.
-        undetermined: Parts of it that these frames cannot tell, because an alternative fits as well, and the reason
-            where it is known.
-        remarks: Lines on what looks wrong but leaves the state.
-        fits: The configured convention and the alternatives of interest, by name.
-    """
-
-    state: State
-    text: str
-    mend: tuple[str, ...] = ()
-    error: float = math.nan
-    share: float = 0.0
-    frames: int = 0
-    pairs: int = 0
-    undetermined: tuple[str, ...] = ()
-    reason: str = ""
-    remarks: tuple[str, ...] = ()
-    fits: tuple[tuple[str, Fit], ...] = ()
-
-    def summary(self) -> dict[str, Any]:
-        """Return the part that a run's manifest holds."""
-        return {name: getattr(self, name) for name in ("state", "text", "error", "share", "frames", "pairs")}
-
-    def to_dict(self) -> dict[str, Any]:
-        """Return the JSON object."""
-        rows = [{"name": name, **dataclasses.asdict(fit)} for name, fit in self.fits]
-        return {field.name: getattr(self, field.name) for field in dataclasses.fields(self)} | {"fits": rows}
 
 
 def assess(sample: Sample, reading: Reading, *, thorough: bool) -> Verdict:
@@ -249,7 +164,7 @@ class Assessment:
             return fit
         measured = min([fit, *self._measured_scale(fit)], key=lambda one: one.error)
         factor = self.reading.usual_factor(measured.convention.factor, fit.convention.depth)
-        (known,) = fits_of(self.sample, fit.convention, np.array([factor]))
+        (known,) = self.sample.fits(fit.convention, np.array([factor]))
         return measured if measured.clearly_beats(known) else known
 
     def _may_refute(self, fit: Fit) -> bool:
@@ -272,12 +187,13 @@ class Assessment:
     def _is_confirmed(self, fit: Fit) -> bool:
         if fit.convention.factor != 1 and not self._scale_is_told(fit):
             return False
-        won = self._won_pairs(fit) if self.configured.has_evidence else []
-        return sum(won) >= WON_PAIRS * len(won) if len(won) >= LEAST_PAIRS else self._stands_out(fit)
+        won = falls(self.sample.by_pair(fit.convention), self.sample.by_pair())
+        told = self.configured.has_evidence and won.count >= LEAST_PAIRS
+        return won.wins if told else self._stands_out(fit)
 
     def _scale_is_told(self, fit: Fit) -> bool:
         """Return whether depth ten times as long and as short fits clearly worse: not where the camera hardly moves."""
-        others = fits_of(self.sample, fit.convention, fit.convention.factor * np.array([0.1, 10]))
+        others = self.sample.fits(fit.convention, fit.convention.factor * np.array([0.1, 10]))
         return all(fit.clearly_beats(other) for other in others)
 
     def _stands_out(self, fit: Fit) -> bool:
@@ -288,13 +204,6 @@ class Assessment:
             for one in near
         )
         return all(_one_hypothesis(fit, other) or self._moves_alike(fit, other) for other in same_depth)
-
-    def _won_pairs(self, fit: Fit) -> list[bool]:
-        """Return for each pair of frames where both see enough whether the alternative has the lower error."""
-        errors = [
-            self.sample.errors(one.convention, np.array([one.convention.factor])) for one in (fit, self.configured)
-        ]
-        return pairs_won(*errors)
 
     def _moves_alike(self, fit: Fit, other: Fit) -> bool:
         """Return whether two conventions give the same motion between the frames.
@@ -313,9 +222,9 @@ class Assessment:
 
         The first ones lie between those of the search, the others nearer.
         """
-        coarse = fits_of(self.sample, near.convention, near.convention.factor * np.power(10.0, np.arange(-12, 13) / 72))
+        coarse = self.sample.fits(near.convention, near.convention.factor * np.power(10.0, np.arange(-12, 13) / 72))
         best = min(coarse, key=lambda fit: (math.isnan(fit.error), fit.error)).convention
-        fine = fits_of(self.sample, best, best.factor * np.power(10.0, np.arange(-10, 11) / 720))
+        fine = self.sample.fits(best, best.factor * np.power(10.0, np.arange(-10, 11) / 720))
         return [fit for fit in (*coarse, *fine) if fit.convention != near.convention]
 
     def _refuted(self, best: Fit) -> Verdict:
@@ -373,25 +282,7 @@ def _all_fits(sample: Sample, reading: Reading, thorough: bool) -> Iterator[Fit]
     for convention in alternatives(sample.configured, reading.ratios):
         known_camera = convention.ratio == (1.0, 1.0)
         factors = (FINE if thorough or convention == sample.configured else DECADES) if known_camera else one
-        yield from fits_of(sample, convention, factors)
-
-
-def fits_of(sample: Sample, convention: Convention, factors: Float64) -> list[Fit]:
-    """Return the fit under a convention with each of the factors (F,) on depth."""
-    errors = sample.errors(convention, factors)
-    pooled = np.concatenate(errors, axis=1) if errors else np.empty((len(factors), 0))
-    points = np.isfinite(pooled).sum(axis=1)
-    medians = median_of_seen(pooled) if pooled.size else np.full(len(factors), np.nan)
-    return [
-        Fit(dataclasses.replace(convention, factor=f), median, n / max(1, pooled.shape[1]), n)
-        for f, median, n in zip(factors.tolist(), medians.tolist(), points.tolist(), strict=True)
-    ]
-
-
-def pairs_won(errors: Sequence[Float64], others: Sequence[Float64]) -> list[bool]:
-    """Return for each pair of frames where both see enough whether the first has the lower median of errors (1, N)."""
-    rows = [[(float(median_of_seen(e)[0]), int(np.isfinite(e).sum())) for e in each] for each in (errors, others)]
-    return [a < b for (a, m), (b, n) in zip(*rows, strict=True) if min(m, n) >= PAIR_POINTS]
+        yield from sample.fits(convention, factors)
 
 
 def _one_hypothesis(fit: Fit, other: Fit) -> bool:
@@ -430,3 +321,22 @@ def _reason(sample: Sample) -> str:
         "all depths are alike": spread < HARDLY_DEEP,
     }
     return " and ".join(reason for reason, holds in reasons.items() if holds)
+
+
+def with_mistakes(verdict: Verdict, sample: Sample) -> Verdict:
+    """Return the verdict, or that the files hold a mistake, where depth agrees far better without it."""
+    if not sample.views or not sample.pairs or not verdict.fits:
+        return verdict
+    now, best = verdict.fits[0][1], ranked(CAMERAS, sample)[0]
+    others = [other for _, other in verdict.fits if other.has_evidence]
+    if not best.fit.has_evidence or best.fit.error > GOOD or not all(map(best.fit.clearly_beats, others)):
+        return verdict
+    if now.has_evidence and (len(sample.pairs) < LEAST_PAIRS or not best.is_right(sample, now, MISTAKEN)):
+        return verdict
+    found, error = best.hypothesis, f"reprojects with {now.error:.1%} error"
+    agrees = error if now.has_evidence else "hardly reprojects at all"
+    text = (
+        f"{found.name}, as it seems: depth {agrees}, but with {best.fit.error:.2%} without this mistake; {found.mend}"
+    )
+    fits = (verdict.fits[0], (f"without {found.name}", best.fit), *verdict.fits[1:])
+    return dataclasses.replace(verdict.refuted(text), fits=fits)

@@ -3,16 +3,18 @@
 from __future__ import annotations
 
 import dataclasses
+import functools
 import re
-from collections.abc import Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
 from semstab.check.conventions import Reading
-from semstab.check.geometry import GOOD, LEAST_PAIRS, MIN_GAIN, SIMPLER, Verdict
+from semstab.check.geometry import LEAST_PAIRS
 from semstab.check.reprojection import Sample, View
-from semstab.check.timing import clearly_lower, mean_log, median_by_pair, middle
+from semstab.check.trials import clearly_falls, fitted, middle
+from semstab.check.verdict import GOOD, MIN_GAIN, SIMPLER, Verdict
 from semstab.core.types import Float64
 from semstab.data.frames import Intrinsics
 
@@ -22,13 +24,15 @@ FACTORS = (0.5, 0.7, 0.8, 0.9, 0.95, 1.0, 1.05, 1.1, 1.25, 1.4, 2.0)
 SHIFTS = (-0.1, -0.05, -0.02, 0.0, 0.02, 0.05, 0.1)
 """Shifts of the principal point that are tried, in widths of the image."""
 
-FINE = np.linspace(-1, 1, 5)
+FINE = (-1.0, -0.5, 0.0, 0.5, 1.0)
+FACTOR_NEAR, SHIFT_NEAR = 0.12, 0.04
+"""Nearer ones: so far from the best at most, the focal length as a share of it, ..."""
+
+SPREADS = (1 / 3, 1 / 9)
+"""... and in each further round over so much of that."""
 
 SCALES = np.power(10.0, np.arange(-10, 11) / 100)
 """Factors on depth, 0.8 to 1.26, that are no other intrinsics."""
-
-ROUNDS = 3
-"""Focal length and principal point are fitted in turn so often, each time over a third of the range."""
 
 LEAST_FACTOR, LEAST_SHIFT = 0.02, 0.01
 """A smaller change of the focal length, or of the principal point in widths of the image, is not named."""
@@ -95,14 +99,12 @@ def with_intrinsics(verdict: Verdict, sample: Sample, how: Reading) -> Verdict:
     """
     if verdict.mend and not _is_a_guess(verdict, how):
         return verdict
-    fit = fitted(sample)
+    fit = find_camera(sample)
     if fit is None or (verdict.mend and SIMPLER * fit.error > verdict.fits[1][1].error):
         return verdict
     if fit.error > REFUSED * fit.present and verdict.state != "unsound":
-        return dataclasses.replace(verdict, remarks=(*verdict.remarks, fit.text()))
-    return dataclasses.replace(
-        verdict, state="unsound", text=f"{fit.text()}; correct the intrinsics", mend=(), undetermined=(), reason=""
-    )
+        return verdict.remarking(fit.text())
+    return verdict.refuted(f"{fit.text()}; correct the intrinsics")
 
 
 def _is_a_guess(verdict: Verdict, how: Reading) -> bool:
@@ -113,77 +115,53 @@ def _is_a_guess(verdict: Verdict, how: Reading) -> bool:
     return name == "intrinsics_size" or bool(re.fullmatch(r"[\d.e+-]+", value) and not how.is_usual(float(value)))
 
 
-def fitted(sample: Sample) -> CameraFit | None:
+def find_camera(sample: Sample) -> CameraFit | None:
     """Return the intrinsics under which depth reprojects clearly better than as configured; None where none do.
 
-    Focal length and principal point are fitted in turn to the mean logarithm of the median errors of pairs of frames.
+    Focal length and principal point are fitted in turn.
     """
-    if len(sample.pairs) < LEAST_PAIRS:
+    errors = functools.cache(lambda camera: sample.of({at: camera.of(v) for at, v in sample.views.items()}).by_pair())
+    if len(sample.pairs) < LEAST_PAIRS or not middle(present := errors(Camera())) > MIN_GAIN:
         return None
-    present = _errors(sample, Camera())
-    if not middle(present) > MIN_GAIN:
+    best = _simplest(fitted(Camera(), _moves(), errors), errors)
+    error = middle(errors(best))
+    if best == Camera() or error > GOOD or not clearly_falls(errors(best), present):
         return None
-    best = _simplest(sample, _fit(sample))
-    errors = _errors(sample, best)
-    if best == Camera() or middle(errors) > GOOD or not clearly_lower(errors, present):
-        return None
-    if min(middle(_scaled(sample, factor)) for factor in SCALES.tolist()) <= SIMPLER * middle(errors):
+    if min(middle(_scaled(sample, factor)) for factor in SCALES.tolist()) <= SIMPLER * error:
         return None  # a depth that is a little too long or too short explains it as well
     first = next(iter(sample.views.values()))
-    return CameraFit(best, best.of(first).camera, first.camera, middle(errors), middle(present))
+    return CameraFit(best, best.of(first).camera, first.camera, error, middle(present))
 
 
-def _fit(sample: Sample) -> Camera:
-    best, spread = Camera(), 1.0
-    for _ in range(ROUNDS):
-        for tried in (_focal_lengths, _to_the_right, _down):
-            best = min((best, *tried(best, spread)), key=lambda camera: mean_log(_errors(sample, camera)))
-        spread /= 3
-    return best
+def _moves() -> Iterator[Callable[[Camera], list[Camera]]]:
+    """Yield which focal lengths, then shifts of the principal point, are tried next to the best camera so far."""
+    whole = (("factor", FACTORS), ("right", SHIFTS), ("down", SHIFTS))
+    for name, values in whole:
+        yield functools.partial(_others, name, values, 0.0)
+    for spread in SPREADS:
+        for name, _ in whole:
+            yield functools.partial(_others, name, FINE, spread)
 
 
-def _focal_lengths(best: Camera, spread: float) -> list[Camera]:
-    """Return cameras of other focal lengths: in the whole range, or around the best in a part of it."""
-    values = FACTORS if spread == 1 else [best.factor * (1 + 0.12 * spread * part) for part in FINE.tolist()]
-    return [dataclasses.replace(best, factor=value) for value in values]
+def _others(name: str, values: Sequence[float], spread: float, best: Camera) -> list[Camera]:
+    """Return cameras with these values of a field, or where there is a spread, with values so far from the best."""
+    now = getattr(best, name)
+    reach = spread * (FACTOR_NEAR * now if name == "factor" else SHIFT_NEAR)
+    return [dataclasses.replace(best, **{name: now + reach * each if spread else each}) for each in values]
 
 
-def _to_the_right(best: Camera, spread: float) -> list[Camera]:
-    return [dataclasses.replace(best, right=value) for value in _shifts(best.right, spread)]
-
-
-def _down(best: Camera, spread: float) -> list[Camera]:
-    return [dataclasses.replace(best, down=value) for value in _shifts(best.down, spread)]
-
-
-def _shifts(best: float, spread: float) -> Sequence[float]:
-    return SHIFTS if spread == 1 else [best + 0.04 * spread * part for part in FINE.tolist()]
-
-
-def _simplest(sample: Sample, best: Camera) -> Camera:
+def _simplest(best: Camera, errors: Callable[[Camera], Float64]) -> Camera:
     """Return the camera without the changes that hardly matter."""
-    simpler = best
-    for neutral, small in (
-        ({"factor": 1.0}, abs(best.factor - 1) < LEAST_FACTOR),
-        ({"right": 0.0}, abs(best.right) < LEAST_SHIFT),
-        ({"down": 0.0}, abs(best.down) < LEAST_SHIFT),
-    ):
-        without = Camera(**{**dataclasses.asdict(simpler), **neutral})
-        if small or middle(_errors(sample, without)) <= SIMPLER * middle(_errors(sample, simpler)):
-            simpler = without
-    return simpler
+    for name, least in (("factor", LEAST_FACTOR), ("right", LEAST_SHIFT), ("down", LEAST_SHIFT)):
+        neutral = getattr(Camera(), name)
+        without = dataclasses.replace(best, **{name: neutral})
+        small = abs(getattr(best, name) - neutral) < least
+        if small or middle(errors(without)) <= SIMPLER * middle(errors(best)):
+            best = without
+    return best
 
 
 def _scaled(sample: Sample, factor: float) -> Float64:
     """Return (pairs,) median relative error of depth that is so many times as long."""
-    views = {
-        position: dataclasses.replace(view, depth=view.depth * np.float32(factor))
-        for position, view in sample.views.items()
-    }
-    return median_by_pair(Sample(views, sample.pairs, sample.configured))
-
-
-def _errors(sample: Sample, camera: Camera) -> Float64:
-    """Return (pairs,) median relative error of depth under changed intrinsics; NaN where few points are seen."""
-    views = {position: camera.of(view) for position, view in sample.views.items()}
-    return median_by_pair(Sample(views, sample.pairs, sample.configured))
+    longer = {at: dataclasses.replace(v, depth=v.depth * np.float32(factor)) for at, v in sample.views.items()}
+    return sample.of(longer).by_pair()

@@ -1,196 +1,162 @@
-"""Label maps from frame to frame: ids that are renamed from a frame on, maps that are empty or of one class."""
+"""Label maps that fit another way from a frame on, or are those of these frames in another order."""
 
 from __future__ import annotations
 
-import itertools
-import math
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
-from semstab.check.continuity import Chain, MapContent, Neighbours
-from semstab.core.types import Int64, Mask
+from semstab.check.label_maps import IN_A_RUN, STEPS, Run, Seen, agreements, frames_of, readable, shared_of, side_of
+from semstab.check.trials import BETTER_FIT, LEAST_FIT, LEAST_TOLD, Contrast, Hypothesis
+from semstab.core.arrays import evenly
+from semstab.core.types import Float64, Int64
+from semstab.datasets import Scene
 
-LEAST_POINTS = 15
-"""Points of a class that tell what its id is in another frame, ..."""
+FEWER = 0.85
+"""The part of the disagreement that remains in the right order."""
 
-MOSTLY = 0.5
-"""... and the share of them that must have that id."""
+MOST_ORDERED, ORDER_COLUMNS, ORDER_PIXELS = 200, 64, 200 * 640 * 480
+"""Frames whose maps are looked for among those of all others, their edges on a grid of so many columns; the pixels of
+all of them, ..."""
 
-LEAST_RENAMED = 2
-"""Classes whose ids change at once: a model that changes its mind about one thing renames one."""
+QUICK_PIXELS = 44 * 640 * 480
+"""... and those of a quick check."""
 
-REACH = 8
-"""Frames on each side of a place, in the chain, that tell whether ids stay there."""
+SAME_ORDER = 0.8
+"""Share of the maps that an order explains."""
 
-ROLLING = 0.5
-"""Share of the places that tell at which ids change: from then on they change from frame to frame."""
 
-MANY = 4
-"""A map of one class is remarkable where those around it have so many, and agree less with it than usual."""
-
-MOST_NAMED = 5
+# --- from a frame on -------------------------------------------------------------------------------------------------
 
 
 @dataclass(frozen=True)
-class Renaming:
-    """Ids that change from one frame to the next.
-
-    Attributes:
-        at: Place in the chain of the first frame after it.
-        ids: Ids before, and after.
-        share: Share of the points of these classes that follow it.
-        tells: Whether enough classes are seen for any to be found.
-    """
+class Turn:
+    """A frame from which on maps are otherwise: of their fits as given and otherwise the better one changes there."""
 
     at: int
-    ids: tuple[tuple[int, int], ...]
-    share: float
-    tells: bool
+    before: Contrast
+    after: Contrast
+
+    @classmethod
+    def of(cls, rows: Sequence[tuple[int, float, float]]) -> Turn:
+        """Find the place at which the sum of the better fits is largest, of index, given and other fit of frames."""
+        _, given, other = np.reshape(rows, (-1, 3)).T
+        gain = np.nan_to_num(np.subtract(other, given))
+        sums = [gain[k:].sum() - gain[:k].sum() for k in range(len(gain), -1, -1)]
+        at = len(gain) - int(np.argmax(sums))  # the last one of several
+        return cls(at, Contrast.of(other[:at], given[:at]), Contrast.of(given[at:], other[at:]))
+
+    @property
+    def is_one(self) -> bool:
+        """Return whether maps fit clearly better as given before it, and otherwise after it."""
+        return self.before.fits_better and self.after.fits_better
 
 
-class Ids:
-    """The ids of points that two frames of a chain see, counted between places in it.
+def from_a_frame_on(scene: Scene, model: str, runs: Sequence[Run]) -> str | None:
+    """Return the finding where maps fit as they are up to a frame, and otherwise from it on."""
+    for tried in zip(*(run.tried for run in runs), strict=True):
+        rows = [row for (_, other), run in zip(tried, runs, strict=True) for row in run.by_frame(other)]
+        if len(rows) < 2 * LEAST_TOLD:
+            continue
+        turn, hypothesis = Turn.of(rows), tried[0][0]
+        if turn.is_one:
+            index = _located(scene, model, hypothesis, rows[turn.at - 1][0], rows[turn.at][0])
+            before, after = turn.before, turn.after
+            says, mend = hypothesis.name, hypothesis.mend
+            if (step := STEPS.get(says)) is not None:
+                says, mend = f"are {side_of(step)}", "give each frame the map of its own image"
+            return (
+                f"{says} from frame {scene.frame_name(index)} on (their edges correlate {after.other:.2f}"
+                f" with those of depth and colour there, {after.given:.2f} now; before it {before.other:.2f} as they"
+                f" are): {mend}"
+            )
+    return None
 
-    `counts(over)` is (K, K): how often an id, of the ids in ascending order, is another one in the later frame.
+
+def _located(scene: Scene, model: str, hypothesis: Hypothesis[Run], last: int, first: int) -> int:
+    """Return the index of the frame from which on maps are otherwise, between two that are known."""
+
+    def rows(span: range) -> list[tuple[int, float, float]]:
+        run = Run([*readable(scene, span, model)])
+        return run.by_frame(hypothesis.change(run))
+
+    while first - last > 2 * IN_A_RUN:
+        middle = (last + first) // 2
+        gains = [other - given for _, given, other in rows(range(middle - IN_A_RUN // 2, middle + IN_A_RUN // 2 + 1))]
+        if not np.isfinite(gains).any():
+            return first
+        first, last = (middle, last) if float(np.nansum(gains)) > 0 else (first, middle)
+    near = rows(range(max(0, last - IN_A_RUN), min(len(scene), first + IN_A_RUN + 1)))
+    return near[min(Turn.of(near).at, len(near) - 1)][0] if near else first
+
+
+# --- another order ---------------------------------------------------------------------------------------------------
+
+
+def in_another_order(scene: Scene, indices: Sequence[int], model: str, pixels: int) -> str | None:
+    """Return the finding where the maps are those of these frames, but in another order: reversed, late, shuffled.
+
+    Each frame gets the map whose edges fit its depth and colour best, each map once. That is right where labels then
+    agree clearly better between frames, which the edges do not know.
     """
+    from scipy.optimize import linear_sum_assignment
 
-    def __init__(self, chain: Chain) -> None:
-        place = {position: k for k, position in enumerate(chain.positions)}
-        linked = [((place[a], place[b]), link.labels) for (a, b), link in chain.links.items() if link.labels.size]
-        self.count = len(chain.positions)
-        self.first: Int64 = np.array([a for (a, _), _ in linked], dtype=np.int64)
-        self.second: Int64 = np.array([b for (_, b), _ in linked], dtype=np.int64)
-        both = np.concatenate([labels for _, labels in linked], axis=1) if linked else np.empty((2, 0), np.int64)
-        self.ids, codes = np.unique(both, return_inverse=True)
-        codes = codes.reshape(both.shape)
-        self._key = codes[0] * len(self.ids) + codes[1]
-        self._of = np.repeat(np.arange(len(linked)), [labels.shape[1] for _, labels in linked])
-
-    def counts(self, links: Mask) -> Int64:
-        """Return (K, K) counts of some links (n,)."""
-        K = len(self.ids)
-        return np.bincount(self._key[links[self._of]], minlength=K * K).reshape(K, K)
-
-    def renaming(self, at: int, reach: int) -> Renaming:
-        """Return the ids that change between the frames before a place in the chain and those from it on."""
-        first, second = self.first, self.second
-        near = (first >= at - reach) & (second < at + reach)
-        across = self.counts(near & (first < at) & (second >= at))
-        before, after = self.counts(near & (second < at)), self.counts(near & (first >= at))
-        seen, later = across.sum(axis=1), across.argmax(axis=1)
-        told = seen >= LEAST_POINTS
-        told &= across.max(axis=1, initial=0) >= MOSTLY * seen
-        stays = told & (later == np.arange(len(later)))
-        moved = told & ~stays & _same(before) & _same(after)[later] & ~stays[later]
-        targets = later[moved]
-        if len(targets) < LEAST_RENAMED or len(set(targets.tolist())) < len(targets):
-            return Renaming(at, (), 0.0, int(told.sum()) >= LEAST_RENAMED)
-        pairs = tuple((int(self.ids[i]), int(self.ids[later[i]])) for i in np.flatnonzero(moved))
-        share = float(across[moved, targets].sum() / seen[moved].sum())
-        return Renaming(at, pairs, share, tells=True)
-
-    def changes(self) -> Iterator[Renaming]:
-        """Yield for each frame but the first whether its ids differ from those of the frame before it alone."""
-        first, second = self.first, self.second
-        for at in range(1, self.count):
-            across = self.counts((first == at - 1) & (second == at))
-            seen, later = across.sum(axis=1), across.argmax(axis=1)
-            told = (seen >= LEAST_POINTS) & (across.max(axis=1, initial=0) >= MOSTLY * seen)
-            moved = told & (later != np.arange(len(later)))
-            one_to_one = len(set(later[moved].tolist())) == moved.sum() and not (told & ~moved)[later[moved]].any()
-            pairs = tuple((int(self.ids[i]), int(self.ids[later[i]])) for i in np.flatnonzero(moved))
-            is_one = moved.sum() >= LEAST_RENAMED and one_to_one
-            yield Renaming(at, pairs if is_one else (), 1.0, int(told.sum()) >= LEAST_RENAMED)
-
-
-def _same(counts: Int64) -> Mask:
-    """Return (K,) whether an id mostly stays, or is not seen, among frames on one side."""
-    seen = counts.sum(axis=1)
-    return np.asarray((seen < LEAST_POINTS) | (np.diag(counts) >= MOSTLY * seen))
-
-
-def wrong_ids(neighbours: Neighbours, chain: Chain) -> str | None:
-    """Return the line on ids that are not those of one taxonomy in all frames; completes 'labels of X ...'."""
-    ids = Ids(chain)
-    if not len(ids.ids):
+    first = next(readable(scene, indices[:1], model), None)
+    if first is None:
         return None
-    changes = [change for change in ids.changes() if change.tells]
-    rolling = [change for change in changes if change.ids]
-    if len(rolling) >= max(LEAST_POINTS // 3, ROLLING * len(changes)):
-        named = neighbours.named(chain.positions[rolling[0].at])
-        return (
-            f"have other ids from frame to frame, first from frame {named} on ({_listed(rolling[0])}), and so at"
-            f" {len(rolling)} of {len(changes)} frames: write class ids of one taxonomy in all frames"
-        )
-    found = [each for each in (ids.renaming(at, REACH) for at in range(2, ids.count - 1)) if each.ids]
-    apart = list[Renaming]()
-    for each in sorted(found, key=lambda one: -one.share * len(one.ids)):
-        if all(abs(each.at - other.at) > REACH for other in apart):
-            apart.append(each)
-    if not apart:
+    count = min(MOST_ORDERED, max(IN_A_RUN, pixels // first.whole.size))
+    chosen = [indices[k] for k in evenly(len(indices), count)]
+    frames = [*readable(scene, chosen, model)]
+    frames = [seen for seen in frames if seen.references and seen.labels.shape == frames[0].labels.shape]
+    if len(frames) < 2 * IN_A_RUN:
         return None
-    first = min(apart, key=lambda each: each.at)
-    again = "" if len(apart) == 1 else f", and again {len(apart) - 1} more times"
-    return (
-        f"have other ids from frame {neighbours.named(chain.positions[first.at])} on{again}: {_listed(first)}"
-        f" ({first.share:.0%} of the points of these classes): write the ids of one taxonomy in all frames"
+    n = len(frames)
+    own = np.stack([_coarse(seen.references) for seen in frames])
+    none = np.zeros_like(frames[0].references[0])
+    edges = np.stack([_coarse((none if seen.edges is None else seen.edges,)) for seen in frames])
+    fits = own @ edges.T
+    order = np.asarray(linear_sum_assignment(-fits)[1])
+    moved = order != np.arange(n)
+    if moved.mean() < 0.5 or fits[np.arange(n), order].mean() < max(
+        LEAST_FIT, BETTER_FIT * float(np.diag(fits).mean())
+    ):
+        return None
+    near = [(a, b) for a in range(n) for b in range(a + 1, min(n, a + 4))]
+    common = shared_of({k: seen.view for k, seen in enumerate(frames)}, near)
+    maps = ({k: frames[at].labels for k, at in enumerate(own)} for own in (range(n), order))
+    agreement = Contrast.of(*(agreements(common, each, frames[0].view.ignore_id) for each in maps))
+    if not (agreement.is_clear and 1 - agreement.other <= FEWER * (1 - agreement.given)):
+        return None
+    text = (
+        f"(their edges correlate {fits[np.arange(n), order].mean():.2f} with those of depth and colour so,"
+        f" {np.diag(fits).mean():.2f} now; {agreement.other:.0%} agree between frames, {agreement.given:.0%} now)"
     )
+    return f"{_order(order, frames, scene)} {text}: give each frame the map of its own image"
 
 
-def _listed(renaming: Renaming) -> str:
-    said = ", ".join(f"{a} becomes {b}" for a, b in renaming.ids[:MOST_NAMED])
-    return f"{said}, ..." if len(renaming.ids) > MOST_NAMED else said
+def _order(order: Int64, frames: Sequence[Seen], scene: Scene) -> str:
+    """Return what the order of the maps is: map `order[k]` is that of frame k."""
+    n, k = len(order), np.arange(len(order))
+    steps, counts = np.unique(order - k, return_counts=True)
+    if np.mean(np.abs(order + k - (n - 1)) <= 1) >= SAME_ORDER:
+        return "are in reversed order: the first frame has the map of the last one"
+    whole = frames[-1].view.index - frames[0].view.index == n - 1
+    if whole and counts.max() >= SAME_ORDER * (n - abs(int(steps[counts.argmax()]))):
+        step = int(steps[counts.argmax()])
+        return f"are {frames_of(abs(step))} {side_of(step)}"
+    at = int(np.flatnonzero(order != k)[0])
+    of, to = (scene.frame_name(frames[one].view.index) for one in (int(order[at]), at))
+    return f"are in another order than the frames (the map of frame {of} is that of frame {to}, and so on)"
 
 
-def remarks_on_maps(neighbours: Neighbours, chain: Chain) -> Iterator[str]:
-    """Yield lines on maps that are empty, or of one class where those around have several; 'labels of X ...'."""
-    maps, named = chain.maps, neighbours.named
-    empty = [position for position, content in maps.items() if not content.labelled]
-    if empty and len(empty) < len(maps):
-        yield (
-            f"have no label at all in {len(empty)} of {len(maps)} frames: {_frames(empty, named)}; predict them again,"
-            " or leave them out (setting frames.list)"
-        )
-    agreements = [link.agreement for link in chain.links.values() if np.isfinite(link.agreement)]
-    usual = float(np.median(agreements)) if agreements else math.nan
-    lonely = [
-        position
-        for position in _of_one_class({k: v for k, v in maps.items() if v.labelled})
-        if not _agreement_with_others(chain, position) >= usual
-    ]
-    for name, group in itertools.groupby(sorted(lonely, key=lambda k: maps[k].name), lambda k: maps[k].name):
-        positions = sorted(group)
-        yield (
-            f"have one class, id {name}, in {len(positions)} of {len(maps)} frames ({_frames(positions, named)}), while"
-            f" the maps around have {MANY} or more: are the files right? Predict them again"
-        )
+def _coarse(edges: Sequence[Float64]) -> Float64:
+    """Return (cells,) the mean of maps of edges on a coarse grid, without its mean, of length 1."""
+    import cv2
 
-
-def _agreement_with_others(chain: Chain, position: int) -> float:
-    """Return the median agreement with maps of several classes; NaN where none was compared."""
-    known = [
-        link.agreement
-        for pair, link in chain.links.items()
-        if position in pair and not any(chain.maps[one].single for one in pair if one != position)
-    ]
-    told = [agreement for agreement in known if np.isfinite(agreement)]
-    return float(np.median(told)) if told else math.nan
-
-
-def _of_one_class(maps: dict[int, MapContent]) -> Iterator[int]:
-    """Yield the positions of maps of one class, where the nearest others before and after have several."""
-    positions = sorted(maps)
-    single = {k for k in positions if maps[k].single}
-    others = np.array([k for k in positions if k not in single])
-    for k in sorted(single):
-        at = int(np.searchsorted(others, k))
-        beside = others[max(0, at - 1) : at + 1].tolist()
-        if beside and all(maps[one].classes >= MANY for one in beside):
-            yield k
-
-
-def _frames(positions: Sequence[int], named: Callable[[int], str]) -> str:
-    shown = ", ".join(named(k) for k in positions[: 2 * MOST_NAMED])
-    return f"{shown}, ..." if len(positions) > 2 * MOST_NAMED else shown
+    H, W = edges[0].shape
+    size = (min(W, ORDER_COLUMNS), max(1, round(H * min(W, ORDER_COLUMNS) / W)))
+    mean = np.mean([cv2.resize(each, size, interpolation=cv2.INTER_AREA) for each in edges], axis=0).ravel()
+    mean = mean - mean.mean()
+    coarse: Float64 = mean / max(float(np.linalg.norm(mean)), 1e-12)
+    return coarse

@@ -7,10 +7,10 @@ import math
 from collections import defaultdict
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Protocol
 
 import numpy as np
 
+from semstab.check.chain import Link
 from semstab.check.conventions import Convention
 from semstab.check.reprojection import Pair
 from semstab.core.types import Float64
@@ -29,19 +29,7 @@ MOST_RUNS = 30
 """Runs of frames with one pose whose images are read, the longest first."""
 
 
-class Agrees(Protocol):
-    """How two frames agree: see `continuity.Link`."""
-
-    @property
-    def error(self) -> float:
-        """Median relative depth error."""
-
-    @property
-    def share(self) -> float:
-        """Share of the points that are seen again."""
-
-
-Compare = Callable[[Sequence[Pair]], Sequence[Agrees | None]]
+Compare = Callable[[Sequence[Pair]], Sequence[Link | None]]
 
 
 @dataclass(frozen=True)
@@ -131,7 +119,7 @@ def _is_near(pair: Pair, run: Run) -> bool:
     return pair[1] == run.before or pair[0] == run.after
 
 
-def _lost_of(run: Run, links: Sequence[Agrees | None], limit: float) -> Sequence[int]:
+def _lost_of(run: Run, links: Sequence[Link | None], limit: float) -> Sequence[int]:
     """Return the frames of a run that are elsewhere: all of them, or all but the first, whose pose the others have."""
     off = {pair: _is_off(link, limit) for pair, link in zip(run.pairs, links, strict=True) if link is not None}
     moves = any(is_off for pair, is_off in off.items() if pair in run.within)
@@ -141,11 +129,11 @@ def _lost_of(run: Run, links: Sequence[Agrees | None], limit: float) -> Sequence
     return range(run.first, run.last + 1) if moves or ends == [True, True] else ()
 
 
-def _fits(run: Run, links: Sequence[Agrees | None], limit: float) -> bool:
+def _fits(run: Run, links: Sequence[Link | None], limit: float) -> bool:
     """Return whether one of its ends fits the frame beside it."""
     known = [link for pair, link in zip(run.pairs, links, strict=True) if link is not None and pair not in run.within]
     return any(link.error < limit for link in known)
 
 
-def _is_off(link: Agrees, limit: float) -> bool:
+def _is_off(link: Link, limit: float) -> bool:
     return link.error >= limit or (math.isnan(link.error) and link.share < UNSEEN)

@@ -7,9 +7,10 @@ import math
 
 import numpy as np
 
-from semstab.check.coverage import BINS, plane_residuals
-from semstab.check.geometry import GOOD, LEAST_PAIRS, MIN_POINTS, MIN_SHARE, Verdict
-from semstab.check.reprojection import Pair, Sample, View, median_of_seen
+from semstab.check.coverage import by_distance, plane_residuals, said
+from semstab.check.geometry import LEAST_PAIRS
+from semstab.check.reprojection import Pair, Sample, View
+from semstab.check.verdict import GOOD, Verdict
 
 MEASURED = 1e-4
 """Noise of one frame, relative, from which on its depth is measured; below, it is rendered or of a surface."""
@@ -62,12 +63,11 @@ def _noise(view: View) -> float:
 def _drift(sample: Sample) -> str | None:
     """Return the line on poses that fit nearby frames and not distant ones."""
     near: tuple[tuple[int, int], float] | None = None
-    for low, high in BINS:
-        pairs = [(a, b) for a, b in sample.pairs if low <= abs(a - b) <= high]
+    for (low, high), pairs in by_distance(sample.pairs):
         error = _error(sample, pairs)
         if near is not None and error > max(GOOD, GROWS * near[1]):
             return (
-                f"poses drift: depth reprojects with {near[1]:.2%} error in frames {_apart(near[0])} apart, but with"
+                f"poses drift: depth reprojects with {near[1]:.2%} error in frames {said(near[0])} apart, but with"
                 f" {error:.1%} in those {low} to {high} apart"
             )
         if near is None and math.isfinite(error):
@@ -75,16 +75,9 @@ def _drift(sample: Sample) -> str | None:
     return None
 
 
-def _apart(distances: tuple[int, int]) -> str:
-    low, high = distances
-    return str(low) if low == high else f"{low} to {high}"
-
-
 def _error(sample: Sample, pairs: list[Pair]) -> float:
     """Return the median error over pairs; NaN where they see too little of each other."""
     if len(pairs) < LEAST_PAIRS:
         return math.nan
-    chosen = dataclasses.replace(sample, pairs=pairs)
-    errors = np.concatenate([error[0] for error in chosen.errors(sample.configured, np.array([1.0]))])
-    seen = np.isfinite(errors)
-    return float(median_of_seen(errors)) if seen.sum() >= MIN_POINTS and seen.mean() >= MIN_SHARE else math.nan
+    fit = dataclasses.replace(sample, pairs=pairs).fit()
+    return fit.error if fit.has_evidence else math.nan

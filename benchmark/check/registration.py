@@ -9,8 +9,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from semstab.check.conventions import OPTION
-from semstab.check.geometry import Verdict
 from semstab.check.reprojection import Pair, View
+from semstab.check.verdict import Verdict
 from semstab.core.arrays import evenly
 from semstab.core.types import Float32, Float64, Mask, UInt8
 from semstab.data.frames import Intrinsics
@@ -118,18 +118,16 @@ def _fits(a: Map, b: Map) -> Map:
 
     H, W = a.shape
     reach = max(1, round(REACH * W))
-    a = a - a.mean()
-    spectrum = np.fft.rfft2(a, (2 * H, 2 * W))
+    a = (a - a.mean()).astype(np.float32)
+    around = cv2.copyMakeBorder(a, reach, reach, reach, reach, cv2.BORDER_CONSTANT)
     fits = []
     for scale in SCALES:
         about = np.array([[scale, 0, (1 - scale) * (W - 1) / 2], [0, scale, (1 - scale) * (H - 1) / 2]])
         warped = cv2.warpAffine(b, about, (W, H), flags=cv2.INTER_LINEAR)
-        warped = warped - warped.mean()
-        product = np.fft.irfft2(spectrum * np.conj(np.fft.rfft2(warped, (2 * H, 2 * W))), (2 * H, 2 * W))
+        warped = (warped - warped.mean()).astype(np.float32)
         norm = math.sqrt(np.square(a).sum() * np.square(warped).sum())  # BLAS would wake its threads for each of them
-        near = np.roll(product, (reach, reach), axis=(0, 1))[: 2 * reach + 1, : 2 * reach + 1]
-        fits.append(near / max(norm, 1e-12))
-    return np.array(fits)
+        fits.append(cv2.matchTemplate(around, warped, cv2.TM_CCORR) / max(norm, 1e-12))
+    return np.array(fits, dtype=np.float64)
 
 
 def _peak(fits: Map) -> tuple[int, ...]:

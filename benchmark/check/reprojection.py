@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import math
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, field
@@ -12,6 +13,7 @@ import numpy.typing as npt
 
 from semstab.check.conventions import INVERSE, Convention
 from semstab.check.loops import find_matches
+from semstab.check.verdict import Fit
 from semstab.core.prefetch import prefetch
 from semstab.core.types import Float32, Float64, Int64, Mask
 from semstab.data.frames import Frame, Intrinsics
@@ -28,7 +30,14 @@ MAX_PIXELS = 2**20
 STEPS = (0, 1, 2, 8, 27)
 """Frames of a cluster, counted from its first one: their pairs lie 1 to 27 selected frames apart."""
 
+CONSISTENT = 0.05
+"""A point that is seen again is taken for the same surface where the two depths differ by at most this share."""
+
+PAIR_POINTS = 20
+"""Points of a pair of frames that are seen again, from which on its error counts."""
+
 Pair = tuple[int, int]
+Ids = npt.NDArray[Any]
 
 
 @dataclass(frozen=True, eq=False)
@@ -76,14 +85,6 @@ class View:
             pose = np.linalg.inv(pose).astype(np.float64)
         pose[:3, :3] = pose[:3, :3] @ CAMERA_AXES[convention.axes]
         return pose
-
-    def read_as(self, convention: Convention, configured: Convention) -> Float32:
-        """Return depth (H, W) of the file as that convention reads it, but for the length of rays and the factor."""
-        if (convention.depth == INVERSE) == (configured.depth == INVERSE):
-            return self.depth
-        with np.errstate(divide="ignore", over="ignore"):
-            inverse: Float32 = np.where(self.depth > 0, 1 / self.depth, np.float32(0)).astype(np.float32)
-        return inverse
 
     def sampled_camera(self, convention: Convention) -> Intrinsics:
         """Return the intrinsics of every stride-th pixel."""
@@ -179,6 +180,31 @@ class Sample:
     _inverse: dict[int, Float32] = field(default_factory=dict, init=False, repr=False)
     _placed: dict[tuple[int, Convention], Placed] = field(default_factory=dict, init=False, repr=False)
 
+    def of(self, views: dict[int, View]) -> Sample:
+        """Return a sample of the same pairs, of which these are the views."""
+        return Sample(views, self.pairs, self.configured)
+
+    def by_pair(self, convention: Convention | None = None) -> Float64:
+        """Return (pairs,) the median error under a convention, as configured; NaN where few points are seen again."""
+        convention = convention or self.configured
+        errors = self.errors(convention, np.array([convention.factor]))
+        return np.array([median_of_seen(e)[0] if np.isfinite(e).sum() >= PAIR_POINTS else np.nan for e in errors])
+
+    def fit(self) -> Fit:
+        """Return the fit of the configured convention."""
+        return self.fits(self.configured, np.array([1.0]))[0]
+
+    def fits(self, convention: Convention, factors: Float64) -> list[Fit]:
+        """Return the fit under a convention with each of the factors (F,) on depth."""
+        errors = self.errors(convention, factors)
+        pooled = np.concatenate(errors, axis=1) if errors else np.empty((len(factors), 0))
+        points = np.isfinite(pooled).sum(axis=1)
+        medians = median_of_seen(pooled) if pooled.size else np.full(len(factors), np.nan)
+        return [
+            Fit(dataclasses.replace(convention, factor=f), median, n / max(1, pooled.shape[1]), n)
+            for f, median, n in zip(factors.tolist(), medians.tolist(), points.tolist(), strict=True)
+        ]
+
     def errors(self, convention: Convention, factors: Float64) -> list[Float64]:
         """Return for each pair the relative error (F, N) of the first view's sample in the second; inf if not seen."""
         return [self.matched(pair, convention, factors).error for pair in self.pairs]
@@ -208,11 +234,13 @@ class Sample:
         return placed
 
     def _read_as(self, convention: Convention, position: int) -> Float32:
-        """Return depth (H, W) of a view as a convention reads it; an inverse is kept."""
+        """Return depth (H, W) as a convention reads it, but for rays and the factor; an inverse is kept."""
         if (convention.depth == INVERSE) == (self.configured.depth == INVERSE):
             return self.views[position].depth
         if position not in self._inverse:
-            self._inverse[position] = self.views[position].read_as(convention, self.configured)
+            depth = self.views[position].depth
+            with np.errstate(divide="ignore", over="ignore"):
+                self._inverse[position] = np.where(depth > 0, 1 / depth, np.float32(0)).astype(np.float32)
         return self._inverse[position]
 
     def motions(self, convention: Convention) -> list[tuple[Float64, Float64]]:
@@ -239,6 +267,28 @@ class Matches:
     depth: Float64
     inside: Mask
     error: Float64
+
+
+@dataclass(frozen=True, eq=False)
+class Shared:
+    """Pixels of two views that see the same points: rows and columns (n,) in each, and which of the sample they are."""
+
+    first: tuple[Int64, Int64]
+    second: tuple[Int64, Int64]
+    chosen: Mask
+
+    @classmethod
+    def of(cls, view: View, matches: Matches) -> Shared:
+        """Return the pixels of a view's sample that lie on one surface with the pixels that they meet."""
+        same = matches.error[0] <= CONSISTENT
+        return cls((view.v[same], view.u[same]), (matches.v[0][same], matches.u[0][same]), same)
+
+    def labels(self, first: Ids | None, second: Ids | None, *ignored: int) -> Ids:
+        """Return (2, n) the labels of the points in two maps, those that have one in both; none without maps."""
+        if first is None or second is None:
+            return np.empty((2, 0), dtype=np.int64)
+        both = np.stack([first[self.first], second[self.second]]).astype(np.int64)
+        return both[:, (both[0] != ignored[0]) & (both[1] != ignored[-1])]
 
 
 def _lens(camera: Intrinsics) -> tuple[float, float, float, float]:

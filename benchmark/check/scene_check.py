@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import contextlib
 import dataclasses
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
@@ -10,11 +9,10 @@ from typing import Any
 
 import numpy as np
 
-from semstab.check.continuity import Chain, Neighbours, with_continuity
-from semstab.check.conventions import Reading, reading
 from semstab.check.coverage import (
     FUSED_FRAMES,
     Coverage,
+    Covers,
     Noise,
     Overlap,
     Persistence,
@@ -22,20 +20,19 @@ from semstab.check.coverage import (
     fused_stride,
     persistence,
     suggest,
+    without_labels,
 )
-from semstab.check.geometry import Verdict, assess, shifts_and_turns
+from semstab.check.geometry import shifts_and_turns
 from semstab.check.histogram import Histogram, Tally
-from semstab.check.intrinsics import with_intrinsics
-from semstab.check.label_order import remarks_on_maps, wrong_ids
-from semstab.check.labels import LabelFindings, check_labels
-from semstab.check.mistakes import with_mistakes
+from semstab.check.inspection import Depth, Inspection
+from semstab.check.labels import LabelFindings, Ordered, label_findings
 from semstab.check.no_depth import with_invalid_depth
-from semstab.check.precision import with_precision
-from semstab.check.registration import assess_surface, match_images, notes
-from semstab.check.reprojection import Sample, View, clusters, frames_at, label_source, pairs_within, reader
-from semstab.check.scans import ScanCoverage, ScanSample, assess_scans, quick_sample_of_scans
+from semstab.check.registration import notes
+from semstab.check.reprojection import Sample, clusters, label_source, reader
+from semstab.check.scan_sample import ScanSample, quick_sample_of_scans
+from semstab.check.scans import assess_scans
 from semstab.check.sweep import with_sweep
-from semstab.check.timing import with_lateness
+from semstab.check.verdict import Verdict
 from semstab.config import Config
 from semstab.core.arrays import evenly
 from semstab.core.json_form import to_json
@@ -51,38 +48,17 @@ SCHEMA = 2
 
 CLUSTERS, SCAN_CLUSTERS = 4, 2
 POINTS = 8000
-LEAST_POINTS_A_VIEW, MOST_POINTS_A_VIEW = 50, 500
 """The number of points that are reprojected, from neighbouring frames at so many positions of the sequence; and the
 number of positions of a sequence of scans."""
 
 QUICK_POINTS = 2400
 """The quick check takes so many points from one position, and looks as thoroughly as the check before it refuses."""
 
-LABEL_RUNS = 6
-"""Number of runs of five frames in which label maps are compared with depth, colour and each other."""
-
 LABELLED_FRAMES = 8
 """Frames in which the labels of every model but the first are counted."""
 
-MOST_VOXELS = 2**20
-"""Voxels from a map's origin to its end, along an axis."""
-
 VOXEL_FACTORS = (0.5, 1.0, 2.0)
 """Voxel sizes for which the distribution of OP is reported, relative to the configured or the suggested one."""
-
-
-Ordered = Mapping[str, tuple[Neighbours, Chain]]
-"""Frames in order, by the model whose labels they have."""
-
-
-@dataclass(frozen=True)
-class Depth:
-    """The depth of the sampled frames: share of valid pixels, and percentiles, metres."""
-
-    valid: float
-    p5: float
-    p50: float
-    p95: float
 
 
 @dataclass(frozen=True)
@@ -218,7 +194,12 @@ def check_scene(scene: Scene, config: Config, told: Sequence[str] = ()) -> Scene
             *begun,
         ),
     )
-    return checked if verdict.state == "unsound" else _with_coverage(checked, inspection, sample, config)
+    if verdict.state == "unsound":
+        return checked
+    stride = fused_stride(checked.size, config.pixel_stride)
+    fused = [without_labels(inspection.views[position], stride) for position in inspection.fused]
+    checked = dataclasses.replace(checked, fused_stride=stride)
+    return _with_coverage(checked, Coverage(sample), fused, config, inspection.too_far)
 
 
 def _check_scans(
@@ -226,10 +207,9 @@ def _check_scans(
 ) -> SceneCheck:
     """Check a scene of scans: their poses, what they share, voxels, and the ids of their labels."""
     sample = ScanSample(scene, indices, first, clusters(len(indices), SCAN_CLUSTERS), fused=FUSED_FRAMES)
-    verdict, coverage = with_sweep(assess_scans(sample), sample), ScanCoverage(sample)
+    verdict = with_sweep(assess_scans(sample), sample)
     scans, ranges = [*sample.scans.values()], sample.ranges
-    p5, p50, p95 = np.percentile(np.concatenate(ranges), (5, 50, 95)) if sum(map(len, ranges)) else (np.nan,) * 3
-    valid = float(np.mean([len(own) / scan.depth.size for own, scan in zip(ranges, scans, strict=True)]))
+    valid = [len(own) / scan.depth.size for own, scan in zip(ranges, scans, strict=True)]
     tally = Tally(first or "")
     for scan in scans if first is not None else ():
         tally.add(scan)
@@ -238,7 +218,7 @@ def _check_scans(
         frames=len(scene),
         selected=len(indices),
         size=(int(np.median([scan.depth.size for scan in scans])), 1),
-        depth=Depth(valid, float(p5), float(p50), float(p95)),
+        depth=Depth.of(valid, ranges),
         motion=None,
         verdict=verdict,
         sources=scene.sources,
@@ -247,19 +227,9 @@ def _check_scans(
     )
     if verdict.state == "unsound" or not sample.pairs:
         return checked
-    overlaps = coverage.overlaps()
-    suggestion = coverage.suggestion(overlaps, len(indices), config.frames.stride)
-    size = config.voxel_size
-    if not config.sets_voxel_size and suggestion.voxel_size is not None:
-        size = suggestion.voxel_size
-    return dataclasses.replace(
-        checked,
-        overlaps=tuple(overlaps),
-        noise=coverage.noise(),
-        fused_frames=len(sample.fused),
-        persistence=tuple(filter(None, (coverage.persistence(size * factor) for factor in VOXEL_FACTORS))),
-        suggestion=suggestion,
-    )
+    fused = [sample.scans[position] for position in sample.fused]
+    of_one_class = [dataclasses.replace(s, labels=np.zeros(s.shape, np.uint8), scores=None) for s in fused]
+    return _with_coverage(checked, sample, of_one_class, config)
 
 
 def _whole(scene: Scene, config: Config) -> tuple[list[str], list[str]]:
@@ -317,63 +287,6 @@ def quick_sample(
     return verdict, sample, ordered
 
 
-def label_findings(
-    scene: Scene,
-    indices: Sequence[int],
-    models: Sequence[str],
-    options: Mapping[str, Any] | None = None,
-    known: Ordered | None = None,
-    *,
-    thorough: bool,
-) -> Iterator[LabelFindings]:
-    """Yield what label maps show to be wrong with them, for each model that has files of its own; nothing of scans.
-
-    Args:
-        scene: The scene.
-        indices: Indices of the selected frames.
-        models: Label sources.
-        options: The dataset's, for the convention of the poses.
-        known: Frames in order with their labels, by model, where they were compared already.
-        thorough: Whether as many frames are compared as `check` does.
-    """
-    for model in () if scene.of_scans else models:
-        space = None
-        with contextlib.suppress(DataError):
-            space = scene.label_space(model)
-        found = check_labels(scene, indices, model, space, LABEL_RUNS, thorough=thorough)
-        if scene.surface is None:
-            with contextlib.suppress(DataError):
-                chained = (known or {}).get(model) or chain_of(scene, indices, model, options or {}, thorough=thorough)
-                found = with_order(found, *chained)
-        yield found
-
-
-def chain_of(
-    scene: Scene, indices: Sequence[int], model: str, options: Mapping[str, Any], *, thorough: bool
-) -> tuple[Neighbours, Chain]:
-    """Return the frames of a scene in order, with the labels of a model.
-
-    Raises:
-        DataError: If the first frame cannot be read.
-    """
-    first = reader(scene, model)(indices[0])
-    how = reading(scene, first, options, None)
-    neighbours = Neighbours(scene, indices, model, how.convention)
-    return neighbours, neighbours.chain(neighbours.spread(how.size, thorough=thorough))
-
-
-def with_order(found: LabelFindings, neighbours: Neighbours, chain: Chain) -> LabelFindings:
-    """Return findings with those of label maps from frame to frame."""
-    wrong = found.wrong
-    if not wrong and (text := wrong_ids(neighbours, chain)) is not None:
-        wrong = (f"labels of {found.model} {text}",)
-    remarks = [f"labels of {found.model} {text}" for text in remarks_on_maps(neighbours, chain)]
-    single = [] if wrong else neighbours.said_of_labels(chain)
-    return dataclasses.replace(
-        found, wrong=wrong, remarks=(*found.remarks, *remarks, *single), open=None if wrong else found.open
-    )
-
-
 def require_sound(scene: Scene, indices: Sequence[int], options: Mapping[str, Any] | None = None) -> Verdict:
     """Return the verdict of `quick_check`.
 
@@ -394,125 +307,16 @@ def refuse_unsound(scene: Scene, verdict: Verdict) -> None:
         )
 
 
-class Inspection:
-    """The frames of a scene that a check reads, thinned as they come in.
-
-    Attributes:
-        source: Label source to read frames with; None needs no labels.
-        groups: Positions in `indices` of frames that are compared with each other.
-        points: About how many points are reprojected in all.
-        fused: Number of frames, evenly spaced, that are also held in memory for fusion.
-        chained: Frames in order, once a verdict compared them.
-        passing_over: Leave out frames that cannot be read, instead of raising what reading them raises.
-        with_color: Whether to read also the size of a colour image: intrinsics may be for that.
-    """
-
-    def __init__(
-        self,
-        scene: Scene,
-        indices: Sequence[int],
-        source: str | None,
-        groups: Sequence[Sequence[int]],
-        points: int,
-        *,
-        fused: int = 0,
-        passing_over: bool = False,
-        with_color: bool = False,
-    ) -> None:
-        self.scene, self.indices, self.source = scene, indices, source
-        self.tally = Tally(source or "")
-        self.views: dict[int, View] = {}
-        self.fused = evenly(len(indices), fused)
-        self.chained: tuple[Neighbours, Chain] | None = None
-        self._first: Frame | None = None
-        self.farthest: tuple[float, Frame, tuple[int, int]] | None = None
-        self._pairs = pairs_within(groups)
-        self._compared = {position for group in groups for position in group}
-        self._points = min(MOST_POINTS_A_VIEW, max(LEAST_POINTS_A_VIEW, points // max(1, len(self._pairs))))
-        self._labelled = source is not None
-        color = scene.color(indices[0]) if with_color else None
-        self._color_shape = None if color is None else color.shape
-        self._read(indices, reader(scene, source), passing_over)
-
-    def _read(self, indices: Sequence[int], read: Callable[[int], Frame], passing_over: bool) -> None:
-        positions = self._compared | set(self.fused)
-        for position, frame in frames_at(positions, indices, read, passing_over=passing_over):
-            self._first = self._first or frame
-            self._take_note(frame)
-            if self._labelled:
-                self.tally.add(frame)
-            self.views[position] = View.of(frame, self._points, labelled=self._labelled)
-
-    def _take_note(self, frame: Frame) -> None:
-        """Remember the farthest pixel of all frames."""
-        depth = np.where(frame.depth < np.inf, frame.depth, np.float32(0))  # NaN is not less
-        at = int(depth.argmax())
-        if self.farthest is None or float(depth.flat[at]) > self.farthest[0]:
-            v, u = divmod(at, depth.shape[1])
-            self.farthest = float(depth.flat[at]), dataclasses.replace(frame.every(64), files=frame.files), (u, v)
-
-    def too_far(self, voxel_size: float) -> str | None:
-        """Return the farthest pixel where a map of voxels of that size does not reach it."""
-        if self.farthest is None or self.farthest[0] < MOST_VOXELS * voxel_size:
-            return None
-        depth, frame, (u, v) = self.farthest
-        return (
-            f"{frame.where('depth')}: pixel ({u}, {v}) has depth {depth:,.0f} m, more than 2^20 voxels of"
-            f" {voxel_size:g} m away, so that a run refuses it; set max_depth: METRES, from which depth is not valid"
-        )
-
-    def reading(self, options: Mapping[str, Any]) -> Reading:
-        """Return how the scene is configured."""
-        assert self._first is not None
-        return reading(self.scene, self._first, options, self._color_shape)
-
-    def sample(self, options: Mapping[str, Any]) -> Sample:
-        """Return the frames that are compared."""
-        views = {position: view for position, view in self.views.items() if position in self._compared}
-        pairs = [pair for pair in self._pairs if pair[0] in views and pair[1] in views]
-        return Sample(views, pairs, self.reading(options).convention)
-
-    def verdict(self, options: Mapping[str, Any], *, thorough: bool, labels_of: str | None = None) -> Verdict:
-        """Assess depth by reprojection from frame to frame, and depth that is cast at a surface by the images.
-
-        Frames in order are read with the labels of `labels_of`, by default those of `source`.
-        """
-        sample = self.sample(options)
-        if self.scene.surface is not None:
-            return assess_surface(match_images(self.scene, sample.views, sample.pairs), len(sample.views))
-        how = self.reading(options)
-        verdict = assess(sample, how, thorough=thorough)
-        if (mistaken := with_mistakes(verdict, sample)) != verdict:
-            return mistaken
-        timed = with_lateness(verdict, self.scene, sample, how)
-        verdict = with_intrinsics(verdict, sample, how) if timed == verdict else timed
-        verdict = with_precision(verdict, sample)
-        if self.scene.made and not thorough:
-            return verdict  # rendering its frames takes longer than fusing them
-        if verdict.mend:
-            return verdict
-        source = labels_of or self.source
-        known = self.views if source == self.source else None
-        neighbours = Neighbours(self.scene, self.indices, source, how.convention, known)
-        chain = neighbours.chain({*neighbours.spread(how.size, thorough=thorough), *neighbours.striking()})
-        self.chained = neighbours, chain
-        return with_continuity(verdict, neighbours, chain)
-
-    def depth(self) -> Depth:
-        """Return the depth of all frames that were read."""
-        valid = [np.mean((view.depth > 0) & (view.depth < np.inf)) for view in self.views.values()]
-        depths = np.concatenate([view.depth[view.v, view.u] for view in self.views.values()])
-        p5, p50, p95 = np.percentile(depths, (5, 50, 95)) if len(depths) else (np.nan,) * 3
-        return Depth(float(np.mean(valid)), float(p5), float(p50), float(p95))
-
-
-def _with_coverage(checked: SceneCheck, inspection: Inspection, sample: Sample, config: Config) -> SceneCheck:
-    """Return overlap, noise and voxels, where depth and poses may agree."""
-    coverage = Coverage(sample)
+def _with_coverage(
+    checked: SceneCheck,
+    coverage: Covers,
+    fused: Sequence[Frame],
+    config: Config,
+    too_far: Callable[[float], str | None] = lambda size: None,
+) -> SceneCheck:
+    """Return overlap, noise and voxels, where the frames, or scans, may agree; those to fuse have one class."""
     overlaps = coverage.overlaps()
-    noise = coverage.noise() if overlaps and any(row.covisible > 0 for row in overlaps) else None
-    views = [inspection.views[position] for position in inspection.fused]
-    stride = fused_stride(checked.size, config.pixel_stride)
+    noise = coverage.noise() if any(row.covisible > 0 for row in overlaps) else None
     suggestion = None if noise is None else suggest(coverage, overlaps, checked.selected, config.frames.stride)
     if suggestion is not None and checked.verdict.state == "imprecise":
         reason = f"{suggestion.voxel_size_reason}, which are that large because depth and poses are imprecise"
@@ -521,26 +325,16 @@ def _with_coverage(checked: SceneCheck, inspection: Inspection, sample: Sample, 
     if not config.sets_voxel_size and suggestion is not None and suggestion.voxel_size is not None:
         size = suggestion.voxel_size
     faces = None if noise is None else coverage.faces(size)
-    fused = [_persistence(views, coverage, size * factor, stride) for factor in VOXEL_FACTORS]
     return dataclasses.replace(
         checked,
-        refused=tuple(filter(None, (inspection.too_far(size),))),
+        refused=tuple(filter(None, (too_far(size),))),
         notes=checked.notes if faces is None else (*checked.notes, str(faces)),
         overlaps=tuple(overlaps),
         noise=noise,
-        fused_frames=len(views),
-        fused_stride=stride,
-        persistence=tuple(row for row in fused if row is not None),
+        fused_frames=len(fused),
+        persistence=tuple(filter(None, (persistence(fused, coverage, size * factor) for factor in VOXEL_FACTORS))),
         suggestion=suggestion,
     )
-
-
-def _persistence(views: Sequence[View], coverage: Coverage, voxel_size: float, stride: int) -> Persistence | None:
-    """Return the distribution of OP; None where points lie so far out that voxels of that size cannot be counted."""
-    try:
-        return persistence(views, coverage, voxel_size, stride)
-    except DataError:
-        return None
 
 
 def _motion(sample: Sample) -> Motion | None:

@@ -4,8 +4,10 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
+from semstab.check.inspection import Inspection
+from semstab.check.labels import Ordered, label_findings
 from semstab.check.registration import REGISTERED_FRAMES, notes
-from semstab.check.scene_check import POINTS, Inspection, Ordered, label_findings
+from semstab.check.scene_check import POINTS
 from semstab.config import Config
 from semstab.datasets import Scene
 from semstab.predict.dataset import NAME as PREDICTED

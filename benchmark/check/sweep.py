@@ -3,58 +3,81 @@
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Callable
+from dataclasses import dataclass
 
 import numpy as np
 
-from semstab.check.geometry import WON_PAIRS, Verdict
-from semstab.check.scans import ScanSample
+from semstab.check.conventions import Convention
+from semstab.check.scan_sample import ScanSample
 from semstab.check.surfaces import Surfaces
+from semstab.check.trials import Hypothesis, ranked
+from semstab.check.verdict import BETTER, Fit, Verdict
 from semstab.core.types import Float64
 from semstab.datasets.geometry.sweeps import SWEEPS, Sweep, carried, motion_in_sweep, share_of_sweep
 
-BETTER = 0.75
-"""A sweep is right where it leaves at most this part of the distance, ..."""
-
 LEAST = 0.001
-"""... and takes away a millimetre."""
+"""A sweep is right where it takes away a millimetre, too."""
 
 
-def _deskewed(surfaces: Surfaces, motion: Float64, motion_of_other: Float64, sweep: Sweep) -> Surfaces:
-    """Return points and surfaces with the motion (6,) of their sensors in a sweep taken out."""
-    share = share_of_sweep(surfaces.middle, sweep)
-    return dataclasses.replace(
-        surfaces,
-        points=carried(surfaces.points, motion, share_of_sweep(surfaces.points, sweep)),
-        normal=carried(surfaces.normal, motion_of_other * [1, 1, 1, 0, 0, 0], share),
-        middle=carried(surfaces.middle, motion_of_other, share),
-    )
+@dataclass(frozen=True, eq=False)
+class Swept:
+    """Points of scans beside surfaces of others, and the motions (6,) of both sensors in a sweep, by pair."""
+
+    pairs: tuple[tuple[Surfaces, Float64, Float64], ...]
+
+    @classmethod
+    def of(cls, sample: ScanSample) -> Swept:
+        """Seek the points of each pair of scans; pairs of which no point is near to a surface are left out."""
+        motions = {p: _motion(sample, p) for pair in sample.pairs for p in pair}
+        sought = [(sample.surfaces((a, b)), motions[a], motions[b]) for a, b in sample.pairs]
+        return cls(tuple(each for each in sought if each[0].met.any()))
+
+    def by_pair(self) -> Float64:
+        """Return (pairs,) the median distance of points from surfaces, metres."""
+        return np.array([np.median(surfaces.distance[surfaces.met]) for surfaces, *_ in self.pairs])
+
+    def fit(self) -> Fit:
+        """Return the median distance of all points from surfaces, metres."""
+        distances = np.concatenate([surfaces.distance[surfaces.met] for surfaces, *_ in self.pairs])
+        return Fit(Convention(), float(np.median(distances)), 1.0, len(distances))
+
+
+def _deskewed(sweep: Sweep) -> Callable[[Swept], Swept]:
+    """Return how points and surfaces lie with the motion in such a sweep taken out."""
+
+    def of(surfaces: Surfaces, motion: Float64, motion_of_other: Float64) -> Surfaces:
+        share = share_of_sweep(surfaces.middle, sweep)
+        return dataclasses.replace(
+            surfaces,
+            points=carried(surfaces.points, motion, share_of_sweep(surfaces.points, sweep)),
+            normal=carried(surfaces.normal, motion_of_other * [1, 1, 1, 0, 0, 0], share),
+            middle=carried(surfaces.middle, motion_of_other, share),
+        )
+
+    return lambda swept: Swept(tuple((of(*pair), *pair[1:]) for pair in swept.pairs))
+
+
+HYPOTHESES = tuple(
+    Hypothesis(f"a sweep {sweep}", _deskewed(sweep), f"set deskew: {sweep} (--option deskew={sweep})")
+    for sweep in SWEEPS
+)
 
 
 def with_sweep(verdict: Verdict, sample: ScanSample) -> Verdict:
     """Return the verdict with a remark where points lie clearly nearer to surfaces once scans are deskewed."""
     if verdict.state != "sound" or sample.scene.settings.get("deskew") is not None:
         return verdict
-    known = {pair: sample.surfaces(pair) for pair in sample.pairs}
-    known = {pair: surfaces for pair, surfaces in known.items() if surfaces.met.any()}
-    if not known:
+    if not (swept := Swept.of(sample)).pairs:
         return verdict
-    moved = {position: _motion(sample, position) for pair in known for position in pair}
-    now = [each.distance[each.met] for each in known.values()]
-    under = {
-        sweep: [_deskewed(each, moved[a], moved[b], sweep).distance[each.met] for (a, b), each in known.items()]
-        for sweep in SWEEPS
-    }
-    best = min(SWEEPS, key=lambda sweep: float(np.median(np.concatenate(under[sweep]))))
-    before, after = (float(np.median(np.concatenate(each))) for each in (now, under[best]))
-    won = np.mean([np.median(a) < np.median(b) for a, b in zip(under[best], now, strict=True)])
-    if after > min(BETTER * before, before - LEAST) or won < WON_PAIRS:
+    now, best = swept.fit(), ranked(HYPOTHESES, swept)[0]
+    if best.fit.error > now.error - LEAST or not best.is_right(swept, now, BETTER):
         return verdict
-    text = (
-        f"scans look as if they were not deskewed: points lie {100 * before:.1f} cm from the surfaces of other scans,"
-        f" {100 * after:.1f} cm where the motion in a sweep is taken out; set deskew: {best} (--option deskew={best}),"
+    return verdict.remarking(
+        f"scans look as if they were not deskewed: points lie {100 * now.error:.1f} cm from the surfaces of other"
+        f" scans, {100 * best.fit.error:.1f} cm where the motion in a sweep is taken out; {best.hypothesis.mend},"
         " or deskew them by the times of their points"
     )
-    return dataclasses.replace(verdict, remarks=(*verdict.remarks, text))
 
 
 def _motion(sample: ScanSample, position: int) -> Float64:

@@ -4,28 +4,31 @@ from __future__ import annotations
 
 import contextlib
 import dataclasses
+import functools
 import math
-from collections.abc import Iterator
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
 
 import numpy as np
 
 from semstab.check.conventions import Reading
-from semstab.check.geometry import BETTER, GOOD, LEAST_PAIRS, MIN_GAIN, PAIR_POINTS, SIMPLER, WON_PAIRS, Verdict
-from semstab.check.reprojection import Sample, median_of_seen
+from semstab.check.geometry import LEAST_PAIRS
+from semstab.check.reprojection import Pair, Sample
+from semstab.check.trials import clearly_falls, falls, fitted, middle
+from semstab.check.verdict import GOOD, MIN_GAIN, SIMPLER, Verdict
 from semstab.core.types import Float64
 from semstab.datasets import Scene
+from semstab.datasets.geometry.cameras import at_times
 from semstab.errors import DataError
 
 REACH = 2
 """Frames by which poses may be late or early."""
 
-COARSE = np.arange(-REACH, REACH + 1) * 1.0
-FINE = np.arange(-9, 10) / 10
+MOVES: tuple[Callable[[float], Iterable[float]], ...] = (
+    lambda best: map(float, range(-REACH, REACH + 1)),
+    lambda best: (best + part / 10 for part in range(-9, 10) if abs(best + part / 10) <= REACH),
+)
 """Shifts that are tried, frames: whole ones, then tenths around the best."""
-
-CLEAR = 4.0
-"""Standard errors by which the logarithm of the error must fall, in the mean over pairs of frames."""
 
 HALF, STRIKING = 0.5, 0.25
 """A shift that not all pairs of frames show is remarked where the error falls to the first part, and a fault where it
@@ -94,10 +97,9 @@ def with_lateness(verdict: Verdict, scene: Scene, sample: Sample, how: Reading) 
     if verdict.mend or (late := find_lateness(scene, sample, stamped="time_offset" in how.names)) is None:
         return verdict
     if not (late.whole and late.sure):
-        return dataclasses.replace(verdict, remarks=(*verdict.remarks, late.text(how)))
+        return verdict.remarking(late.text(how))
     setting = late.setting(how)
-    mend = () if setting is None else (f"{setting[0]}: {setting[1]}",)
-    return dataclasses.replace(verdict, state="unsound", text=late.text(how), mend=mend, undetermined=(), reason="")
+    return verdict.refuted(late.text(how), () if setting is None else (f"{setting[0]}: {setting[1]}",))
 
 
 def find_lateness(scene: Scene, sample: Sample, *, stamped: bool) -> Lateness | None:
@@ -110,61 +112,18 @@ def find_lateness(scene: Scene, sample: Sample, *, stamped: bool) -> Lateness | 
         sample: Frames that are compared.
         stamped: Whether poses are looked up by time, so that any shift can be mended.
     """
-    moved = PoseShift(scene, sample)
-    if len(moved.pairs) < LEAST_PAIRS:
+    pairs, errors = _moved(scene, sample)
+    if len(pairs) < LEAST_PAIRS or not (before := middle(present := errors(0.0))) > MIN_GAIN:
         return None
-    present = moved.errors(0.0)
-    if not middle(present) > MIN_GAIN:
-        return None
-    tried = {shift: moved.errors(shift) for shift in COARSE.tolist()}
-    near = min(tried, key=lambda shift: mean_log(tried[shift]))
-    tried |= {near + part: moved.errors(near + part) for part in FINE.tolist() if abs(near + part) <= REACH}
-    best = min(tried, key=lambda shift: mean_log(tried[shift]))
-    if not stamped and middle(tried[float(round(best))]) <= SIMPLER * middle(tried[best]):
+    best = fitted(0.0, MOVES, errors)
+    if not stamped and middle(errors(float(round(best)))) <= SIMPLER * middle(errors(best)):
         best = float(round(best))
-    error, before = middle(tried[best]), middle(present)
-    won = _won(tried[best], present)
-    sure = clearly_lower(tried[best], present) or (won and error <= STRIKING * before)
+    error, moving = middle(errors(best)), falls(errors(best), present, DIFFER)
+    won = moving.wins and moving.count >= LEAST_MOVING
+    sure = clearly_falls(errors(best), present) or (won and error <= STRIKING * before)
     if abs(best) < 0.1 or not (sure or (won and error <= HALF * before)) or error > GOOD:
         return None
     return Lateness(round(best, 1), round(best, 1) * _period(scene) if stamped else None, error, before, sure)
-
-
-def _won(errors: Float64, present: Float64) -> bool:
-    """Return whether errors (pairs,) are lower than the present ones in most pairs in which they differ at all.
-
-    They do not where the camera stands still.
-    """
-    told = np.isfinite(errors) & np.isfinite(present)
-    told[told] = np.abs(np.log(np.maximum(errors[told], 1e-9) / np.maximum(present[told], 1e-9))) > DIFFER
-    return bool(told.sum() >= LEAST_MOVING and np.mean(errors[told] < present[told]) >= WON_PAIRS)
-
-
-def median_by_pair(sample: Sample) -> Float64:
-    """Return (pairs,) median relative error of depth as configured; NaN where few points are seen again."""
-    errors = sample.errors(sample.configured, np.array([1.0]))
-    return np.array([median_of_seen(e)[0] if np.isfinite(e).sum() >= PAIR_POINTS else math.nan for e in errors])
-
-
-def clearly_lower(errors: Float64, present: Float64) -> bool:
-    """Return whether errors (pairs,) are lower than the present ones: in the mean, by its standard error, in most."""
-    told = np.isfinite(errors) & np.isfinite(present)
-    if told.sum() < LEAST_PAIRS or middle(errors) > min(BETTER * middle(present), middle(present) - MIN_GAIN):
-        return False
-    gains = np.log(np.maximum(present[told], 1e-9)) - np.log(np.maximum(errors[told], 1e-9))
-    standard_error = gains.std(ddof=1) / math.sqrt(len(gains))
-    return bool(gains.mean() > CLEAR * standard_error and np.mean(gains > 0) >= WON_PAIRS)
-
-
-def mean_log(errors: Float64) -> float:
-    """Return the mean logarithm of errors (pairs,) that are known; inf where none is."""
-    told = errors[np.isfinite(errors)]
-    return float(np.log(np.maximum(told, 1e-9)).mean()) if len(told) else math.inf
-
-
-def middle(errors: Float64) -> float:
-    """Return the median of errors (pairs,) that are known; inf where none is."""
-    return float(np.nanmedian(errors)) if np.isfinite(errors).any() else math.inf
 
 
 def _period(scene: Scene) -> float:
@@ -172,44 +131,22 @@ def _period(scene: Scene) -> float:
     return float(np.median(np.diff(times))) if times is not None and len(times) > 1 else math.nan
 
 
-class PoseShift:
-    """The frames of a sample with the poses of other times.
+def _moved(scene: Scene, sample: Sample) -> tuple[list[Pair], Callable[[float], Float64]]:
+    """Return the pairs of frames that have poses within reach, and their errors with the poses so many frames later."""
+    known, views = dict(_poses_around(scene, sample)), sample.views
+    reach = {at for at, v in views.items() if all(v.index + k in known for k in range(-REACH, REACH + 1))}
+    pairs = [pair for pair in sample.pairs if {*pair} <= reach]
+    used = {at: views[at] for pair in pairs for at in pair}
+    indices, poses = np.array([*known], dtype=np.float64), np.array([*known.values()])
 
-    Attributes:
-        pairs: The pairs of frames that have poses within reach.
-    """
+    @functools.cache
+    def errors(shift: float) -> Float64:
+        wanted = np.array([view.index + shift for view in used.values()])
+        there = at_times(indices, poses, wanted, 1.0, "interpolate")
+        moved = {at: dataclasses.replace(view, T_wc=T) for (at, view), T in zip(used.items(), there, strict=True)}
+        return Sample(moved, pairs, sample.configured).by_pair()
 
-    def __init__(self, scene: Scene, sample: Sample) -> None:
-        self._sample = sample
-        self._poses = dict(_poses_around(scene, sample))
-        self.pairs = [(a, b) for a, b in sample.pairs if self._reaches(a) and self._reaches(b)]
-
-    def _reaches(self, position: int) -> bool:
-        index = self._sample.views[position].index
-        return all(index + k in self._poses for k in range(-REACH, REACH + 1))
-
-    def errors(self, shift: float) -> Float64:
-        """Return (pairs,) median relative error of depth with the poses `shift` frames later; NaN where few see."""
-        used = {position for pair in self.pairs for position in pair}
-        views = {
-            position: dataclasses.replace(view, T_wc=self._between(view.index + shift))
-            for position, view in self._sample.views.items()
-            if position in used
-        }
-        return median_by_pair(Sample(views, self.pairs, self._sample.configured))
-
-    def _between(self, at: float) -> Float64:
-        from scipy.spatial.transform import Rotation, Slerp
-
-        before = math.floor(at + 1e-9)
-        part, first = at - before, self._poses[before]
-        if part < 1e-6:
-            return first
-        second, T = self._poses[before + 1], np.eye(4)
-        rotations = Rotation.from_matrix(np.stack([first[:3, :3], second[:3, :3]]))
-        T[:3, :3] = Slerp([0, 1], rotations)([part]).as_matrix()[0]
-        T[:3, 3] = (1 - part) * first[:3, 3] + part * second[:3, 3]
-        return T
+    return pairs, errors
 
 
 def _poses_around(scene: Scene, sample: Sample) -> Iterator[tuple[int, Float64]]:

@@ -6,10 +6,11 @@ import contextlib
 import math
 from collections.abc import Mapping
 
-from semstab.check.coverage import Coverage, Stays, suggested_size
+from semstab.check.coverage import Coverage, Covers, suggested_size
+from semstab.check.inspection import Inspection
 from semstab.check.reprojection import Sample, clusters
-from semstab.check.scans import quick_sample_of_scans
-from semstab.check.scene_check import CLUSTERS, POINTS, Inspection
+from semstab.check.scan_sample import quick_sample_of_scans
+from semstab.check.scene_check import CLUSTERS, POINTS
 from semstab.config import Config
 from semstab.core.arrays import evenly
 from semstab.data.results import VoxelAdvice
@@ -65,7 +66,7 @@ def _is_made(config: Config) -> bool:
     return (dataset.options["dataset"]["name"] if dataset.name == PREDICTED else dataset.name) == MADE
 
 
-def _coverage(config: Config, scene: Scene) -> Stays | None:
+def _coverage(config: Config, scene: Scene) -> Covers | None:
     """Return what a scene's frames share; None where they cannot be read."""
     models = models_of(scene, config)
     with contextlib.suppress(DataError):

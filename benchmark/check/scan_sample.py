@@ -1,0 +1,245 @@
+"""Scans of a scene whose points are sought in each other, under the poses as they are or as they may be."""
+
+from __future__ import annotations
+
+import copy
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+
+from semstab.backends.shared.association import in_world
+from semstab.check.conventions import Convention
+from semstab.check.coverage import Noise, Overlap, by_distance
+from semstab.check.reprojection import CONSISTENT, Pair, clusters, frames_at, motion, pairs_within, reader
+from semstab.check.surfaces import LEAST_RANGE, Surfaces
+from semstab.check.verdict import Fit
+from semstab.core.arrays import evenly
+from semstab.core.types import Float32, Float64, Int64, Mask
+from semstab.data.frames import Frame
+from semstab.datasets import Scene
+
+QUERIES = 2000
+"""Points of a scan that are sought in another one, ..."""
+
+JUDGED = 4
+"""... every so many of them beside surfaces, under each reading of the poses."""
+
+EXACT = 1e-5
+"""The least error: a smaller one is that of the arithmetic."""
+
+
+@dataclass(frozen=True, eq=False)
+class Met:
+    """The points of a scan that were sought in another one.
+
+    Attributes:
+        distance: (n,) metres to the nearest point there.
+        range: (n,) of each point from its own sensor.
+        nearest: (n,) its row there.
+    """
+
+    distance: Float64
+    range: Float64
+    nearest: Int64
+
+    @property
+    def error(self) -> Float64:
+        """(n,) the distance as a share of the range."""
+        return self.distance / np.maximum(self.range, LEAST_RANGE)
+
+
+class ScanSample:
+    """Scans of a scene at some positions of the sequence, and points of each sought in the others.
+
+    Args:
+        scene: The scene.
+        indices: The selected scans.
+        source: Label source to read them with; None needs no labels.
+        groups: Positions in `indices` of scans that are compared with each other.
+        fused: Number of scans, evenly spaced, that are read for fusion too.
+        passing_over: Leave out scans that cannot be read, instead of raising what reading them raises.
+    """
+
+    reasons = (
+        "{:.0%} of the points have the nearest one of another scan in the same voxel",
+        "{:.0%} of a scan's points lie on the surfaces of the next one",
+    )
+
+    def __init__(
+        self,
+        scene: Scene,
+        indices: Sequence[int],
+        source: str | None,
+        groups: Sequence[Sequence[int]],
+        *,
+        fused: int = 0,
+        passing_over: bool = False,
+    ) -> None:
+        self.scene, self.fused = scene, evenly(len(indices), fused)
+        compared = {position for group in groups for position in group}
+        positions = compared | set(self.fused)
+        read = frames_at(positions, indices, reader(scene, source), passing_over=passing_over)
+        self.scans: dict[int, Frame] = dict(read)
+        self.poses: dict[int, Float64] = {position: scan.T_wc for position, scan in self.scans.items()}
+        clouds = {position: _Cloud(self.scans[position]) for position in compared & self.scans.keys()}
+        self._clouds = {position: cloud for position, cloud in clouds.items() if len(cloud.rows)}
+        self.pairs = [pair for pair in pairs_within(groups) if pair[0] < pair[1] and {*pair} <= self._clouds.keys()]
+
+    def _motion(self, pair: Pair) -> tuple[Float64, Float64]:
+        return motion(*(self.poses[position] for position in pair))
+
+    @cached_property
+    def met(self) -> dict[Pair, Met]:
+        """Points of each pair's first scan in its second one."""
+        return {pair: self._met(pair) for pair in self.pairs}
+
+    def _met(self, pair: Pair) -> Met:
+        R, t = self._motion(pair)
+        points = self._clouds[pair[0]].sought
+        distance, nearest = self._clouds[pair[1]].tree.query(points @ R.T + t)
+        return Met(distance, np.linalg.norm(points, axis=1), nearest)
+
+    def posed(self, change: Callable[[Float64], Float64]) -> ScanSample:
+        """Return the same scans with each pose (4, 4) changed."""
+        other = copy.copy(self)
+        vars(other).update(poses={position: change(T) for position, T in self.poses.items()})
+        for known in {"met", "_errors", "_in_world"} & vars(other).keys():
+            delattr(other, known)
+        return other
+
+    def surfaces(self, pair: Pair, every: int = 1) -> Surfaces:
+        """Seek points of the pair's first scan beside surfaces of its second one."""
+        here, there = (self._clouds[position] for position in pair)
+        return Surfaces.of(here.sought[::every], there.points, there.tree, *self._motion(pair))
+
+    @cached_property
+    def _errors(self) -> list[Float64]:
+        """For each pair the distance (n,) of points from the surfaces there, as a share of their range."""
+        return [self.surfaces(pair, JUDGED).error for pair in self.pairs]
+
+    def by_pair(self) -> Float64:
+        """Return (pairs,) the typical error of each pair; NaN where no point is told."""
+        return np.array([_typical(own) for own in self._errors])
+
+    def fit(self) -> Fit:
+        """Return the typical error of all points that are told, and the share of them on one surface."""
+        every = np.concatenate(self._errors)
+        told = every[np.isfinite(every)]
+        share = float(np.mean(told <= CONSISTENT)) if len(told) else 0.0
+        return Fit(Convention(), _typical(every), share, len(told))
+
+    @property
+    def ranges(self) -> list[Float32]:
+        """Return for each scan the ranges (n,) of its points that have one, metres."""
+        return [scan.depth[(scan.depth > 0) & (scan.depth < np.inf)] for scan in self.scans.values()]
+
+    @property
+    def places(self) -> tuple[Float64, Float64]:
+        """Return the middles (n, 3) of the points of scans that are compared, and the positions (n, 3) of the poses."""
+        middle = [np.median(cloud.points, axis=0) for cloud in self._clouds.values()]
+        return np.array(middle), np.array([self.poses[position][:3, 3] for position in self._clouds])
+
+    @property
+    def between(self) -> float:
+        """Median distance of a point from the nearest of another scan, metres."""
+        return float(np.median(np.concatenate([met.distance for met in self.met.values()])))
+
+    @cached_property
+    def spacing(self) -> float:
+        """Median distance of a point from the nearest of its own scan, metres."""
+        clouds = [self._clouds[position] for position in {pair[0] for pair in self.pairs}]
+        own = [cloud.tree.query(cloud.sought, k=2)[0][:, 1] for cloud in clouds]
+        return float(np.median(np.concatenate(own))) if own else math.nan
+
+    def overlaps(self) -> list[Overlap]:
+        """Return one row a distance between scans."""
+        return [self._overlap(apart, pairs) for apart, pairs in by_distance(self.pairs)]
+
+    def _overlap(self, apart: tuple[int, int], pairs: Sequence[Pair]) -> Overlap:
+        error = np.concatenate([self.met[pair].error for pair in pairs])
+        agree = np.concatenate([self.agree(pair) for pair in pairs])
+        share, agreement = float(np.mean(error <= CONSISTENT)), float(agree.mean()) if len(agree) else math.nan
+        return Overlap(apart, len(pairs), share, share, float(np.median(error)), agreement)
+
+    def noise(self) -> Noise:
+        """Return the distance of points from the nearest of another scan and of their own, and between rays."""
+        ranges = np.concatenate([met.range for met in self.met.values()])
+        angle = float(np.median([scan.ray_angle for scan in self.scans.values()]))
+        return Noise(self.between, self.spacing, angle * float(np.median(ranges)))
+
+    def pixel_stride(self, voxel_size: float | None) -> tuple[int | None, str]:
+        """Return that all points are fused."""
+        return 1, "all points"
+
+    def agree(self, pair: Pair) -> Mask:
+        """Return whether labels agree, of the points met that have one in both scans."""
+        a, b = self.scans[pair[0]], self.scans[pair[1]]
+        here, there, met = self._clouds[pair[0]], self._clouds[pair[1]], self.met[pair]
+        first = a.predicted.reshape(-1)[here.rows][here.chosen]
+        second = b.predicted.reshape(-1)[there.rows][met.nearest]
+        known = (met.error <= CONSISTENT) & (first != a.ignore_id) & (second != b.ignore_id)
+        agree: Mask = (first == second)[known]
+        return agree
+
+    def faces(self, voxel_size: float) -> None:
+        """Return that faces of voxels are not looked for: rings of a scan do not lie in them."""
+
+    def stays(self, voxel_size: float) -> float:
+        """Return the share of the points met that lie in the same voxel as the nearest of the other scan."""
+        first, second = self._in_world
+        same = np.all(np.floor(first / voxel_size) == np.floor(second / voxel_size), axis=1)
+        return float(same.mean()) if len(same) else math.nan
+
+    @cached_property
+    def _in_world(self) -> tuple[Float64, Float64]:
+        """Return (n, 3) the points met of all pairs, and the nearest ones of the other scans, in the world."""
+        first, second = [np.zeros((0, 3))], [np.zeros((0, 3))]
+        for pair, met in self.met.items():
+            (here, T), (there, T_other) = ((self._clouds[p], self.poses[p]) for p in pair)
+            near = met.error <= CONSISTENT
+            first.append(in_world(here.sought[near].T, T).T)
+            second.append(in_world(there.points[met.nearest[near]].T, T_other).T)
+        return np.concatenate(first), np.concatenate(second)
+
+
+class _Cloud:
+    """The points of a scan that have a range, and those of them that are sought in others.
+
+    Attributes:
+        rows: (n,) rows of these points among all.
+        points: (n, 3) in the sensor's axes.
+        chosen: (m,) those that are sought, of the n.
+    """
+
+    def __init__(self, scan: Frame) -> None:
+        assert scan.points is not None
+        self.rows = np.flatnonzero((scan.depth > 0) & (scan.depth < np.inf))
+        self.points: Float64 = scan.points.reshape(-1, 3)[self.rows].astype(np.float64)
+        self.chosen = np.array(evenly(len(self.rows), QUERIES), dtype=np.int64)
+
+    @property
+    def sought(self) -> Float64:
+        """(m, 3) the points that are sought."""
+        return self.points[self.chosen]
+
+    @cached_property
+    def tree(self) -> Any:
+        """Return a search tree of the points."""
+        from scipy.spatial import cKDTree
+
+        return cKDTree(self.points)
+
+
+def quick_sample_of_scans(scene: Scene, indices: Sequence[int]) -> ScanSample:
+    """Return a few scans of a scene, those that can be read."""
+    return ScanSample(scene, indices, None, clusters(len(indices), 1), passing_over=True)
+
+
+def _typical(errors: Float64) -> float:
+    """Return the geometric mean of errors (n,): some points lie on no surface of the other scan; NaN where none is."""
+    told = errors[np.isfinite(errors)]
+    return float(np.exp(np.log(np.maximum(told, EXACT)).mean())) if len(told) else math.nan
