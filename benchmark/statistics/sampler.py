@@ -213,9 +213,10 @@ class Sampler:
 
         (H, W), stride = frame.shape, _stride(frame.shape)
         blocks = -(-H // stride) * -(-W // stride)
-        where = SURE * self._noise, self._edge, self._share, self._low, stride, _factor(blocks)
-        where = *where, self._density(blocks), seed
-        self._new(lambda *room: new_in_image(fixed(frame.depth), _camera(frame), T, *where, *room))
+        cells = self._edge, self._share, self._low
+        places = stride, _factor(blocks), self._density(blocks), seed
+        of_frame = fixed(frame.depth), _camera(frame), T, SURE * self._noise
+        self._new(lambda *room: new_in_image(*of_frame, *cells, *places, *room))
 
     def _density(self, blocks: int) -> float:
         """Return how many places are looked at in the area of a coarse cell's face."""
@@ -227,9 +228,9 @@ class Sampler:
 
         looked = min(len(sparse.w), LOOKED_AT)
         place = sparse.camera, sparse.around, sparse.reach, sparse.apart(looked)
-        where = self._allowed(), T, self._edge, self._share, self._low, _factor(len(sparse.w))
-        where = *where, looked, self._density(looked), seed
-        self._new(lambda *room: new_in_points(*sparse.arrays, *place, *where, *room))
+        cells = self._edge, self._share, self._low
+        places = _factor(len(sparse.w)), looked, self._density(looked), seed
+        self._new(lambda *room: new_in_points(*sparse.arrays, *place, self._allowed(), T, *cells, *places, *room))
 
     def _new(self, find: Any) -> None:
         """Add the spots that a loop finds, at most MOST_NEW."""

@@ -149,7 +149,7 @@ class _Site:
             if rng.random() < 0.55:
                 self.cars.append((lot.s + lot.wide - 2, lot.t(rng.uniform(3, setback + 2)), np.pi / 2))
             garden = lot.part(1, lot.wide - 1, setback + deep + 2.5, lot.deep)
-            self._plant(garden, rng.integers(1, 5))
+            self._plant(garden, int(rng.integers(1, 5)))
 
     def _put_flats(self, land: Rectangle) -> None:
         """Put two rows of long buildings on a paved court, with a lawn behind each and cars in the middle."""
