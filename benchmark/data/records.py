@@ -33,9 +33,6 @@ the ground truth of the same frames; logs of observations; time series; and the 
 SCENE__MODEL.npz with the arrays frame (its index), labels (H, W) rows 0..K-1 or the ignore id, palette (K, 3) and,
 where the dataset has it, color (H, W, 3). In addition sums by frame and cube of space, `ClusterSums`."""
 
-SUMS_BEFORE = "influence"
-"""Folder of the sums in runs before 0.4."""
-
 REGIONS = "region_maps"
 """The name, not of a sweep, for the label sources that hold regions without classes."""
 
@@ -299,8 +296,7 @@ class Record:
     @property
     def sums_file(self) -> Path | None:
         """File of its sums by frame and cube of space, which is there where its map was assessed."""
-        new = self._companion(SUMS)
-        return new if new is None or new.exists() else self._companion(SUMS_BEFORE)
+        return self._companion(SUMS)
 
     def _companion(self, folder: str, suffix: str = ".parquet") -> Path | None:
         return None if self.voxels_file is None else self.voxels_file.parents[1] / folder / f"{self.unit.slug}{suffix}"
