@@ -14,12 +14,33 @@ from simulated_events import log_of, log_of_evidence, soft
 from statsmodels.stats.inter_rater import fleiss_kappa as statsmodels_kappa
 
 from semstab.metrics import vss
-from semstab.statistics import class_agreement, decompose, fleiss_kappa, krippendorff_alpha, psa
+from semstab.statistics import alpha, class_agreement, decompose, fleiss_kappa, krippendorff_alpha, psa
 from semstab.testing import checks
 
 LABELS = st.lists(st.lists(st.integers(-1, 2), min_size=4, max_size=4), min_size=1, max_size=8).filter(
     lambda rows: all(max(row) >= 0 for row in rows)
 )
+
+
+@given(LABELS)
+def test_alpha_of_arrays_is_that_of_the_package_krippendorff(rows):
+    """Rows are units and columns are views; -1 is no label."""
+    ratings = np.array(rows)
+    unit = np.repeat(np.arange(len(ratings)), ratings.shape[1])
+    counts = np.stack([(ratings == k).sum(axis=1) for k in range(3)], axis=1)
+    again = counts[counts.sum(axis=1) >= 2]
+    if np.count_nonzero(again.sum(axis=0)) < 2:
+        assert math.isnan(alpha(unit, ratings.ravel()))
+        return
+    expected = krippendorff.alpha(value_counts=again, level_of_measurement="nominal")
+    assert alpha(unit, ratings.ravel()) == pytest.approx(expected)
+    assert alpha(unit[::-1] + 7, 10 * ratings.ravel()[::-1]) == pytest.approx(expected)
+
+
+def test_alpha_of_arrays_needs_integers_of_one_shape():
+    for unit, label in (([0, 0], [1]), ([0, 0], [1.0, 1.0]), ([[0, 0]], [[1, 1]])):
+        with pytest.raises(ValueError, match="integers of one shape"):
+            alpha(unit, label)
 
 
 def by_pairs(evidence):

@@ -10,7 +10,15 @@ Examples:
 """
 
 from semstab.data.statistics import Estimate, Reliability
-from semstab.statistics.agreement import class_agreement, decompose, disagreement, fleiss_kappa, krippendorff_alpha, psa
+from semstab.statistics.agreement import (
+    alpha,
+    class_agreement,
+    decompose,
+    disagreement,
+    fleiss_kappa,
+    krippendorff_alpha,
+    psa,
+)
 from semstab.statistics.correctness import consistent_wrong, correctness, join_truth, reliability
 from semstab.statistics.correlogram import correlogram
 from semstab.statistics.drift import expected_sbd, flips
@@ -29,6 +37,7 @@ __all__ = [
     "Sampler",
     "SpotObservations",
     "Views",
+    "alpha",
     "analyse",
     "ceiling",
     "class_agreement",

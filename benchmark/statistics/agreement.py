@@ -12,6 +12,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
+import numpy.typing as npt
 
 from semstab.core.types import Float64, Int64, Mask
 from semstab.data.events import Events
@@ -64,6 +65,41 @@ def krippendorff_alpha(table: VoxelTable) -> float:
     predicted.
     """
     return float(alpha_of(alpha_sums(table)))
+
+
+def alpha(unit: npt.ArrayLike, label: npt.ArrayLike) -> float:
+    """Return Krippendorff's alpha, nominal, of labels alone, without a run or a map (Krippendorff 2018, ch. 12).
+
+    A unit weighs by its number of labels. Units with one label do not count.
+
+    Args:
+        unit: (n,) integers: the spot, voxel or object that a view labelled.
+        label: (n,) integers: the class that the view gave it; negative ones are no label.
+
+    Returns:
+        Alpha, at most 1; NaN if no unit has two labels, or all labels are of one class.
+
+    Raises:
+        ValueError: If the two differ in shape, or are not integers.
+
+    Examples:
+        Two views label four spots; they differ about the last one:
+
+        >>> round(alpha([0, 0, 1, 1, 2, 2, 3, 3], [5, 5, 5, 5, 2, 2, 2, 5]), 3)
+        0.533
+    """
+    units, labels = np.asarray(unit), np.asarray(label)
+    if units.shape != labels.shape or units.ndim != 1 or not {units.dtype.kind, labels.dtype.kind} <= {"i", "u"}:
+        raise ValueError("unit and label must be integers of one shape (n,)")
+    units, labels = units[labels >= 0], labels[labels >= 0]
+    _, units, views = np.unique(units, return_inverse=True, return_counts=True)
+    again = views[units] >= 2
+    units, labels = units[again], np.unique(labels[again], return_inverse=True)[1]
+    of_class = np.bincount(labels)
+    pairs, count = np.unique(units * len(of_class) + labels, return_counts=True)
+    agreeing = count * (count - 1.0) / (views[pairs // max(len(of_class), 1)] - 1)
+    n = float(len(labels))
+    return float(alpha_of(np.array([agreeing.sum(), n, n, *of_class])))
 
 
 def alpha_sums(table: VoxelTable) -> Float64:
