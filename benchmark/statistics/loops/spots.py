@@ -277,16 +277,15 @@ def new_in_image(depth, camera, T, allowed, edge, share, low, stride, factor, de
             along_x, along_y = slopes(depth, row, column, here)
             z = 1.0 / max(here + along_x * (u - column) + along_y * (v - row), 0.5 * here)
             px, py, pz = in_world((u - cx) / fx * z, (v - cy) / fy * z, z, T)
-            if free(px, py, pz, edge, share, low, table, False) < 0:
-                if done == 1:
-                    break  # other places of the block were looked at in an earlier frame
-                continue
+            known = free(px, py, pz, edge, share, low, table, False) < 0
             if done == 1:
                 along_x, along_y = slopes(depth, row, column, here, stride)
                 shown = area(here, along_x, along_y, (column - cx) / fx, (row - cy) / fy, fx, fy) * stride * stride
                 places = number_of(density * shown / (edge * edge), fraction(np.uint32(number ^ np.uint32(0x165667B1))))
                 if places == 0:
                     break
+            if known:
+                continue
             there = smoothed(depth, row, column, here, u - column, v - row, allowed)
             z = 1.0 / (there if there > 0.5 * here else here)
             px, py, pz = in_world((u - cx) / fx * z, (v - cy) / fy * z, z, T)
