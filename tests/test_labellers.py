@@ -62,7 +62,7 @@ def test_the_limits_of_a_verdict_are_settings(result, tmp_path):
         "stable": 0.8, "usable": pytest.approx(2 / 3), "labelled": 0.9, "class_locations": 100.0,
     }  # fmt: skip
     verdict = {"stable": 0.99, "class_locations": 1e9}
-    found = of(labelled(tmp_path / "run", ["sim-steady"], verdict=verdict), "sim-steady")
+    found = of(labelled(tmp_path / "run", ["sim-steady"], verdict=verdict, truth=False), "sim-steady")
     assert found.verdict.level == "usable"
     assert np.isfinite(of(result, "sim-steady").spots.critical_classes[0].unstable)
     assert not found.spots.critical_classes
