@@ -1,7 +1,7 @@
 """Train a small network on the city, with mIoU and stability of every epoch: `python training_loop.py [figure.png]`.
 
 After half of the epochs the loss also asks for the same answer under another exposure. mIoU on the validation images
-stays; the stability on the flight, whose exposure changes from frame to frame as a camera's does, doubles.
+hardly rises; the stability on the flight, whose exposure changes from frame to frame as a camera's does, doubles.
 """
 
 from __future__ import annotations
