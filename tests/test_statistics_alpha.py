@@ -684,3 +684,24 @@ def shelf():
         pytest.skip(f"no {DATA / 'apc_shelf'}; set SEMSTAB_DATA to the folder that holds apc_shelf/")
     scene = open_dataset("posed_folder", {"root": DATA / "apc_shelf"}).scene("apc_shelf")
     return [scene.frame(index, "gt") for index in range(15)]
+
+
+def test_two_spots_beside_a_face_of_their_cells_are_two_units():
+    """Both lie in one 64th of a cell, as faces of cells are between those of the 64ths."""
+    column = np.array([0, 0, 1, 1])
+    spots = SpotObservations(
+        spot=column.astype(np.int32),
+        view=np.array([0, 1, 0, 1], np.int32),
+        **dict.fromkeys(("label", "neighbour", "beyond"), column.astype(np.uint16)),
+        **dict.fromkeys(("near", "far"), np.zeros(4, np.float32)),
+        point=np.array([[0.615, 0.1, 0.1], [0.62, 0.1, 0.1]]),
+        drawn=np.arange(2, dtype=np.uint32),
+        views=Views.of([[index, index, 0, 0, 0, 0.01] for index in range(2)]),
+        spacing=1.0,
+        K=2,
+    )
+    assert len({*map(tuple, spots.cell.tolist())}) == 2
+    log = spots.observations()
+    assert np.bincount(log.voxel).tolist() == [2, 2]
+    assert log.evidence.weight.tolist() == [1, 1, 1, 1]
+    assert value(sums_of_spots(spots).near, "voxel_alpha") == 1

@@ -204,7 +204,8 @@ class SpotObservations:
     def _log(self, label: UInt16, square: Float32 | None = None) -> tuple[Events, Int64, Float64]:
         """Return a log of these labels, (n,) the spot of each of its voxels, and (m,) squared distances.
 
-        A spot is a voxel of a PARTS-th of a coarse cell: none of two spots is in one.
+        A spot is a voxel of a PARTS-th of a coarse cell. Of two spots in one, next to a face of their cells, the second
+        one is the next voxel.
         """
         from semstab.statistics.loops.spots import observe
 
@@ -212,6 +213,9 @@ class SpotObservations:
         spots, spot = np.unique(self.spot[rows], return_inverse=True)
         place = np.floor(self.point[spots] * (PARTS / self.spacing)).astype(np.int64)
         index, of = distinct_rows(place)
+        while len(index) < len(place):
+            place[np.setdiff1d(np.arange(len(place)), np.unique(of, return_index=True)[1]), 0] += 1
+            index, of = distinct_rows(place)
         number = of[spot]
         order = np.lexsort((self.view[rows], number))
         rows, number = rows[order], number[order]
