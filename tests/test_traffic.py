@@ -40,7 +40,7 @@ def test_all_disagreement_is_where_things_move() -> None:
     result = fused()
     spots = result.record().statistics.spots
     assert spots.moving.classes == ("car", "person")
-    assert spots.moving.disagreement == pytest.approx(1, abs=0.08)
+    assert spots.moving.disagreement == pytest.approx(1, abs=0.1)
     assert spots.moving.alpha == pytest.approx(1, abs=0.03)
     assert result.record().statistics.headline.alpha.value < 0.9
     (line,) = (text for text in warnings(result) if "move" in text)

@@ -31,11 +31,11 @@ def iou_of(sums: Float64) -> Float64:
 
 
 def wrong_of_consistent_of(sums: Float64) -> Float64:
-    """Return the share (...,) of the consistent locations that are wrong, from sums (..., 2); NaN of less than one.
+    """Return the share (...,) of the consistent locations that are wrong, from sums (..., 2); NaN of none.
 
     A location counts by its probability of being consistent.
     """
-    share: Float64 = np.where(sums[..., 1].real >= 1, ratio_of(sums), np.nan)
+    share: Float64 = np.where(sums[..., 1].real >= 1e-3, ratio_of(sums), np.nan)
     return share
 
 
