@@ -30,15 +30,6 @@ def iou_of(sums: Float64) -> Float64:
     return iou(right, true, predicted)
 
 
-def wrong_of_consistent_of(sums: Float64) -> Float64:
-    """Return the share (...,) of the consistent locations that are wrong, from sums (..., 2); NaN of none.
-
-    A location counts by its probability of being consistent.
-    """
-    share: Float64 = np.where(sums[..., 1].real >= 1e-3, ratio_of(sums), np.nan)
-    return share
-
-
 def miou_of(sums: Float64) -> Float64:
     """Return mean IoU (...,) from a count twice, then of each class the right, the true and the predicted."""
     return mean_iou(*np.split(sums[..., 2:], 3, axis=-1))
@@ -152,7 +143,7 @@ FUNCTIONALS: Mapping[str, Functional] = {
     "entropy_op2": Functional(("entropy", "voxels"), ratio_of, by_location=True),
     "accuracy": Functional(("right", "known"), ratio_of),
     "observation_accuracy": Functional(("observed_right", "observed"), ratio_of),
-    "wrong_of_consistent": Functional(("consistent_wrong", "consistent"), wrong_of_consistent_of, by_location=True),
+    "wrong_of_consistent": Functional(("consistent_wrong", "consistent"), ratio_of, by_location=True),
     "sbd_excess": Functional(("sbd_excess", "sbd_known"), ratio_of, -1.0, 1.0, "plain"),
     "miou": Functional(("known", "known", "class_right", "class_known", "class_predicted"), miou_of, scale="plain"),
     "ece": Functional(("calibrated", "calibrated", "gap"), ece_of, scale="plain"),
