@@ -32,7 +32,7 @@ def fused(classes=("road", "grass", "car", "person"), **settings):
 
 
 def test_all_disagreement_is_where_things_move() -> None:
-    """But for 7 % of it, as alpha of the rest is .98.
+    """But for 8 % of it, as alpha of the rest is .97.
 
     Of the spots at the edges of cars those remain that most views call road or grass: their disagreement is not quite
     extrapolated to 0.
