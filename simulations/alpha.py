@@ -90,9 +90,7 @@ def shares(scenes: int, flights: int, seed: int) -> None:
                     inside = alpha.low - 1e-9 <= truth <= alpha.high + 1e-9
                     decided = level != "undecided"
                     rows.append((inside, alpha.high - alpha.low, probability, level == level_of(truth), decided))
-                    fine = own.near
-                    assert fine is not None
-                    evidence = fine["evidence"].sum(axis=0)
+                    evidence = own.answers[0]["evidence"].sum(axis=0)
                     chance.append(((evidence / evidence.sum()) ** 2).sum())
         inside, wide, probability, right, decided = (np.array(column) for column in zip(*rows, strict=True))
         sure = decided & (probability >= 0.9)

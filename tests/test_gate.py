@@ -462,7 +462,7 @@ def test_frames_without_any_label_are_of_the_same_flight():
     assert not same_flight(new, base)
     assert within_a_flight(new, base)
     assert within_a_flight(new, base.coarsened(base.edge, 2))
-    unknown = dataclasses.replace(base.coarsened(base.edge, 0), near=None, far=None)
+    unknown = dataclasses.replace(base.coarsened(base.edge, 0), answers=())
     assert not within_a_flight(new, unknown)
     assert not within_a_flight(unknown, base)
     assert within_a_flight(new, base.coarsened(base.edge, 0))  # by the views of its spots

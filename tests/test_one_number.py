@@ -18,7 +18,7 @@ import video_scene
 from command_line import bench
 from rich.console import Console
 from street import Street, write_street
-from test_leaderboard import NEARLY, define, write_scene
+from test_leaderboard import define, write_scene
 from test_recording import read, series
 from typer.testing import CliRunner
 
@@ -279,7 +279,7 @@ def test_the_leaderboard_has_the_numbers_of_the_runs(tmp_path):
             if math.isnan(value):  # no location counts as consistent: the run states no interval either
                 assert {math.isnan(each.low) for each in wrong[model]} == {True}
             else:
-                assert value == pytest.approx(mean, abs=NEARLY if key == "alpha" else 1e-6), name
+                assert value == pytest.approx(mean, abs=1e-6), name
             (at,) = (k for k, head in enumerate(heads) if head.startswith(name.lower()))
             assert agree(shown[at].split()[0].replace("\N{EN DASH}", "-"), value), name
         (line,) = (line for line in lines([board]) if f" {model} " in line)

@@ -136,9 +136,9 @@ def test_alpha_is_its_definition(options):
     assert (len(spots.views), spots.frames) == (4, 5)
     sums = sums_of_spots(spots)
     first, second = alpha_by_hand(spots, spots.label), alpha_by_hand(spots, spots.neighbour)
-    assert value(sums.near, "voxel_alpha") == pytest.approx(first, abs=1e-9)
-    assert value(sums.far, "voxel_alpha") == pytest.approx(second, abs=1e-9)
-    lever = lever_of(sums.near, sums.far)
+    assert value(sums.answers[0], "voxel_alpha") == pytest.approx(first, abs=1e-9)
+    assert value(sums.answers[1], "voxel_alpha") == pytest.approx(second, abs=1e-9)
+    lever = lever_of(sums.answers)
     assert lever > 0
     assert value(sums, "alpha") == pytest.approx(first + lever * (first - second), abs=1e-9)
 
@@ -147,7 +147,7 @@ def test_alpha_is_its_definition(options):
 def test_alpha_of_perfect_labels_is_about_1(step, frames):
     """Though pixels at the borders of stripes, of which one in twelve is one, have other labels in other views."""
     sums = sums_of_spots(sampled(flight(frames, step=step)))
-    assert value(sums.near, "voxel_alpha") < 0.985
+    assert value(sums.answers[0], "voxel_alpha") < 0.985
     assert value(sums, "alpha") == pytest.approx(1, abs=0.02)
 
 
@@ -687,14 +687,14 @@ def shelf():
 
 
 def test_two_spots_beside_a_face_of_their_cells_are_two_units():
-    """Both lie in one 64th of a cell, as faces of cells are between those of the 64ths."""
+    """A face of cells is one of the 64ths in which a log tells places."""
     column = np.array([0, 0, 1, 1])
     spots = SpotObservations(
         spot=column.astype(np.int32),
         view=np.array([0, 1, 0, 1], np.int32),
         **dict.fromkeys(("label", "neighbour", "beyond"), column.astype(np.uint16)),
         **dict.fromkeys(("near", "far"), np.zeros(4, np.float32)),
-        point=np.array([[0.615, 0.1, 0.1], [0.62, 0.1, 0.1]]),
+        point=np.array([[0.609, 0.1, 0.1], [0.61, 0.1, 0.1]]),
         drawn=np.arange(2, dtype=np.uint32),
         views=Views.of([[index, index, 0, 0, 0, 0.01] for index in range(2)]),
         spacing=1.0,
@@ -704,4 +704,4 @@ def test_two_spots_beside_a_face_of_their_cells_are_two_units():
     log = spots.observations()
     assert np.bincount(log.voxel).tolist() == [2, 2]
     assert log.evidence.weight.tolist() == [1, 1, 1, 1]
-    assert value(sums_of_spots(spots).near, "voxel_alpha") == 1
+    assert value(sums_of_spots(spots).answers[0], "voxel_alpha") == 1

@@ -104,7 +104,7 @@ def lever_by_hand(spots):
 
     The third answers are two pixels away, of which the second ones are one.
     """
-    (first, near), (second, far), third = spots.logs()
+    (first, near), (second, far), (third, _) = spots.logs()
     again = first.table().op[first.voxel] >= 2
     disagreement = [1 - psa(log.table())[log.voxel[again]].mean() for log in (first, second, third)]
     own, one = near[again].mean(), far[again].mean()
@@ -117,7 +117,7 @@ def test_the_sums_of_spots_give_alpha_back():
     whole, spots = stripes()
     logs = [log for log, _ in spots.logs()[:2]]
     expected = [krippendorff_alpha(log.table()) for log in logs]
-    assert [value(part, "voxel_alpha") for part in (whole.near, whole.far)] == pytest.approx(expected)
+    assert [value(part, "voxel_alpha") for part in whole.answers[:2]] == pytest.approx(expected)
     lever = lever_by_hand(spots)
     assert 0.1 < lever < 1
     assert value(whole, "alpha") == pytest.approx(expected[0] + lever * (expected[0] - expected[1]))
@@ -134,13 +134,13 @@ def test_where_the_second_answers_are_the_first_ones_alpha_is_that_of_the_first_
     spots = stripes()[1]
     alone = replace(spots, neighbour=spots.label, beyond=spots.label, far=spots.near)
     found = sums_of_spots(alone)
-    assert value(found, "alpha") == pytest.approx(value(sums_of_spots(spots).near, "voxel_alpha"), abs=1e-12)
+    assert value(found, "alpha") == pytest.approx(value(sums_of_spots(spots).answers[0], "voxel_alpha"), abs=1e-12)
 
 
 def test_without_spots_there_is_no_alpha():
     table, log, _ = flight()
     sums = cluster_sums_of(table, log)
-    assert (sums.near, sums.far) == (None, None)
+    assert sums.answers == ()
     assert np.isnan(value(sums, "alpha"))
     assert not np.isnan(value(sums, "voxel_alpha"))
 
@@ -148,9 +148,10 @@ def test_without_spots_there_is_no_alpha():
 def test_sums_of_spots_become_coarser_with_those_of_the_map():
     whole, _ = stripes()
     larger = whole.coarsened(2 * whole.edge, 4)
-    assert larger.near.edge == larger.far.edge == larger.edge == 2 * whole.edge
-    assert larger.near.cells < whole.near.cells
-    assert larger.near.step == whole.near.step == 1
+    assert [part.edge for part in (larger, *larger.answers)] == [2 * whole.edge] * 4
+    for wide, fine in zip(larger.answers, whole.answers, strict=True):
+        assert wide.cells < fine.cells
+        assert wide.step == fine.step == 1
     for key in ("alpha", "voxel_alpha"):
         assert value(larger, key) == pytest.approx(value(whole, key))
 
@@ -160,25 +161,25 @@ def test_sums_of_two_maps_are_aligned_with_their_spots():
     one, other = stripes()[0].coarsened(2.0, 2), stripes(seed=1)[0].coarsened(4.0, 1)
     a, b = aligned(one.coarsened(2.0, 0), other)
     assert (a.edge, a.step, b.edge, b.step) == (4.0, 0, 4.0, 0)
-    for part in (a.near, a.far, b.near, b.far):
+    for part in (*a.answers, *b.answers):
         assert (part.edge, part.step) == (4.0, 1)
     assert [value(a, "alpha"), value(b, "alpha")] == pytest.approx([value(one, "alpha"), value(other, "alpha")])
     without = cluster_sums_of(flight()[0]).coarsened(4.0, 0)
     a, b = aligned(replace(without, voxel_size=0.3), other)
-    assert (a.near, np.isnan(value(a, "alpha"))) == (None, True)
+    assert (a.answers, np.isnan(value(a, "alpha"))) == ((), True)
     assert value(b, "alpha") == pytest.approx(value(other, "alpha"))
 
 
-def test_a_file_holds_a_map_and_the_first_and_second_answers_of_its_spots(tmp_path):
+def test_a_file_holds_a_map_and_the_three_answers_of_its_spots(tmp_path):
     whole, spots = stripes()
     whole.save(tmp_path / "sums.parquet")
     back = ClusterSums.load(tmp_path / "sums.parquet")
-    for part, own in zip((back, back.near, back.far), (whole, whole.near, whole.far), strict=True):
+    for part, own in zip((back, *back.answers), (whole, *whole.answers), strict=True):
         for name in ("cell", "frame", "columns"):
             np.testing.assert_array_equal(getattr(part, name), getattr(own, name))
         for name in ("edge", "step", "voxel_size", "K", "classes", "truth", "fused"):
             assert getattr(part, name) == getattr(own, name)
-    assert (back.voxel_size, back.near.voxel_size, back.far.voxel_size) == (0.3, *[spots.spacing / PARTS] * 2)
+    assert [part.voxel_size for part in (back, *back.answers)] == [0.3, *[spots.spacing / PARTS] * 3]
     assert value(back, "alpha") == value(whole, "alpha")
 
 

@@ -41,8 +41,8 @@ def sums_from(labels, side, voxel_size=0.125):
 
 def moved(sums, by):
     """The same map, elsewhere."""
-    further = {name: part and moved(part, by) for name, part in (("near", sums.near), ("far", sums.far))}
-    return dataclasses.replace(sums, cell=sums.cell + np.array(by, np.int32), **further)
+    answers = tuple(moved(part, by) for part in sums.answers)
+    return dataclasses.replace(sums, cell=sums.cell + np.array(by, np.int32), answers=answers)
 
 
 def simulated(seed=0, **settings):
@@ -75,7 +75,7 @@ def test_no_error_seen_is_not_no_error_and_next_to_nothing_is_nowhere():
     assert alpha.value == alpha.high == of_voxels.value == of_voxels.high == psa.high == 1
     assert psa.low == pytest.approx(0.025 ** (1 / 100))
     assert of_voxels.low == pytest.approx(1 - (1 - psa.low) / 0.5, abs=0.01)
-    assert sums.cells == sums.near.cells == sums.far.cells == 100
+    assert [part.cells for part in (sums, *sums.answers)] == [100] * 4
     assert alpha.low == pytest.approx(of_voxels.low)  # the second answers are the first ones: there is no fall
     # Of 150 classes so few voxels may be stable that the square of their number is none any more
     rng = np.random.default_rng(0)

@@ -117,13 +117,11 @@ def compared_observations(samples: Mapping[str, SpotObservations]) -> SharedObse
     edge: float | None = None
     for name, own in shared.items():
         sums[name] = sums_of_spots(own, edge)
-        near = sums[name].near
-        edge = None if near is None else near.edge
+        edge = sums[name].answers[0].edge
     ignored = []
     for name, missing in zip(names, both.missing, strict=True):
         log, whole = ignoring[name].observations(), sums_of_spots(samples[name])
-        chance = math.nan if whole.near is None else chance_of(whole.near)
-        pairs = LabelledPairs(pairs_labelled(log), chance)
+        pairs = LabelledPairs(pairs_labelled(log), chance_of(whole.answers[0]))
         ignored.append(Ignored(name, missing, *psa_bounds(log), pairs.of_all(min(value_of(whole, ALPHA.key), 1.0))))
     first = next(iter(logs.values()))
     bounds = {row.model: (row.psa_low, row.psa_high) for row in ignored}

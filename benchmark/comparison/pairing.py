@@ -172,8 +172,7 @@ def _by_voxels(entries: Sequence[Entry], regions: Regions) -> Common:
     tables, share = tuple(common.tables.values()), common.share
     label = None if common.truth is None else join_truth(tables[0], common.truth).label
     sums = tuple(
-        replace(_sums(table, label), near=entry.sums.near, far=entry.sums.far)
-        for table, entry in zip(tables, entries, strict=True)
+        replace(_sums(table, label), answers=entry.sums.answers) for table, entry in zip(tables, entries, strict=True)
     )
     millions = len(tables[0]) / share / 1e6
     sampled = () if share == 1 else (SAMPLED.format(millions=millions, n=round(1 / share)),)
@@ -187,7 +186,7 @@ def _with_observations(common: Common, names: Sequence[str], records: Sequence[R
         return replace(common, notes=(OTHER_OBSERVATIONS, *common.notes), same_frames=False, frames_differ=True)
     shared, pixels = _compared(names, samples)
     spots = shared.sums.values()
-    sums = (replace(part, near=of.near, far=of.far) for part, of in zip(common.sums, spots, strict=True))
+    sums = (replace(part, answers=of.answers) for part, of in zip(common.sums, spots, strict=True))
     notes, logs = _fewer_frames(samples), tuple(shared.logs.values())
     return replace(
         common, basis="observations", notes=(*common.notes, *notes, *pixels), sums=tuple(sums), logs=logs,
@@ -232,7 +231,7 @@ def on_common_observations(
     if not shared.compared.observations:
         return None
     alike = [
-        replace(entry, small=(replace(entry.sums, near=of.near, far=of.far), entry.flicker))
+        replace(entry, small=(replace(entry.sums, answers=of.answers), entry.flicker))
         for entry, of in zip(runs, shared.sums.values(), strict=True)
     ]
     return alike, shared.compared, notes

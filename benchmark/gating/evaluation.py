@@ -265,7 +265,7 @@ def silence_notes(rule: Rule, pairs: Sequence[Pair]) -> list[str]:
 
 def _is_nearly_one_class(sums: ClusterSums | None) -> bool:
     """Return whether the verdict on the map is 'uninformative'."""
-    return sums is not None and sums.near is not None and chance_of(sums.near) * LEAST_CLASSES > 1
+    return sums is not None and bool(sums.answers) and chance_of(sums.answers[0]) * LEAST_CLASSES > 1
 
 
 def _same_frames(new: Entry, base: Entry) -> bool:

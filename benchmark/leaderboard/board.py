@@ -66,20 +66,20 @@ class SceneNumbers:
         alpha, of_labelled = (estimate(each, "alpha", scope=scope_of(each)) for each in (whole, sums))
         keys = OF_TRUTH if sums.truth else ()
         truth = {key: estimate(sums, key, scope=scope_of(sums, key=key)) for key in keys}
-        labelled = labelled_share(sums, spots)
+        labelled = labelled_share(sums.answers[0], spots)
         level = _level(whole, spots, alpha, _at_least_wrong(sums, truth))
         return cls(whole, alpha, of_labelled, labelled, level, truth)
 
 
 def _level(whole: ClusterSums, spots: Spots, alpha: Interval, wrong: Interval) -> Level:
     """Return the level of the verdict, with all answers that a model has to give."""
-    near = whole.near
-    assert near is not None
-    voxels, evidence = round(float(whole["voxels"].sum())), near["evidence"].sum(axis=0)
+    first = whole.first_answers
+    assert first is not None
+    voxels, evidence = round(float(whole["voxels"].sum())), first["evidence"].sum(axis=0)
     largest, n = int(evidence.argmax()), float(evidence.sum())
     agreement = SpotAgreement(
-        spacing=math.nan, spots=round(float(near["voxels"].sum())), cubes=near.cells, frames=spots.frames,
-        views=len(np.unique(near.frame)) * max(near.step, 1), chance=chance_of(near),
+        spacing=math.nan, spots=round(float(first["voxels"].sum())), cubes=first.cells, frames=spots.frames,
+        views=len(np.unique(first.frame)) * max(first.step, 1), chance=chance_of(first),
         largest_class=whole.classes[largest], largest_share=float(evidence[largest]) / n if n else math.nan,
         labelled=1.0, classes=(),
     )  # fmt: skip
@@ -92,10 +92,10 @@ def _at_least_wrong(sums: ClusterSums, truth: Mapping[Number, Interval]) -> Inte
 
     Two views agree on a wrong label at least as often as they agree, less the share of the right labels.
     """
-    near, wrong = sums.near, truth.get("wrong_of_consistent", UNKNOWN)
-    assert near is not None
-    n = float(near["observations"].sum())
-    agreeing = float(near["agreeing"].sum()) / n if n else math.nan
+    first, wrong = sums.first_answers, truth.get("wrong_of_consistent", UNKNOWN)
+    assert first is not None
+    n = float(first["observations"].sum())
+    agreeing = float(first["agreeing"].sum()) / n if n else math.nan
     least = 1 - truth["accuracy"].high / agreeing if truth and agreeing > 0 else math.nan
     return dataclasses.replace(wrong, value=float(np.fmax(wrong.value, least)), low=float(np.fmax(wrong.low, least)))
 

@@ -92,23 +92,20 @@ def spots_of(seen: Iterable[Frame], truth: Iterable[Frame] | None, classes: tupl
     """
     sample, frames = _sampled(seen, 1)
     sums, shares = sums_of_spots(sample), tuple[float, ...]()
-    near, far = sums.near, sums.far
-    assert near is not None
-    assert far is not None
-    keys, answers = keys_of(near), near["observations"][:, 0]
+    first, second, _ = sums.answers
+    keys, answers = keys_of(first), first["observations"][:, 0]
     needed = answers
     if truth is not None:
         sample, _ = _sampled(truth, len(classes))
-        known = sums_of_spots(sample, near.edge).near
-        assert known is not None
+        known = sums_of_spots(sample, first.edge).answers[0]
         needed, at = np.zeros(len(keys)), rows_in(keys_of(known), keys)
         needed[at[at >= 0]] = known["observations"][at >= 0, 0]
         shares = _class_shares(sample)
     n = max(float(answers.sum()), 1.0)
     rows = np.concatenate([keys, np.stack([answers, needed], axis=1).astype(np.int64)], axis=1)
     return Spots(
-        classes, frames, near.edge, near.step, float(near["square"].sum()) / n, float(far["square"].sum()) / n, shares,
-        tuple(map(tuple, rows.tolist())),
+        classes, frames, first.edge, first.step, float(first["square"].sum()) / n, float(second["square"].sum()) / n,
+        shares, tuple(map(tuple, rows.tolist())),
     )  # fmt: skip
 
 

@@ -180,8 +180,8 @@ def _checked(path: Path, benchmark: Benchmark, handle: RunHandle) -> dict[str, E
 
 def _in_cubes(entry: Entry, spots: Spots) -> Entry:
     """Return a scene with the sums of its spots in the cubes of the definition."""
-    near, far = (part and part.coarsened(spots.edge, spots.step) for part in (entry.sums.near, entry.sums.far))
-    return dataclasses.replace(entry, small=(dataclasses.replace(entry.sums, near=near, far=far), entry.flicker))
+    answers = tuple(part.coarsened(spots.edge, spots.step) for part in entry.sums.answers)
+    return dataclasses.replace(entry, small=(dataclasses.replace(entry.sums, answers=answers), entry.flicker))
 
 
 def require_whole(benchmark: Benchmark, handle: RunHandle) -> None:

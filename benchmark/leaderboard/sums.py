@@ -7,7 +7,7 @@ definition, and of one another's sums. What cannot have been counted is refused 
 from __future__ import annotations
 
 import dataclasses
-import math
+import itertools
 from collections.abc import Iterator
 from typing import NamedTuple
 
@@ -26,9 +26,12 @@ the spots: voxels are sampled otherwise than spots. Up to .12 and .11 were seen.
 LEAST_LABELLED = 0.5
 """Least share of the answers that a model has to give that a result has."""
 
+NAMES = ("first", "second", "third")
+"""Words for the answers of a spot and view, from the nearest pixel on."""
+
 NOISE = 0.01
-"""Share of the answers by which second ones, which are farther from the spot, may agree more often than first ones; up
-to .0045 was seen."""
+"""Share of the answers by which those that are farther from the spot may agree more often than nearer ones; up to .0045
+was seen."""
 
 ROUNDED, LEAST = 1e-6, 0.02
 """Relative and absolute error of sums in single precision over the frames of a cube."""
@@ -54,10 +57,9 @@ def checked(where: str, sums: ClusterSums, spots: Spots, *, truth: bool, voxel_s
     Raises:
         DataError: If the sums cannot be those of a run of it.
     """
-    near, far = sums.near, sums.far
-    if near is None or far is None:
+    if not sums.answers:
         raise DataError(f"{where}: its sums have no spots; run the benchmark again")
-    for part in (sums, near, far):
+    for part in (sums, *sums.answers):
         if (part.K, part.classes) != (len(spots.classes), spots.classes):
             raise DataError(f"{where}: its classes are not those of the definition ({', '.join(spots.classes)})")
     if sums.truth != truth or abs(sums.voxel_size / voxel_size - 1) > ROUNDED:
@@ -70,20 +72,20 @@ def checked(where: str, sums: ClusterSums, spots: Spots, *, truth: bool, voxel_s
     if sums.fused not in (0, spots.frames) or (sums.step and len(np.unique(known)) > spots.frames):
         raise DataError(f"{where}: its map is of other frames than the definition's {spots.frames}; run it again")
     _refuse(where, "map", sums, _of_map(sums))
-    parts = [_at(where, part, spots) for part in (near, far)]
-    for name, part in zip(("first", "second"), parts, strict=True):
+    answers = tuple(_at(where, part, spots) for part in sums.answers)
+    for name, part in zip(NAMES, answers, strict=True):
         _refuse(where, f"{name} answers", part, _of_rows(part, [*PLAIN, "evidence"]))
         _refuse(where, f"{name} answers", part, _of_spots(part, spots))
-    one, other = parts
-    if not np.array_equal(keys_of(one), keys_of(other)):
-        raise DataError(f"{where}: first and second answers are of other spots; run it again")
-    _refuse(where, "second answers", one, _of_both(one, other))
-    _refuse(where, "map", sums, _of_classes(sums, one, spots))
-    if (share := labelled_share(dataclasses.replace(sums, near=one), spots)) < LEAST_LABELLED:
+        if not np.array_equal(keys_of(answers[0]), keys_of(part)):
+            raise DataError(f"{where}: first and {name} answers are of other spots; run it again")
+    for (name, nearer), (further, part) in itertools.pairwise(zip(NAMES, answers, strict=True)):
+        _refuse(where, f"{further} answers", part, _of_further(nearer, part, name))
+    _refuse(where, "map", sums, _of_classes(sums, answers[0], spots))
+    if (share := labelled_share(answers[0], spots)) < LEAST_LABELLED:
         raise DataError(f"{where}: it has {share:.0%} of the answers that the definition asks for; run it again")
-    return dataclasses.replace(
-        sums, near=_vouched(one, spots.near), far=_with_line(_vouched(other, spots.far), one, spots)
-    )
+    means = spots.near, spots.far, 0.0
+    vouched = (_vouched(part, mean) for part, mean in zip(answers, means, strict=True))
+    return dataclasses.replace(sums, answers=tuple(vouched))
 
 
 def _refuse(where: str, what: str, part: ClusterSums, rules: Iterator[Impossible]) -> None:
@@ -193,19 +195,20 @@ def _by_cube(part: ClusterSums, name: str) -> Float64:
     return np.stack([part.index.by_cube(column) for column in part[name].T], axis=1)
 
 
-def _of_both(one: ClusterSums, other: ClusterSums) -> Iterator[Impossible]:
-    """Yield what differs of first and second answers, which the same views give at the same spots."""
-    for name in ("voxels", "observations", "twice", "recurrent"):
-        yield Impossible(f"{name} is not that of the first answers", _differ(_column(one, name), _column(other, name)))
-    n, first, second = (
-        float(part[name].sum()) for part, name in ((one, "observations"), (one, "agreeing"), (other, "agreeing"))
+def _of_further(nearer: ClusterSums, part: ClusterSums, name: str) -> Iterator[Impossible]:
+    """Yield what cannot be of answers farther from the spots than the `name` answers, which the same views give."""
+    for column in ("voxels", "observations", "twice", "recurrent"):
+        differ = _differ(_column(nearer, column), _column(part, column))
+        yield Impossible(f"{column} is not that of the {name} answers", differ)
+    n, before, agreeing = (
+        float(of[column].sum()) for of, column in ((part, "observations"), (nearer, "agreeing"), (part, "agreeing"))
     )
     yield Impossible(
-        "second answers agree more often than first ones, which are nearer", np.array([second - first > NOISE * n])
+        f"they agree more often than the {name} answers, which are nearer", np.array([agreeing - before > NOISE * n])
     )
 
 
-# Three sums of spots decide details, and nothing else in a result vouches for them: they are computed.
+# Two sums of spots decide details, and nothing else in a result vouches for them: they are computed.
 
 
 def _vouched(part: ClusterSums, mean: float) -> ClusterSums:
@@ -216,18 +219,6 @@ def _vouched(part: ClusterSums, mean: float) -> ClusterSums:
     n, agreeing = part["observations"], part["agreeing"]
     rate = np.clip(np.divide(agreeing, n, out=np.zeros_like(n), where=n > 0), 0, 1)
     return _with_columns(part, square=mean * n, twice_agreeing=rate * part["twice"])
-
-
-def _with_line(far: ClusterSums, near: ClusterSums, spots: Spots) -> ClusterSums:
-    """Return the sums of second answers with third ones that continue a line: agreement falls with the distance.
-
-    The distances are d and d' = sqrt(far / near) of first and second answers, with d as the unit, and that of third
-    ones, which are two steps away: d'' = sqrt(1 + 4 (d'^2 - 1)); see `lever_of`.
-    """
-    ratio = spots.far / spots.near if spots.near > 0 else 1.0
-    d1, d2 = math.sqrt(ratio), math.sqrt(max(1 + 4 * (ratio - 1), 0.0))
-    further = (d2 - d1) / (d1 - 1) if d1 > 1 else 0.0
-    return _with_columns(far, agreeing_beyond=far["agreeing"] - further * (near["agreeing"] - far["agreeing"]))
 
 
 def _with_columns(part: ClusterSums, **columns: Float64) -> ClusterSums:
@@ -290,13 +281,10 @@ def completed(sums: ClusterSums, spots: Spots) -> ClusterSums:
     In a cube and view with n answers of n + m, the share (n / (n + m))^2 of the pairs have two labels. What is missing
     is of the map's classes in proportion, so that chance stays.
     """
-    near, far = sums.near, sums.far
-    assert near is not None
-    assert far is not None
-    return dataclasses.replace(sums, near=_completed(near, spots), far=_completed(far, spots))
+    return dataclasses.replace(sums, answers=tuple(_completed(part, spots) for part in sums.answers))
 
 
-SHARED = ("agreeing", "agreeing_beyond", "twice_agreeing")
+SHARED = ("agreeing", "twice_agreeing")
 """Sums of agreement of two answers."""
 
 
@@ -323,12 +311,10 @@ def _completed(part: ClusterSums, spots: Spots) -> ClusterSums:
     return dataclasses.replace(whole, cell=whole.cell[filled], frame=whole.frame[filled], columns=columns[filled])
 
 
-def labelled_share(sums: ClusterSums, spots: Spots) -> float:
-    """Return the share of the answers that a model has to give that it gives."""
-    near = sums.near
-    assert near is not None
-    at: Int64 = rows_in(keys_of(near), spots.keys)
+def labelled_share(first: ClusterSums, spots: Spots) -> float:
+    """Return the share of the answers that a model has to give that it gives, from sums of first answers."""
+    at: Int64 = rows_in(keys_of(first), spots.keys)
     needed = spots.table[:, 5].astype(np.float64)
     given = np.zeros(len(needed))
-    given[at] = near["observations"][:, 0]
+    given[at] = first["observations"][:, 0]
     return float(np.minimum(given, needed).sum() / needed.sum()) if needed.any() else 1.0

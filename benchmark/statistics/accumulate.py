@@ -148,7 +148,7 @@ def cluster_sums_of(
 
 
 def with_spots(whole: ClusterSums, spots: SpotObservations, edge: float | None = None) -> ClusterSums:
-    """Return the sums with sums of spots: of their first answers, and of the second ones.
+    """Return the sums with sums of spots: of their first, second and third answers.
 
     Args:
         whole: Sums of the map.
@@ -156,22 +156,10 @@ def with_spots(whole: ClusterSums, spots: SpotObservations, edge: float | None =
         edge: Edge of the cubes of the spots in metres, a power of 2; the smallest that leaves at most MOST_CELLS by
             default, whatever the voxels of the map.
     """
-    (first, near), (second, far), third = spots.logs()
-    cubes = Cubes.of_log(first, edge)
-    parts = [
-        replace(_sums_of_log(log, cubes, further=further), classes=whole.classes)
-        for log, further in (
-            (first, {"square": near}),
-            (second, {"square": far, "agreeing_beyond": agreement_of(third)}),
-        )
-    ]
-    return replace(whole, near=parts[0], far=parts[1])
-
-
-def agreement_of(log: Events) -> Float64:
-    """Return the share (m,) of the other observations of its location that agree, for the mean of each location."""
-    table = log.table()
-    return np.asarray(np.nan_to_num(psa(table))[log.voxel], np.float64)
+    logs = spots.logs()
+    cubes = Cubes.of_log(logs[0][0], edge)
+    answers = (replace(_sums_of_log(log, cubes, square=square), classes=whole.classes) for log, square in logs)
+    return replace(whole, answers=tuple(answers))
 
 
 def sums_of_spots(spots: SpotObservations, edge: float | None = None) -> ClusterSums:
@@ -194,11 +182,11 @@ def _sums_of_log(
     fused: Int64 | None = None,
     true_label: Int64 | None = None,
     likely: Float64 | None = None,
-    further: Mapping[str, Float64] | None = None,
+    square: Float64 | None = None,
 ) -> ClusterSums:
     """Return the sums by cube and group of frames of the locations of a log, whose dominant classes are `fused`.
 
-    further has numbers (m,) of observations whose sums are kept, too.
+    square (m,) are the squared distances of answers from their spots, whose sums are kept, too.
     """
     from semstab.core.compiled import in_chunks
     from semstab.statistics.loops.clusters import add_influences
@@ -220,11 +208,10 @@ def _sums_of_log(
         add_influences, order, bounds, (events.starts, events.ends), longest, events.evidence.entries, K, group, own,
         label, consistent, FirstColumns.of(K, truth=truth), len(groups), sums,
     )  # fmt: skip
-    if further:
+    if square is not None:
         counted = np.flatnonzero(cubes.at[events.voxel] >= 0)
         at = cubes.at[events.voxel[counted]].astype(np.int64) * len(groups) + group[counted]
-        for name, values in further.items():
-            sums[:, slices[name].start] = np.bincount(at, values[counted], len(sums))
+        sums[:, slices["square"].start] = np.bincount(at, square[counted], len(sums))
     rows = np.flatnonzero(sums[:, slices["observations"].start])
     cell, frame = np.divmod(rows, max(len(groups), 1))
     return ClusterSums(

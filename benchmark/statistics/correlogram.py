@@ -17,15 +17,7 @@ from semstab.core.types import Float64, Int64, UInt16
 from semstab.data.events import Events
 from semstab.data.statistics import UNKNOWN, Correlogram, LagBin
 from semstab.statistics.agreement import alpha_of
-from semstab.statistics.cluster_sums import (
-    ALPHA_SUMS,
-    MOST_GROUPS,
-    SPOTS,
-    ClusterSums,
-    Functional,
-    cubes_of,
-    side_by_side,
-)
+from semstab.statistics.cluster_sums import ALPHA_SUMS, MOST_GROUPS, ClusterSums, Functional, cubes_of, side_by_side
 from semstab.statistics.intervals import confidence_intervals, scope_of, spec_of
 from semstab.statistics.observations import SpotObservations
 
@@ -49,7 +41,7 @@ EDGES: dict[str, tuple[float, ...]] = {
 AXES = EDGES | {"standard": STANDARD}
 
 
-PAIRED_ALPHA = Functional(ALPHA_SUMS, alpha_of, -1.0, 1.0, "agreement", pairs=ALPHA_SUMS[:2], parts=SPOTS)
+PAIRED_ALPHA = Functional(ALPHA_SUMS, alpha_of, -1.0, 1.0, "agreement", pairs=ALPHA_SUMS[:2], of_spots=True)
 """Alpha of pairs of observations: neither has half of its agreement with the other one for itself alone."""
 
 
@@ -63,10 +55,9 @@ def correlogram(spots: SpotObservations) -> Correlogram:
     pairs in the bin. Bands are at CONFIDENCE, for this scene flown again if the bin has enough frames for that, else
     for these frames.
     """
-    (seen, near), (beside, far), further = spots.logs()
-    labels = np.unique(
-        np.concatenate([log.evidence.label for log in (seen, beside, further)])
-    )  # the other classes change nothing
+    logs = spots.logs()
+    seen, _ = logs[0]
+    labels = np.unique(np.concatenate([log.evidence.label for log, _ in logs]))  # the other classes change nothing
     cubes, of, edge = _cubes(seen)
     step, most = 1, min(MOST_GROUPS, max(1, MOST_SUMS // (max(len(cubes), 1) * (4 + len(labels)))))
     while len(frames := np.unique(seen.frame // step)) > most:
@@ -81,20 +72,16 @@ def correlogram(spots: SpotObservations) -> Correlogram:
         pairs += np.bincount(bins.ravel(), minlength=len(pairs))
         distance += np.bincount(bins.ravel(), weights=apart.ravel(), minlength=len(pairs))
         by_lag.append((first, second, bins))
-    sums = [_sums(log, labels, square, by_lag, cluster, len(keys)) for log, square in ((seen, near), (beside, far))]
-    third = _sums(further, labels, far, by_lag, cluster, len(keys))[:, :, :1]
-    sums = [np.concatenate([each, third], axis=2) for each in sums]
-    columns = side_by_side(
-        dict(zip((*ALPHA_SUMS, "square", "agreeing_beyond"), (1, 1, 1, len(labels), 1, 1), strict=True))
-    )
+    sums = [_sums(log, labels, square, by_lag, cluster, len(keys)) for log, square in logs]
+    columns = side_by_side(dict(zip((*ALPHA_SUMS, "square"), (1, 1, 1, len(labels), 1), strict=True)))
     rows, specs = [], []
     for k in np.flatnonzero(pairs[:-1] >= LEAST_PAIRS):
         some = np.flatnonzero(sums[0][k, :, 1])
         if len(np.unique(cube[some])) < LEAST_CUBES:
             continue
         where = cubes[cube[some]], frames[group[some]]
-        first_answers, second_answers = (ClusterSums(*where, each[k, some], columns, edge, step) for each in sums)
-        of_bin = dataclasses.replace(first_answers, near=first_answers, far=second_answers)
+        answers = tuple(ClusterSums(*where, each[k, some], columns, edge, step) for each in sums)
+        of_bin = dataclasses.replace(answers[0], answers=answers)
         specs.append(spec_of(of_bin, PAIRED_ALPHA, scope=scope_of(of_bin, key=PAIRED_ALPHA)))
         rows.append((k, float(distance[k] / pairs[k]), int(pairs[k])))
     of_axis: dict[str, tuple[LagBin, ...]] = dict.fromkeys(AXES, ())

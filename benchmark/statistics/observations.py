@@ -196,16 +196,15 @@ class SpotObservations:
         """Return the log of spots: the class that a view gives each of them, by the first answers."""
         return self._log(self.label)[0]
 
-    def logs(self) -> tuple[tuple[Events, Float64], tuple[Events, Float64], Events]:
-        """Return the logs of the three answers, the first two with (m,) squared distances, metres^2."""
-        near, far = self._log(self.label, self.near), self._log(self.neighbour, self.far)
-        return (near[0], near[2]), (far[0], far[2]), self._log(self.beyond)[0]
+    def logs(self) -> tuple[tuple[Events, Float64], ...]:
+        """Return the logs of the three answers with (m,) squared distances, metres^2, 0 of the third ones."""
+        near, far, last = self._log(self.label, self.near), self._log(self.neighbour, self.far), self._log(self.beyond)
+        return tuple((log, squares) for log, _, squares in (near, far, last))
 
     def _log(self, label: UInt16, square: Float32 | None = None) -> tuple[Events, Int64, Float64]:
         """Return a log of these labels, (n,) the spot of each of its voxels, and (m,) squared distances.
 
-        A spot is a voxel of a PARTS-th of a coarse cell. Of two spots in one, next to a face of their cells, the second
-        one is the next voxel.
+        A spot is a voxel of a PARTS-th of a coarse cell, whose faces are faces of such voxels.
         """
         from semstab.statistics.loops.spots import observe
 
@@ -213,9 +212,6 @@ class SpotObservations:
         spots, spot = np.unique(self.spot[rows], return_inverse=True)
         place = np.floor(self.point[spots] * (PARTS / self.spacing)).astype(np.int64)
         index, of = distinct_rows(place)
-        while len(index) < len(place):
-            place[np.setdiff1d(np.arange(len(place)), np.unique(of, return_index=True)[1]), 0] += 1
-            index, of = distinct_rows(place)
         number = of[spot]
         order = np.lexsort((self.view[rows], number))
         rows, number = rows[order], number[order]

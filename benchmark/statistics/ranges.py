@@ -46,10 +46,10 @@ def range_agreement(
     for low, high in itertools.pairwise(edges):
         within = spots.only((distance >= low) & ((distance < high) | (high == edges[-1])))
         sums = sums_of_spots(within)
-        near = sums.near
-        assert near is not None
-        seen_twice = round(float(near["voxels"].sum()))
-        assessed = seen_twice >= LEAST_SEEN_TWICE and chance_of(near) * LEAST_CLASSES <= 1
+        first = sums.first_answers
+        assert first is not None
+        seen_twice = round(float(first["voxels"].sum()))
+        assessed = seen_twice >= LEAST_SEEN_TWICE and chance_of(first) * LEAST_CLASSES <= 1
         alpha = estimate(sums, "alpha", scope=scope_of(sums, scope)) if assessed else UNKNOWN
         strata.append(RangeStratum(low, high, len(within) / len(spots), seen_twice, alpha))
     return RangeAgreement(tuple(strata), limits.usable, *_reliable(strata, limits.usable))

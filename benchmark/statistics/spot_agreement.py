@@ -41,25 +41,25 @@ def spot_agreement(
         critical: Classes that the verdict depends on; where none is named, those with enough locations.
         limits: Limits of the verdict.
     """
-    near = sums.near
-    assert near is not None
+    first = sums.first_answers
+    assert first is not None
     names, named = sums.classes or tuple(str(k) for k in range(table.K)), set(critical) & set(sums.classes)
     locations = np.bincount(dominant(table)[table.op >= 2], minlength=table.K).tolist()
-    scope_of_spots, evidence = scope_of(sums, scope), near["evidence"].sum(axis=0)
+    scope_of_spots, evidence = scope_of(sums, scope), first["evidence"].sum(axis=0)
     alphas = confidence_intervals(
         spec_of(sums, "alpha", k, scope_of_spots) for k in range(table.K) if table.K <= MOST_CLASSES
     )
     silent = silence(spots)
-    n, largest = float(near["observations"].sum()), int(evidence.argmax())
+    n, largest = float(first["observations"].sum()), int(evidence.argmax())
     disagreement = _disagreement(evidence / n if n else evidence, np.array([alpha.value for alpha in alphas]))
     moving = [k for k in labels.moving(names) if k < len(disagreement) and disagreement[k] >= LITTLE]
     return SpotAgreement(
         spacing=spots.spacing,
-        spots=round(float(near["voxels"].sum())),
-        cubes=near.cells,
+        spots=round(float(first["voxels"].sum())),
+        cubes=first.cells,
         frames=spots.frames,
         views=len(spots.views),
-        chance=chance_of(near),
+        chance=chance_of(first),
         largest_class=names[largest],
         largest_share=float(evidence[largest]) / n if n else math.nan,
         labelled=spots.labelled_share(),
@@ -87,9 +87,9 @@ def moving_classes(spots: SpotObservations, sums: ClusterSums, moving: Sequence[
     """
 
     def disagreeing(of: ClusterSums, alpha: float) -> float:
-        near = of.near
-        assert near is not None
-        return float(near["observations"].sum()) * (1 - alpha) * (1 - chance_of(near))
+        first = of.first_answers
+        assert first is not None
+        return float(first["observations"].sum()) * (1 - alpha) * (1 - chance_of(first))
 
     rest = sums_of_spots(spots.without(moving))
     whole, alpha = (min(value(each, "alpha"), 1.0) for each in (sums, rest))  # extrapolated to the spot itself

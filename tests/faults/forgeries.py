@@ -134,12 +134,12 @@ EDITS: Mapping[str, Callable[[np.ndarray], Any]] = {
 
 
 def of_columns(sums: Table) -> Iterator[Forgery]:
-    """Yield edits of each column, of the first two classes, in the map and in both answers of the first scene."""
+    """Yield edits of each column, of the first two classes, in the map and in the answers of the first scene."""
     names = [
         name for name in sums if name != "part" and (name.rpartition("_")[2] in ("0", "1") or not name[-1].isdigit())
     ]
     for name in names:
-        for part, of in enumerate(("map", "first answers", "second answers")):
+        for part, of in enumerate(("map", "first answers", "second answers", "third answers")):
             for how, edit in EDITS.items():
                 if np.any(sums[name][sums["part"] == part]):
                     yield (
@@ -256,7 +256,7 @@ def by_hand() -> Iterator[Forgery]:  # noqa: PLR0915  a list
     def of_rows(choose: Callable[[Table], np.ndarray]) -> Callable[[Parts], None]:
         return each(lambda sums, about: take(sums, choose(sums)))
 
-    def worst(share: float, parts: tuple[int, ...] = (1, 2)) -> Callable[[Table], np.ndarray]:
+    def worst(share: float, parts: tuple[int, ...] = (1, 2, 3)) -> Callable[[Table], np.ndarray]:
         """Leave out the cubes and views with the least agreement."""
 
         def choose(sums: Table) -> np.ndarray:
@@ -273,6 +273,7 @@ def by_hand() -> Iterator[Forgery]:  # noqa: PLR0915  a list
     for share in (0.02, 0.05, 0.1, 0.3, 0.6):
         yield "rows", f"the worst {share:.0%} of cubes and views left out", of_rows(worst(share))
     yield "rows", "the worst 5 % of second answers left out", of_rows(worst(0.05, (2,)))
+    yield "rows", "the worst 5 % of third answers left out", of_rows(worst(0.05, (3,)))
     yield "rows", "all rows twice", of_rows(lambda sums: np.tile(np.arange(len(sums["part"])), 2))
     yield (
         "rows",
@@ -287,6 +288,7 @@ def by_hand() -> Iterator[Forgery]:  # noqa: PLR0915  a list
     yield "rows", "no map", of_rows(lambda sums: np.flatnonzero(sums["part"] > 0))
     yield "rows", "no spots", of_rows(lambda sums: np.flatnonzero(sums["part"] == 0))
     yield "rows", "no second answers", of_rows(lambda sums: np.flatnonzero(sums["part"] < 2))
+    yield "rows", "no third answers", of_rows(lambda sums: np.flatnonzero(sums["part"] < 3))
 
     def put_all(**columns: Callable[[Table], np.ndarray]) -> Callable[[Table, Content], None]:
         def change(sums: Table, about: Content) -> None:
@@ -317,10 +319,10 @@ def by_hand() -> Iterator[Forgery]:  # noqa: PLR0915  a list
 
         return change
 
-    yield "places", "groups of 0 frames", each(said(step=lambda _: [0, 0, 0]))
-    yield "places", "groups of 64 frames", each(said(step=lambda _: [64, 64, 64]))
+    yield "places", "groups of 0 frames", each(said(step=lambda own: [0] * len(own)))
+    yield "places", "groups of 64 frames", each(said(step=lambda own: [64] * len(own)))
     yield "places", "100 frames more were fused", each(said(fused=lambda own: [n + 100 for n in own]))
-    yield "places", "0 frames were fused", each(said(fused=lambda own: [0, 0, 0]))
+    yield "places", "0 frames were fused", each(said(fused=lambda own: [0] * len(own)))
     yield "places", "cubes said to be twice as large", each(said(edge=lambda own: [2 * x for x in own]))
     yield "places", "cubes said to be half as large", each(said(edge=lambda own: [x / 2 for x in own]))
     yield "places", "voxels said to be larger", each(said(voxel_size=lambda own: [2 * x for x in own]))
@@ -349,7 +351,7 @@ def by_hand() -> Iterator[Forgery]:  # noqa: PLR0915  a list
 
     numbers = lambda sums: [name for name in sums if name not in ("part", "ix", "iy", "iz", "frame")]  # noqa: E731
 
-    def times(factor: float, parts: tuple[int, ...] = (0, 1, 2)) -> Callable[[Table, Content], None]:
+    def times(factor: float, parts: tuple[int, ...] = (0, 1, 2, 3)) -> Callable[[Table, Content], None]:
         def change(sums: Table, about: Content) -> None:
             rows = np.isin(sums["part"], parts)
             for name in numbers(sums):
@@ -359,9 +361,10 @@ def by_hand() -> Iterator[Forgery]:  # noqa: PLR0915  a list
 
     for factor in (1000.0, 10.0, 2.0, 1.5, 0.5, 0.1):
         yield "all sums", f"times {factor:g}", each(times(factor))
-        yield "all sums", f"of spots times {factor:g}", each(times(factor, (1, 2)))
+        yield "all sums", f"of spots times {factor:g}", each(times(factor, (1, 2, 3)))
         yield "all sums", f"of the map times {factor:g}", each(times(factor, (0,)))
         yield "all sums", f"of second answers times {factor:g}", each(times(factor, (2,)))
+        yield "all sums", f"of third answers times {factor:g}", each(times(factor, (3,)))
 
     def within(parts: tuple[int, ...], **columns: Callable[[Table], np.ndarray]) -> Callable[[Table, Content], None]:
         def change(sums: Table, about: Content) -> None:
@@ -376,7 +379,7 @@ def by_hand() -> Iterator[Forgery]:  # noqa: PLR0915  a list
     def all_agree(sums: Table) -> np.ndarray:
         return sums["observations"]
 
-    for parts, of in (((1,), "first"), ((2,), "second"), ((1, 2), "both")):
+    for parts, of in (((1,), "first"), ((2,), "second"), ((3,), "third"), ((1, 2, 3), "all")):
         yield "agreement", f"all of {of} answers agree", each(within(parts, agreeing=all_agree))
         yield (
             "agreement",
@@ -386,9 +389,6 @@ def by_hand() -> Iterator[Forgery]:  # noqa: PLR0915  a list
         yield "agreement", f"no one's own in {of} answers", each(within(parts, own=lambda s: 0 * s["own"]))
         yield "agreement", f"pairs agree in {of} answers", each(within(parts, twice_agreeing=lambda s: s["twice"]))
         yield "agreement", f"psa is 1 in {of} answers", each(within(parts, psa=lambda s: s["voxels"]))
-    yield "agreement", "third answers agree", each(within((2,), agreeing_beyond=all_agree))
-    yield "agreement", "third answers agree as second ones", each(within((2,), agreeing_beyond=lambda s: s["agreeing"]))
-    yield "agreement", "third answers never agree", each(within((2,), agreeing_beyond=lambda s: 0 * s["agreeing"]))
     yield "agreement", "second answers are near", each(within((2,), square=lambda s: s["square"] / 4))
     yield "agreement", "second answers are far", each(within((2,), square=lambda s: 4 * s["square"]))
     yield "agreement", "first answers are far", each(within((1,), square=lambda s: 4 * s["square"]))
@@ -396,7 +396,7 @@ def by_hand() -> Iterator[Forgery]:  # noqa: PLR0915  a list
     yield (
         "agreement",
         "evidence of two classes swapped",
-        each(within((1, 2), evidence_0=lambda s: s["evidence_1"], evidence_1=lambda s: s["evidence_0"])),
+        each(within((1, 2, 3), evidence_0=lambda s: s["evidence_1"], evidence_1=lambda s: s["evidence_0"])),
     )
 
     def even(sums: Table, about: Content) -> None:
@@ -410,12 +410,22 @@ def by_hand() -> Iterator[Forgery]:  # noqa: PLR0915  a list
 
     yield "agreement", "classes are as frequent as each other", each(even)
 
-    def exchanged(sums: Table, about: Content) -> None:
-        sums["part"] = np.where(sums["part"] == 0, 0, 3 - sums["part"])
-        order = np.argsort(sums["part"], kind="stable")
-        take(sums, order)
+    def answers(*of: int) -> Callable[[Table, Content], None]:
+        """Give the rows of these answers as the first, second and third ones."""
 
-    yield "agreement", "first and second answers exchanged", each(exchanged)
+        def change(sums: Table, about: Content) -> None:
+            rows = [np.flatnonzero(sums["part"] == part) for part in (0, *of)]
+            part = np.repeat(np.arange(4), [len(own) for own in rows]).astype(sums["part"].dtype)
+            take(sums, np.concatenate(rows))
+            sums["part"] = part
+
+        return change
+
+    yield "agreement", "first and second answers exchanged", each(answers(2, 1, 3))
+    yield "agreement", "answers in the opposite order", each(answers(3, 2, 1))
+    yield "agreement", "third answers are the second ones", each(answers(1, 2, 2))
+    yield "agreement", "third answers are the first ones", each(answers(1, 2, 1))
+    yield "agreement", "second answers are the third ones", each(answers(1, 3, 3))
 
     def named(change: Callable[[list[str]], list[str]]) -> Callable[[Table, Content], None]:
         def of(sums: Table, about: Content) -> None:
@@ -528,7 +538,7 @@ def _same(one: RunHandle, other: RunHandle) -> bool:
 
 
 def _parts(sums: Any) -> tuple[Any, ...]:
-    return sums, sums.near, sums.far
+    return sums, *sums.answers
 
 
 def judged(referee: Referee, file: Path, *, fields: bool = True) -> Iterator[tuple[str, str, str]]:

@@ -15,7 +15,7 @@ MOST_CLASSES = 64
 
 PLAIN = (
     "voxels", "psa", "observations", "agreeing", "own", "twice", "twice_agreeing", "recurrent", "vss", "entropy",
-    "square", "agreeing_beyond",
+    "square",
 )  # fmt: skip
 BY_CLASS_ALONE = ("class_apart", "class_own")
 DRIFT = ("sbd_excess", "sbd_known")

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, Literal
+from typing import Literal
 
 import numpy as np
 
@@ -19,9 +19,6 @@ from semstab.statistics.cluster_sums.sums import ClusterSums
 
 Statistic = Callable[[Float64], Float64]
 Scale = Literal["share", "agreement", "plain"]
-
-
-Part = Literal["map", "near", "far"]
 
 
 def iou_of(sums: Float64) -> Float64:
@@ -51,7 +48,7 @@ class Functional:
         of: The number (...,) from these sums (..., C).
         low, high: Its range.
         scale: Scale of its interval: a 'share' or mean of numbers from 0 to 1, an 'agreement', at most 1, or 'plain'.
-        parts: The parts that its sums come from, each with its weight: a map, or spots.
+        of_spots: Its sums are of the answers of spots, not of a map; see `parts_of`.
         pairs: Names of the part of the first two sums that is of pairs alone, where the first is of pairwise
             agreement: at a location that two frames saw, neither frame has it for itself alone.
         pair_weight: Weight of an observation of these pairs in the first two sums.
@@ -67,7 +64,7 @@ class Functional:
     scale: Scale = "share"
     pairs: tuple[str, ...] = ()
     pair_weight: float = 1.0
-    parts: tuple[tuple[Part, float], ...] = (("map", 1.0),)
+    of_spots: bool = False
     by_location: bool = False
     k: int | None = None
 
@@ -77,23 +74,19 @@ class Functional:
         return self.by_location or set(self.names) <= set(WITHOUT_FRAMES)
 
 
-SPOTS: tuple[tuple[Part, float], ...] = (("near", 1.0), ("far", -1.0))
-"""alpha + lever (alpha - alpha'), with alpha' of the second answers: agreement falls with the distance of the points
-that answer from the spot, as a border of two classes may lie between them. See `lever_of`."""
-
-
-def lever_of(near: ClusterSums, far: ClusterSums) -> float:
+def lever_of(answers: Sequence[ClusterSums]) -> float:
     """Return by how much of the fall from first to second answers alpha lies above alpha of the first ones.
 
     The parabola through disagreement D, D', D'' at the root mean square distances d < d' < d'' of three answers is read
     at 0: lever = (D - D(0)) / (D' - D). A sharp border of classes gives a line, one that models place differently by
     more than a pixel a parabola, and labels finer than pixels a curve that levels off.
     """
-    n = float(near["observations"].sum())
+    first, second, _ = answers
+    n = float(first["observations"].sum())
     if not n > 0:
         return 0.0
-    agreeing = [float(part.sum()) / n for part in (near["agreeing"], far["agreeing"], far["agreeing_beyond"])]
-    return float(lever(near["square"].sum(), far["square"].sum(), *agreeing))
+    agreeing = [float(part["agreeing"].sum()) / n for part in answers]
+    return _lever(float(first["square"].sum()), float(second["square"].sum()), agreeing)
 
 
 LEAST_FALL, LARGEST_RATIO = 1e-3, 3.0
@@ -101,34 +94,23 @@ LEAST_FALL, LARGEST_RATIO = 1e-3, 3.0
 ratio of the further fall to it, which a parabola around 0 has."""
 
 
-def lever(near: Any, far: Any, first: Any, second: Any, third: Any) -> Float64:
-    """Return the lever (...,) from sums (...,) of squared distances of first and second answers, and three agreements.
+def _lever(near: float, far: float, agreeing: Sequence[float]) -> float:
+    """Return the lever from sums of squared distances of first and second answers, and three agreements.
 
     It is 0 if the second answers are the first ones.
     """
-    near, far, first, second, third = map(np.asarray, (near, far, first, second, third))
-    with np.errstate(invalid="ignore", divide="ignore"):
-        d, d1 = np.ones_like(near, np.float64), np.sqrt(far / near)  # the last one is two steps away, not one
-        d2 = np.sqrt(1 + 4 * (d1**2 - 1))
-        ratio = np.where(first - second > LEAST_FALL, (second - third) / (first - second), (d2 - d1) / (d1 - d))
-        at_second, at_third = d * d2 / ((d - d1) * (d2 - d1)), d * d1 / ((d - d2) * (d1 - d2))
-        read = -at_second - at_third - at_third * np.clip(ratio, 0.0, LARGEST_RATIO)
-    return np.where(far > SAME * near, read, 0.0)
+    if not far > SAME * near > 0:
+        return 0.0
+    first, second, third = agreeing
+    d, d1 = 1.0, math.sqrt(far / near)
+    d2 = math.sqrt(1 + 4 * (d1**2 - 1))  # the third answer is two steps away, not one
+    ratio = (second - third) / (first - second) if first - second > LEAST_FALL else (d2 - d1) / (d1 - d)
+    at_second, at_third = d * d2 / ((d - d1) * (d2 - d1)), d * d1 / ((d - d2) * (d1 - d2))
+    return -at_second - at_third - at_third * min(max(ratio, 0.0), LARGEST_RATIO)
 
 
 SAME = 1.2
 """Second answers are farther than first ones if their squared distances are larger by this factor."""
-
-
-def alpha_of_spots(near: Float64, far: Float64) -> Float64:
-    """Return alpha (...,) from sums (..., C + 2) of first and of second answers.
-
-    They are `ALPHA_SUMS`, squared distances, and the agreement of the third answers.
-    """
-    first, second, n = alpha_of(near[..., :-2]), alpha_of(far[..., :-2]), near[..., 1]
-    with np.errstate(invalid="ignore", divide="ignore"):
-        agreeing = near[..., 0] / n, far[..., 0] / n, far[..., -1] / n
-    return first + lever(near[..., -2], far[..., -2], *agreeing) * (first - second)
 
 
 ALPHA_SUMS = ("agreeing", "observations", "own", "evidence")
@@ -137,7 +119,7 @@ PAIRS = ("twice_agreeing", "twice")
 
 FUNCTIONALS: Mapping[str, Functional] = {
     "psa": Functional(("psa", "voxels"), ratio_of, pairs=PAIRS, pair_weight=0.5),
-    "alpha": Functional(ALPHA_SUMS, alpha_of, -1.0, 1.0, "agreement", pairs=PAIRS, parts=SPOTS),
+    "alpha": Functional(ALPHA_SUMS, alpha_of, -1.0, 1.0, "agreement", pairs=PAIRS, of_spots=True),
     "voxel_alpha": Functional(ALPHA_SUMS, alpha_of, -1.0, 1.0, "agreement", pairs=PAIRS),
     "vss": Functional(("vss", "recurrent"), ratio_of),
     "entropy_op2": Functional(("entropy", "voxels"), ratio_of, by_location=True),
@@ -154,7 +136,7 @@ accuracy of the fused labels at OP >= 2 and of single observations, the wrong am
 mean intersection over union and expected calibration error at OP >= 2."""
 
 BY_CLASS: Mapping[str, Functional] = {
-    "alpha": Functional(CLASS_SUMS, class_alpha_of, -1.0, 1.0, "agreement", parts=SPOTS),
+    "alpha": Functional(CLASS_SUMS, class_alpha_of, -1.0, 1.0, "agreement", of_spots=True),
     "voxel_alpha": Functional(CLASS_SUMS, class_alpha_of, -1.0, 1.0, "agreement"),
     "accuracy": Functional(("class_right", "class_known"), ratio_of),
     "precision": Functional(("class_right", "class_predicted"), ratio_of),
@@ -192,15 +174,19 @@ def functional(key: str | Functional, k: int | None = None) -> Functional:
 
 
 def parts_of(sums: ClusterSums, number: Functional) -> tuple[tuple[ClusterSums, float], ...]:
-    """Return the sums that a number is of, each with its weight; none where they are missing."""
-    of = {"map": sums, "near": sums.near, "far": sums.far}
-    present = [(part, weight) for name, weight in number.parts if (part := of[name]) is not None]
-    if number.parts == SPOTS and len(present) == len(SPOTS):
-        (near, _), (far, _) = present
-        lever = lever_of(near, far)
-        present = [(near, 1 + lever), (far, -lever)]
-    known = all(set(number.names) <= set(part.layout) for part, _ in present)
-    return tuple(present) if known and len(present) == len(number.parts) else ()
+    """Return the sums that a number is of, each with its weight; none where they are missing.
+
+    Of spots it is alpha + lever (alpha - alpha'), with alpha' of the second answers: agreement falls with the distance
+    of the points that answer from the spot, as a border of two classes may lie between them.
+    """
+    parts: tuple[tuple[ClusterSums, float], ...] = ((sums, 1.0),)
+    if number.of_spots:
+        if not sums.answers:
+            return ()
+        first, second, _ = sums.answers
+        lever = lever_of(sums.answers)
+        parts = (first, 1 + lever), (second, -lever)
+    return parts if all(set(number.names) <= set(part.layout) for part, _ in parts) else ()
 
 
 def columns_of(part: ClusterSums, number: Functional) -> Float64:

@@ -24,7 +24,7 @@ from semstab.errors import DataError
 from semstab.statistics.cluster_sums.columns import OF_TRUTH, column_names, layout, of_measure, side_by_side, width
 from semstab.statistics.cluster_sums.index import MOST_CELLS, ClusterIndex, distinct_rows
 
-SCHEMA = 6
+SCHEMA = 7
 
 
 @dataclass(frozen=True, eq=False)
@@ -47,8 +47,8 @@ class ClusterSums:
         step: Frames of a group, a power of 2; 0 where they are unknown.
         voxel_size: Metres.
         fused: Number of frames that they come from.
-        near, far: The same of spots, which are units instead of voxels, and views, instead of frames: of their first
-            and of their second answers, if there are `SpotObservations`.
+        answers: The same of spots, which are units instead of voxels, and views, instead of frames: of their first,
+            second and third answers; empty without `SpotObservations`.
     """
 
     cell: Int32
@@ -60,8 +60,7 @@ class ClusterSums:
     voxel_size: float = math.nan
     classes: tuple[str, ...] = ()
     fused: int = 0
-    near: ClusterSums | None = None
-    far: ClusterSums | None = None
+    answers: tuple[ClusterSums, ...] = ()
 
     @classmethod
     def of_cubes(cls, cell: npt.NDArray[np.integer], edge: float, sums: Mapping[str, Float64]) -> ClusterSums:
@@ -98,6 +97,11 @@ class ClusterSums:
         return int(evidence.stop - evidence.start)
 
     @property
+    def first_answers(self) -> ClusterSums | None:
+        """The sums of the first answers of spots; None without spots."""
+        return self.answers[0] if self.answers else None
+
+    @property
     def truth(self) -> bool:
         """Whether sums of ground truth are included."""
         return "known" in self.layout
@@ -129,8 +133,8 @@ class ClusterSums:
 
         Cubes of the spots are then at least as large as cubes of the map.
         """
-        near, far = (part and part.coarsened(max(edge, part.edge), part.step) for part in (self.near, self.far))
-        return dataclasses.replace(self.map_coarsened(edge, step), near=near, far=far)
+        answers = tuple(part.coarsened(max(edge, part.edge), part.step) for part in self.answers)
+        return dataclasses.replace(self.map_coarsened(edge, step), answers=answers)
 
     def map_coarsened(self, edge: float, step: int) -> ClusterSums:
         """Return the sums of the map in larger cubes or groups of frames, with the sums of spots unchanged."""
@@ -161,7 +165,7 @@ class ClusterSums:
         import pyarrow as pa
         import pyarrow.parquet as pq
 
-        parts = [part for part in (self, self.near, self.far) if part is not None]
+        parts = self, *self.answers
         about = {name: getattr(self, name) for name in ("K", "classes", "truth")}
         about |= {name: [getattr(part, name) for part in parts] for name in ("edge", "step", "voxel_size", "fused")}
         lengths = [len(part.frame) for part in parts]
@@ -217,13 +221,16 @@ class ClusterSums:
                 cell, frame = np.stack([key[rows] for key in keys[:3]], axis=1), keys[3][rows]
                 where = cell.astype(np.int32), frame.astype(np.int32), columns[rows, : width(its_layout)]
                 parts.append(cls(*where, its_layout, edge, step, voxel_size, meta.classes, fused))
-        whole, *spots = parts
-        return dataclasses.replace(whole, near=spots[0], far=spots[1]) if spots else whole
+        whole, *answers = parts
+        return dataclasses.replace(whole, answers=tuple(answers))
 
 
 KEYS = ("part", "ix", "iy", "iz", "frame")
-"""The columns of the file before the sums; part 0 is the map, 1 the first and 2 the second answers of spots."""
+"""The columns of the file before the sums; part 0 is the map, 1 to 3 are first, second and third answers of spots."""
 
+
+ANSWERS = 3
+"""Answers of a spot and view."""
 
 LARGEST = 2.0**30
 """Largest edge in metres and group of frames; its square is the largest sum. Larger numbers are damage."""
@@ -243,8 +250,8 @@ class SumsMeta:
 
     def __post_init__(self) -> None:
         parts = {len(each) for each in (self.edge, self.step, self.voxel_size, self.fused)}
-        if not (parts <= {1} or parts <= {3}):
-            raise DataError("sums of other parts than a map, and two answers of spots")
+        if not (parts <= {1} or parts <= {1 + ANSWERS}):
+            raise DataError(f"sums of other parts than a map, and {ANSWERS} answers of spots")
         sizes = all(0 < size < math.inf for size in self.voxel_size)
         if not (sizes and self.K > 0 and len(self.classes) in (0, self.K)):
             raise DataError(f"{self.K} classes, {len(self.classes)} names, voxels of {self.voxel_size[0]:g} m")
@@ -280,8 +287,7 @@ def aligned(*parts: ClusterSums) -> tuple[ClusterSums, ...]:
     edge, steps = max(part.edge for part in parts), [part.step for part in parts]
     step = max(steps) if all(steps) else 0
     same = [part if (part.edge, part.step) == (edge, step) else part.map_coarsened(edge, step) for part in parts]
-    near, far = [part.near for part in same if part.near], [part.far for part in same if part.far]
-    if len(near) < len(same) or len(far) < len(same):
+    if not all(part.answers for part in same):
         return tuple(same)
-    spots = zip(same, aligned(*near), aligned(*far), strict=True)
-    return tuple(dataclasses.replace(part, near=one, far=two) for part, one, two in spots)
+    answers = zip(*(aligned(*of_all) for of_all in zip(*(part.answers for part in same), strict=True)), strict=True)
+    return tuple(dataclasses.replace(part, answers=own) for part, own in zip(same, answers, strict=True))

@@ -22,8 +22,9 @@ plane the same sum comes again soon (Roberts 2018, The Unreasonable Effectivenes
 GOLDEN = np.uint64(0x9E3779B97F4A7C15)
 EMPTY = np.int64(-1)
 
-PHASE = 0.3819660113
-"""Part of its edge by which coarse cells are moved from the origin: the golden section."""
+PHASE = 25 / 64
+"""Part of its edge by which coarse cells are moved from the origin, near the golden section, so that floors and walls
+of models do not lie in their faces; a multiple of the 64ths in which a log tells places, see `SpotObservations`."""
 
 STEEPEST = 32.0
 """Largest area that a pixel shows, in those that it would show if the surface faced it."""
