@@ -189,7 +189,7 @@ def export(
     run: Run,
     to: Annotated[list[Path], typer.Option(
         "--to", metavar="FILE",
-        help=".ply .las .laz .tif .glb .parquet .csv; places.csv, .geojson; tasks: --format; repeatable.")],
+        help=".ply .las .laz .tif .glb .parquet .csv; places.csv, .geojson; classes: .yaml; tasks: --format.")],
     scene: Scene = None,
     model: Model = None,
     backend: Backend = None,

@@ -221,9 +221,13 @@ class LabelSpace:
             rows |= {name_key(key): row for key in (name, *members)}
         return rows
 
+    def text(self) -> str:
+        """Return the text of a taxonomy file."""
+        return str(yaml.safe_dump(self.to_dict(), sort_keys=False, allow_unicode=True))
+
     def save(self, path: str | Path) -> None:
         """Write a taxonomy file."""
-        write_text(path, yaml.safe_dump(self.to_dict(), sort_keys=False, allow_unicode=True))
+        write_text(path, self.text())
 
     def mapping_to(self, target: LabelSpace) -> LabelMapping:
         """Map each class of this space to the class of `target` with its name, or among whose members it is.

@@ -21,6 +21,7 @@ from semstab.exports.annotation import annotation_tasks
 from semstab.exports.coco import MOST, TaskFile, write_tasks
 from semstab.exports.places import GEOJSON, holds_places, write_places
 from semstab.exports.relabel import task_of
+from semstab.exports.taxonomy import TAXONOMY, holds_taxonomy, write_taxonomy
 from semstab.exports.voxels import Chosen, Voxels
 from semstab.statistics.acceptance import AcceptanceThresholds
 from semstab.task import Task
@@ -67,7 +68,7 @@ WRITERS: Mapping[str, Writer] = {
 }
 """The writers by suffix; each takes a map tile by tile and returns the number of voxels."""
 
-SUFFIXES = (*WRITERS, GEOJSON)
+SUFFIXES = (*WRITERS, GEOJSON, *TAXONOMY)
 
 
 def export(
@@ -92,7 +93,8 @@ def export(
 ) -> list[Exported]:
     """Write a unit of the run in a folder to files, in the format that each one's suffix names (`SUFFIXES`).
 
-    A .geojson file, or one that is called places.csv, gets the worst places instead: where frames disagree most.
+    A .geojson file, or one that is called places.csv, gets the worst places instead: where frames disagree most. A
+    .yaml file gets a taxonomy: the finest groups of the unit's classes on which views agree.
 
     Args:
         run: Folder of the run, or FOLDER:MODEL.
@@ -153,7 +155,9 @@ def export(
             return [_classified(chosen(joining.MEASURES), Path(classify), file, radius, settings) for file in files]
         usual = {".tif": maps.RASTER_MEASURES}
         return [
-            _places_written(chosen(("op",)), record, file, most)
+            _taxonomy_written(Path(run), record, file)
+            if holds_taxonomy(file)
+            else _places_written(chosen(("op",)), record, file, most)
             if holds_places(file)
             else _written(chosen(usual.get(file.suffix.lower())), file, settings)
             for file in files
@@ -194,6 +198,12 @@ def _places_written(chosen: Chosen, record: Record, file: Path, most: int) -> Ex
     if record.observations_file is None or not record.observations_file.exists():
         notes.append("the frames that see them are not known: the run stored no sampled observations")
     return Exported(file, content, tuple(notes))
+
+
+def _taxonomy_written(run: Path, record: Record, file: Path) -> Exported:
+    grouping = write_taxonomy(run, record, file)
+    content = f"{grouping.groups} groups of classes, {grouping.level}: alpha {grouping.alpha.text()}"
+    return Exported(file, content, ())
 
 
 def _tasks_written(file: TaskFile, task: Task) -> Exported:

@@ -103,6 +103,40 @@ def dot_chart(rows: Mapping[str, Sequence[tuple[int, str, Estimate]]], x_label: 
     return _svg(parts, height, x_label)
 
 
+@dataclass(frozen=True)
+class Joint:
+    """A joint of a tree: two sets of leaves that become one at a height."""
+
+    first: tuple[str, ...]
+    second: tuple[str, ...]
+    height: float
+
+
+def tree_chart(joints: Sequence[Joint], x_label: str, guides: Sequence[float], start: float) -> str:
+    """Return a tree that grows from its leaves, at `start`, to the right; a lower height is drawn at the one before."""
+    place: dict[str, tuple[str, ...]] = {}
+    for joint in joints:
+        both = (*place.get(joint.first[0], joint.first), *place.get(joint.second[0], joint.second))
+        place |= dict.fromkeys(both, both)
+    leaves = list(dict.fromkeys(name for both in place.values() for name in both))
+    left = LEFT + 6 * min(16, max(map(len, leaves)))
+    height = TOP + ROW * len(leaves) + BOTTOM
+    heights = list(itertools.accumulate((joint.height for joint in joints), max, initial=start))[1:]
+    x = Scale.over([start, *heights, *guides], left, WIDTH - RIGHT - 6, margin=0.03)
+    y = Scale(0, len(leaves), TOP, height - BOTTOM)
+    names = {row + 0.5: name if len(name) <= 22 else f"{name[:19]}..." for row, name in enumerate(leaves)}
+    parts = [*_frame(x, y, {tick: number(tick) for tick in x.ticks(7)}, names, x_label, "", left=left, height=height)]
+    parts += [f'<path class="guide" d="M{x(g):.1f} {TOP}V{height - BOTTOM}"/>' for g in guides]
+    at = {name: (start, row + 0.5) for row, name in enumerate(leaves)}
+    for joint, end in zip(joints, heights, strict=True):
+        (x0, y0), (x1, y1) = at[joint.first[0]], at[joint.second[0]]
+        title = html.escape(f"{' + '.join(joint.first)} and {' + '.join(joint.second)}: {joint.height:.3g}")
+        way = f"M{x(x0):.1f} {y(y0):.1f}H{x(end):.1f}V{y(y1):.1f}H{x(x1):.1f}"
+        parts.append(f'<path class="line c0" d="{way}"><title>{title}</title></path>')
+        at |= dict.fromkeys((*joint.first, *joint.second), (end, (y0 + y1) / 2))
+    return _svg(parts, height, x_label)
+
+
 def thinned(line: Line) -> Line:
     """Return the line; a line of more than POINTS points is reduced to the means of its parts."""
     if len(line.x) <= POINTS:

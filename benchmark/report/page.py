@@ -21,7 +21,7 @@ from semstab.data.statistics import CONFIDENCE, Estimate, MapStatistics, short
 from semstab.data.topdown import EMPTY
 from semstab.metrics import CATEGORIES, CATEGORY_COLORS, NOT_ASSESSED, categories, macro_mean
 from semstab.metrics.image_space import mean_over_scenes
-from semstab.report.charts import Line, dot_chart, line_chart, sample
+from semstab.report.charts import Joint, Line, dot_chart, line_chart, sample, tree_chart
 from semstab.report.figures.located import Located
 from semstab.report.figures.maps import Overview, Views
 from semstab.report.figures.topdown import FromAbove
@@ -227,6 +227,7 @@ def _scenes(result: Result, folder: Path, above: Mapping[str, FromAbove]) -> Ite
             "outlying": [text for record in records for text in _outlying(record, alone=len(records) == 1)],
             "lone": [row for record in records for row in _lone(record, overviews.get(record.unit.model))],
             "classes": _classes(records, colors),
+            "groupings": list(_groupings(records)),
             "distance": list(_distance(records, colors)),
         }
 
@@ -352,6 +353,20 @@ def _classes(records: Sequence[Record], colors: Mapping[str, int]) -> str:
     ordered = dict(sorted(rows.items(), key=lambda item: min(e.value for _, _, e in item[1])))
     guides = (LIMITS.usable, LIMITS.stable)
     return dot_chart(ordered, "alpha of the class", guides)
+
+
+def _groupings(records: Sequence[Record]) -> Iterator[dict[str, str]]:
+    """Yield the tree of merges of each model that has groups on which views agree, up to the largest alpha."""
+    for record in records:
+        statistics = record.statistics
+        groupings = None if statistics is None else statistics.groupings
+        if statistics is None or groupings is None or not groupings.text:
+            continue
+        best = max(range(len(groupings.merges)), key=lambda n: groupings.merges[n].alpha)
+        joints = [Joint(merge.first, merge.second, merge.alpha) for merge in groupings.merges[: best + 1]]
+        limits, start = (LIMITS.usable, LIMITS.stable), statistics.headline.alpha.value
+        chart = tree_chart(joints, "alpha after the merge", limits, start)
+        yield {"title": f"{record.unit.model}: {groupings.text}", "chart": chart}
 
 
 def _distance(records: Sequence[Record], colors: Mapping[str, int]) -> Iterator[dict[str, str]]:

@@ -60,6 +60,7 @@ from semstab.statistics.cube_sums import (
 from semstab.statistics.drift import expected_sbd
 from semstab.statistics.frame_disagreement import LoneDisagreement, by_frame, lone_disagreement, outlying_frames
 from semstab.statistics.geometry import losses
+from semstab.statistics.groupings import groupings
 from semstab.statistics.intervals import confidence_intervals, estimate, headline_specs, scope_of, spec_of
 from semstab.statistics.observations import SpotObservations
 from semstab.statistics.ranges import range_agreement
@@ -67,7 +68,7 @@ from semstab.statistics.sample import MapSample
 from semstab.statistics.spot_agreement import spot_agreement
 from semstab.statistics.verdict import LIMITS, Limits, verdict
 
-SCHEMA = 4
+SCHEMA = 5
 
 
 @dataclass(frozen=True, eq=False)
@@ -228,6 +229,7 @@ def analyse(
         strata=_strata(whole, table, columns, edges),
         outlying_frames=outlying,
         ranges=None if spots is None else range_agreement(spots, scope, limits),
+        groupings=None if spots is None else groupings(spots, sums, scope, limits),
     )  # fmt: skip
     return Analysis(summary, whole, sums, sample, shares, drawn, lone)
 

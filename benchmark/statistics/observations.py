@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import functools
 import itertools
 import json
 from collections.abc import Mapping, Sequence
@@ -167,7 +168,7 @@ class SpotObservations:
         """Return the answers for spots whose dominant class is none of these."""
         if not len(classes) or not len(self):
             return self
-        log, order, _ = self._log(self.label)
+        log, order, _ = self._first
         left_out = np.zeros(len(self.point), np.bool_)
         left_out[order] = np.isin(dominant(log.table()), classes)
         return self.only(~left_out[self.spot])
@@ -194,12 +195,19 @@ class SpotObservations:
 
     def observations(self) -> Events:
         """Return the log of spots: the class that a view gives each of them, by the first answers."""
-        return self._log(self.label)[0]
+        return self._first[0]
 
     def logs(self) -> tuple[tuple[Events, Float64], ...]:
         """Return the logs of the three answers with (m,) squared distances, metres^2, 0 of the third ones."""
-        near, far, last = self._log(self.label, self.near), self._log(self.neighbour, self.far), self._log(self.beyond)
-        return tuple((log, squares) for log, _, squares in (near, far, last))
+        return tuple((log, squares) for log, _, squares in (self._first, self._second, self._log(self.beyond)))
+
+    @functools.cached_property
+    def _first(self) -> tuple[Events, Int64, Float64]:
+        return self._log(self.label, self.near)
+
+    @functools.cached_property
+    def _second(self) -> tuple[Events, Int64, Float64]:
+        return self._log(self.neighbour, self.far)
 
     def _log(self, label: UInt16, square: Float32 | None = None) -> tuple[Events, Int64, Float64]:
         """Return a log of these labels, (n,) the spot of each of its voxels, and (m,) squared distances.

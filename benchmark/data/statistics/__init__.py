@@ -18,6 +18,7 @@ from semstab.data.statistics.agreement import (
 )
 from semstab.data.statistics.correctness import Correctness, CorrectnessStatistics, Losses, Quadrants, Reliability
 from semstab.data.statistics.drift import DriftStatistics, Flipping, FlipRates, FrameDisagreement, OutlyingFrames
+from semstab.data.statistics.groupings import Grouping, Groupings, Merge
 from semstab.data.statistics.intervals import CONFIDENCE, UNDEFINED, UNKNOWN, Estimate, Interval, short
 from semstab.data.statistics.map_statistics import (
     ORDER_KNOWN,
@@ -47,6 +48,8 @@ __all__ = [
     "Flipping",
     "FrameAgreement",
     "FrameDisagreement",
+    "Grouping",
+    "Groupings",
     "HeadlineStatistics",
     "Interval",
     "LabelledPairs",
@@ -54,6 +57,7 @@ __all__ = [
     "Level",
     "Losses",
     "MapStatistics",
+    "Merge",
     "MovingClasses",
     "OutlyingFrames",
     "Quadrants",

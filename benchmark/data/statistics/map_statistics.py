@@ -11,6 +11,7 @@ from semstab.data.measures import MeasureMeans
 from semstab.data.statistics.agreement import Correlogram, FrameAgreement, RangeAgreement, SpotAgreement
 from semstab.data.statistics.correctness import CorrectnessStatistics, Losses
 from semstab.data.statistics.drift import DriftStatistics, Flipping, OutlyingFrames
+from semstab.data.statistics.groupings import Groupings
 from semstab.data.statistics.intervals import Interval, short
 
 Level = Literal[
@@ -144,6 +145,7 @@ class MapStatistics:
     strata: tuple[StratumStatistics, ...]
     outlying_frames: OutlyingFrames | None = None
     ranges: RangeAgreement | None = None
+    groupings: Groupings | None = None
 
     def __repr__(self) -> str:
         return f"<MapStatistics '{self.name}': {self.stated}>"

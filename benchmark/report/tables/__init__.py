@@ -21,6 +21,7 @@ from semstab.report.tables.statistics import (
     class_agreement,
     drift,
     frames,
+    merges,
     ranges,
     temporal_agreement,
     uncertainty,
@@ -47,7 +48,7 @@ __all__ = [
 
 BUILDERS = (
     overview, paper, verdicts, flicker, video_measures, scenes, persistence, classes, temporal_agreement, correlogram,
-    class_agreement, ranges, drift, frames, uncertainty, ceiling, correctness, cross_model, sensitivity,
+    class_agreement, merges, ranges, drift, frames, uncertainty, ceiling, correctness, cross_model, sensitivity,
     voxel_sizes, reduced, fusion, compared, agreement,
 )  # fmt: skip
 """The functions that make tables, in the paper's order; without numbers for its tables a function returns none."""

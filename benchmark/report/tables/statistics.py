@@ -141,6 +141,37 @@ def ranges(result: Result) -> list[Table]:
     return [Table("ranges", "Agreement by range", caption, columns, tuple(groups))]
 
 
+def merges(result: Result) -> list[Table]:
+    """Return the merges of classes, scene by scene: each makes alpha as large as one merge can."""
+    assessed, groups = assessed_records(result), []
+    several = any(len(rows) > 1 for rows in assessed.values())
+    for name, rows in assessed.items():
+        of_model = [
+            (
+                *((record.unit.scene,) if several else ()), " + ".join(merge.first), " + ".join(merge.second),
+                merge.groups, merge.effective, merge.alpha,
+            )
+            for record, stats in rows
+            if stats.groupings is not None
+            for merge in stats.groupings.merges
+        ]  # fmt: skip
+        groups += [Group(name, tuple(of_model))] if of_model else []
+    if not groups:
+        return []
+    columns = (
+        *((Column("scene", "Scene"),) if several else ()),
+        Column("first", "Merged"), Column("second", "With"), Column("groups", "Groups left", 0),
+        Column("effective", "Effective", 1), Column.of(ALPHA),
+    )  # fmt: skip
+    caption = (
+        "Of all merges of two groups of classes each row has the one that raises alpha most, until two groups are left."
+        " Alpha is that after the merge, less what the choice flatters: by how much, on one half of the space, groups"
+        " that were chosen there have a larger alpha than groups that were chosen on the other half. Effective is the"
+        " number of groups of equal size whose labels would tell as much."
+    )
+    return [Table("merges", "Which distinctions between classes hold", caption, columns, tuple(groups))]
+
+
 def _from_to(stratum: RangeStratum) -> str:
     return f"{stratum.low:g} to {metres(stratum.high)}"
 

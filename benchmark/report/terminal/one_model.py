@@ -70,6 +70,8 @@ def _verdict(run: UnitSummary) -> Iterator[str]:
         yield f"  {told}"
     if statistics.told_ranges is not None:
         yield from wrapped(statistics.told_ranges.text)
+    if statistics.groupings is not None:
+        yield from wrapped(statistics.groupings.text)
     yield ""
 
 

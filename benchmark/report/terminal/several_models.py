@@ -88,7 +88,8 @@ def several_models(result: Result, records: Sequence[Record], width: int) -> Ite
         if statistics is None:
             continue
         ranges = "" if statistics.told_ranges is None else statistics.told_ranges.text
-        for text in filter(None, (statistics.verdict.difference, ranges)):
+        merged = "" if statistics.groupings is None else statistics.groupings.text
+        for text in filter(None, (statistics.verdict.difference, ranges, merged)):
             yield from wrapped(f"{record.unit.model}: {text}")
     yield ""
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import numpy as np
+
 from semstab.core.compiled import serial
 
 
@@ -53,3 +55,32 @@ def add_class_pairs(evidence, op, weight_of, sums):
             share = weight_of[i] * (weight[a] / op[i])
             for b in range(a + 1, starts[i + 1]):
                 sums[label[a], label[b]] += share * (weight[b] / op[i])
+
+
+@serial
+def add_coincidences(bounds, log, half, pairs):
+    """Add to `pairs` (2, K, K) how often two observations of a spot are of two classes, as alpha weighs it.
+
+    Each observation is paired with the T - 1 others of its spot, which count 1 together (Krippendorff 2011); bounds
+    (n + 1,) are the first observations of spots, log is (starts, label, weight) of all of them, and half (n,) is 0 or 1
+    for each spot. One view alone makes no pair.
+    """
+    starts, label, weight = log
+    total, met = np.zeros(pairs.shape[1]), np.empty(pairs.shape[1], np.int64)
+    for spot in range(len(bounds) - 1):
+        T, many = bounds[spot + 1] - bounds[spot], 0
+        if T < 2:
+            continue
+        for one in range(bounds[spot], bounds[spot + 1]):
+            for a in range(starts[one], starts[one + 1]):
+                if total[label[a]] == 0.0:
+                    met[many] = label[a]
+                    many += 1
+                total[label[a]] += weight[a]
+                for b in range(starts[one], starts[one + 1]):  # no observation is paired with itself
+                    pairs[half[spot], label[a], label[b]] -= weight[a] * weight[b] / (T - 1)
+        for i in range(many):
+            for j in range(many):
+                pairs[half[spot], met[i], met[j]] += total[met[i]] * total[met[j]] / (T - 1)
+        for i in range(many):
+            total[met[i]] = 0.0
