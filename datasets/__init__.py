@@ -101,6 +101,10 @@ REGISTRY = Registry(
         "semantickitti": Entry(
             "semstab.datasets.semantickitti:SemanticKitti", "SemanticKITTI: LiDAR scans, a class a point"
         ),
+        "semantickitti_images": Entry(
+            "semstab.datasets.semantickitti_images:SemanticKittiImages",
+            "SemanticKITTI: camera images, with depth and true classes of the LiDAR's points",
+        ),
         "nuscenes": Entry("semstab.datasets.nuscenes:NuScenes", "nuScenes lidarseg: LiDAR key frames, a class a point"),
         "kitti360": Entry("semstab.datasets.kitti360:Kitti360", "KITTI-360: velodyne scans of its raw data"),
         "points_folder": Entry(

@@ -356,7 +356,7 @@ def read_intrinsics(path: Path) -> Intrinsics:
         )
     side = 3 if len(numbers) == 9 else 4
     K = np.array(numbers, dtype=np.float64).reshape(side, side)[:3, :3]
-    return _pinhole(path, K)
+    return pinhole(path, K)
 
 
 def read_camera(path: Path) -> tuple[Intrinsics, tuple[int, int] | None]:
@@ -386,10 +386,11 @@ def read_camera(path: Path) -> tuple[Intrinsics, tuple[int, int] | None]:
         raise DataError(
             f"{path}: holds no camera; write width, height and intrinsic_matrix as Open3D does, or fx, fy, cx, cy"
         )
-    return _pinhole(path, K), size
+    return pinhole(path, K), size
 
 
-def _pinhole(path: Path, K: Float64) -> Intrinsics:
+def pinhole(path: Path, K: Float64) -> Intrinsics:
+    """Return intrinsics of a camera matrix (3, 3) of a file; raises DataError with the file."""
     if not np.isfinite(K).all() or K[1, 0] != 0 or K[2].tolist() != [0, 0, 1]:
         raise DataError(f"{path}: {K.tolist()} is no camera matrix; write fx 0 cx 0 fy cy 0 0 1, in rows")
     try:
