@@ -92,6 +92,9 @@ REGISTRY = Registry(
         "arkitscenes": Entry("semstab.datasets.arkitscenes:ArkitScenes", "ARKitScenes, raw data"),
         "tartanair": Entry("semstab.datasets.tartanair:TartanAir", "TartanAir: simulated flights, NED poses"),
         "syndrone": Entry("semstab.datasets.syndrone:Syndrone", "Syndrone: flights simulated by CARLA"),
+        "virtual_kitti": Entry(
+            "semstab.datasets.virtual_kitti:VirtualKitti", "Virtual KITTI 2: KITTI's sequences, rendered"
+        ),
         "midair": Entry(
             "semstab.datasets.midair:MidAir",
             "Mid-Air: flights simulated low over land",
@@ -154,7 +157,8 @@ def open_dataset(name: str, options: dict[str, Any] | BaseModel, run_folder: Pat
 RECOGNISED = (
     "odm", "metashape", "pix4d", "realitycapture", "uavscenes", "hololens", "tum", "seven_scenes", "replica", "scannet",
     "semantickitti", "nuscenes", "kitti360", "tartanair", "stray_scanner", "polycam", "record3d", "arkitscenes",
-    "syndrone", "midair", "transforms_json", "colmap", "bag_scans", "bag", "posed_folder", "points_folder",
+    "syndrone", "midair", "virtual_kitti", "transforms_json", "colmap", "bag_scans", "bag", "posed_folder",
+    "points_folder",
 )  # fmt: skip
 """Formats that a folder is recognised as: the one whose scenes lie highest, of these the first."""
 

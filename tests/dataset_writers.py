@@ -273,6 +273,22 @@ def write_syndrone(folder: Path, frames: Sequence[Frame]) -> list[str]:
     return names
 
 
+def write_virtual_kitti(folder: Path, frames: Sequence[Frame]) -> list[str]:
+    """Depth in centimetres, the sky at its end; poses and intrinsics of both cameras, world to camera, in one table."""
+    names = [f"{k:05d}" for k in range(len(frames))]
+    poses, cameras = ["frame cameraID r1,1 r1,2 r1,3 t1 r2,1 ..."], ["frame cameraID K[0,0] K[1,1] K[0,2] K[1,2]"]
+    for k, (name, frame) in enumerate(zip(names, frames, strict=True)):
+        depth = stored(frame, 100)
+        save(folder / f"frames/depth/Camera_0/depth_{name}.png", np.where(depth == 0, 65535, depth).astype(np.uint16))
+        save(folder / f"frames/rgb/Camera_0/rgb_{name}.jpg", frame.color)
+        for camera in (0, 1):
+            poses.append(f"{k} {camera} {numbers(np.linalg.inv(frame.T_wc) + camera * 0.5)}")
+            cameras.append(f"{k} {camera} {numbers(np.add(four(frame), camera))}")
+    write_lines(folder / "extrinsic.txt", poses)
+    write_lines(folder / "intrinsic.txt", cameras)
+    return names
+
+
 def write_midair(folder: Path, frames: Sequence[Frame], flight: str = "trajectory_0000") -> list[str]:
     """A flight, with planar depth in half floats, and records of which each fourth is that of an image."""
     import h5py
@@ -666,6 +682,7 @@ FORMATS = {
         floats=True,
         within="-trajectory_0000",
     ),
+    "virtual_kitti": Format("virtual_kitti", write_virtual_kitti, 100),
     "syndrone": Format("syndrone", write_syndrone, 65.535, {"intrinsics": camera_option}),
     "tartanair": Format("tartanair", write_tartanair, None, {"intrinsics": camera_option}),
     "tartanair, V2": Format(

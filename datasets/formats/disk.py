@@ -445,8 +445,10 @@ def numbered_lines(file: BinaryIO) -> Iterator[tuple[int, str]]:
         yield number, line.decode("utf-8", errors="replace").strip()
 
 
-def read_table(path: Path, columns: int, what: str) -> Float64:
+def read_table(path: Path, columns: int, what: str, heading: str | None = None) -> Float64:
     """Return (n, columns) numbers, apart by whitespace or commas; `what` describes a line in errors.
+
+    A line that begins with the word `heading` is left out.
 
     Raises:
         DataError: For another number of words, or one that is no number; and for no line; the message names the line.
@@ -454,6 +456,8 @@ def read_table(path: Path, columns: int, what: str) -> Float64:
     values = array("d")
     for number, text in records(path):
         words = text.replace(",", " ").split()
+        if words[:1] == [heading]:
+            continue
         if len(words) != columns:
             require_decimal_points(f"{path}: line {number}", text)
             raise DataError(f"{path}: line {number} has {len(words)} values; expected {columns} ({what})")
