@@ -273,6 +273,18 @@ def write_syndrone(folder: Path, frames: Sequence[Frame]) -> list[str]:
     return names
 
 
+def write_habitat(folder: Path, frames: Sequence[Frame]) -> list[str]:
+    """OpenGL axes, quaternions w x y z; numbers are not padded."""
+    names, poses = [str(k) for k in range(len(frames))], []
+    for name, frame in zip(names, frames, strict=True):
+        save(folder / f"depth/{name}.png", stored(frame, 1000))
+        save(folder / f"rgb/{name}.png", frame.color)
+        T = with_axes(frame.T_wc, "opengl")
+        poses.append(numbers([*T[:3, 3], *np.roll(quaternion(T[:3, :3]), 1)]))
+    write_lines(folder / "GT_Pose.txt", poses)
+    return names
+
+
 def write_virtual_kitti(folder: Path, frames: Sequence[Frame]) -> list[str]:
     """Depth in centimetres, the sky at its end; poses and intrinsics of both cameras, world to camera, in one table."""
     names = [f"{k:05d}" for k in range(len(frames))]
@@ -682,6 +694,7 @@ FORMATS = {
         floats=True,
         within="-trajectory_0000",
     ),
+    "habitat": Format("habitat", write_habitat, 1000, {"intrinsics": camera_option}),
     "virtual_kitti": Format("virtual_kitti", write_virtual_kitti, 100),
     "syndrone": Format("syndrone", write_syndrone, 65.535, {"intrinsics": camera_option}),
     "tartanair": Format("tartanair", write_tartanair, None, {"intrinsics": camera_option}),
