@@ -273,6 +273,29 @@ def write_syndrone(folder: Path, frames: Sequence[Frame]) -> list[str]:
     return names
 
 
+def write_hypersim(folder: Path, frames: Sequence[Frame], unit: float = 1.0) -> list[str]:
+    """Depth in half floats, poses in a unit of metres, OpenGL axes; of a frame that was left out there is a pose alone."""
+    names, images = [f"{k + 1:04d}" for k in range(len(frames))], folder / "images/scene_cam_00_geometry_hdf5"
+    for name, frame in zip(names, frames, strict=True):
+        save_hdf5(images / f"frame.{name}.depth_meters.hdf5", frame.depth.astype(np.float16))
+        save(folder / f"images/scene_cam_00_final_preview/frame.{name}.color.jpg", frame.color)
+    poses = np.array([np.eye(4), *(with_axes(frame.T_wc, "opengl") for frame in frames)])
+    save_hdf5(folder / "_detail/cam_00/camera_keyframe_positions.hdf5", poses[:, :3, 3] / unit)
+    save_hdf5(folder / "_detail/cam_00/camera_keyframe_orientations.hdf5", poses[:, :3, :3])
+    write_lines(
+        folder / "_detail/metadata_scene.csv", ["parameter_name,parameter_value", f"meters_per_asset_unit,{unit}"]
+    )
+    return names
+
+
+def save_hdf5(path: Path, array: np.ndarray) -> None:
+    import h5py
+
+    path.parent.mkdir(parents=True, exist_ok=True)
+    with h5py.File(path, "w") as file:
+        file["dataset"] = array
+
+
 def write_habitat(folder: Path, frames: Sequence[Frame]) -> list[str]:
     """OpenGL axes, quaternions w x y z; numbers are not padded."""
     names, poses = [str(k) for k in range(len(frames))], []
@@ -693,6 +716,9 @@ FORMATS = {
         {"intrinsics": camera_option, "depth_kind": "planar"},
         floats=True,
         within="-trajectory_0000",
+    ),
+    "hypersim": Format(
+        "hypersim", write_hypersim, 256, {"intrinsics": camera_option, "depth_kind": "planar"}, floats=True
     ),
     "habitat": Format("habitat", write_habitat, 1000, {"intrinsics": camera_option}),
     "virtual_kitti": Format("virtual_kitti", write_virtual_kitti, 100),

@@ -6,10 +6,12 @@ import json
 
 import numpy as np
 import pytest
-from dataset_writers import FORMATS, opened, save, source, write_labelled
+from dataset_writers import FORMATS, opened, save, save_hdf5, source, write_hypersim, write_labelled, write_lines
 from posed_scene import fails
+from scipy.spatial.transform import Rotation
 
 from semstab.data.labels import LabelSpace
+from semstab.datasets.hypersim import read_lens
 from semstab.errors import DataError
 
 VIRTUAL_KITTI = FORMATS["virtual_kitti"]
@@ -136,3 +138,97 @@ def test_the_camera_of_habitat_sees_90_degrees_and_quaternions_have_an_order(tmp
     (folder / "GT_Pose.txt").write_text("".join(f"{' '.join([*r[:3], *r[4:], r[3]])}\n" for r in rows))
     T = opened(HABITAT, folder, quaternion="xyzw").T_wc(2)
     np.testing.assert_allclose(T, source(1000)[2].T_wc, atol=1e-12)
+
+
+# --- Hypersim
+
+
+HYPERSIM = FORMATS["hypersim"]
+FRAME = "images/scene_cam_00_geometry_hdf5/frame.0001"
+
+
+def write_lens(folder, scene, turn, focal=800.0, size=(1024, 768)):
+    """A row of metadata_camera_parameters.csv of a pinhole that looks along another axis than the poses say."""
+    W, H = size
+    K = np.array([[focal, 0, 500], [0, focal, 400], [0, 0, 1.0]])
+    pixels = np.array([[W / 2, 0, W / 2 - 0.5], [0, -H / 2, H / 2 - 0.5], [0, 0, 1]])  # of u, v from -1 to 1, v up
+    M = 3 * np.diag([1.0, -1, -1]) @ turn.T @ np.linalg.inv(K) @ pixels
+    names = ["scene_name", "settings_output_img_width", "settings_output_img_height"]
+    names += [f"M_cam_from_uv_{i}{j}" for i in range(3) for j in range(3)]
+    values = [scene, f"{W}.0", f"{H}.0", *map(repr, M.ravel().tolist())]
+    return write_lines(folder / "metadata_camera_parameters.csv", [",".join(names), ",".join(values)])
+
+
+def test_a_tilted_lens_of_hypersim_is_a_pinhole_that_looks_elsewhere(tmp_path):
+    turn = Rotation.from_euler("xy", [12, -5], degrees=True).as_matrix()  # from the poses' axes to the lens's, OpenCV
+    camera, T = read_lens(write_lens(tmp_path, "ai_001_002", turn), "ai_001_002")
+    K = camera.intrinsics
+    np.testing.assert_allclose([K.fx, K.fy, K.cx, K.cy], [800, 800, 500, 400], rtol=1e-9)
+    flip = np.diag([1.0, -1, -1])
+    np.testing.assert_allclose(flip @ T[:3, :3] @ flip, turn.T, atol=1e-12)
+    write_labelled(HYPERSIM, tmp_path / "scenes/ai_001_002")
+    scene = opened(HYPERSIM, tmp_path / "scenes", intrinsics=None)
+    np.testing.assert_allclose(scene.T_wc(0)[:3, :3], source(256)[0].T_wc[:3, :3] @ turn.T, atol=1e-9)
+    assert scene.intrinsics(0, (768, 1024)).cx == pytest.approx(500)
+
+
+def test_a_scene_of_hypersim_without_a_lens_is_told_where_it_is(tmp_path):
+    write_labelled(HYPERSIM, tmp_path / "ai_001_003")
+    fails(
+        DataError,
+        r"metadata_camera_parameters\.csv is not there or above; .*886\.81",
+        opened,
+        HYPERSIM,
+        tmp_path,
+        intrinsics=None,
+    )
+    path = write_lens(tmp_path, "ai_001_002", np.eye(3))
+    fails(DataError, "has no row of ai_001_003", opened, HYPERSIM, tmp_path, intrinsics=None)
+    replace_in(path, "ai_001_002,1024.0", "ai_001_003,0")
+    fails(DataError, "the row of ai_001_003 holds no size", opened, HYPERSIM, tmp_path, intrinsics=None)
+    write_lens(tmp_path, "ai_001_003", np.array([[1, 0.01, 0], [0, 1, 0], [0, 0, 1]]).T)
+    fails(DataError, r"ai_001_003 has a skew of -?8\.0 pixels", opened, HYPERSIM, tmp_path, intrinsics=None)
+
+
+def test_classes_of_hypersim_are_nyu40_and_depth_is_along_the_ray(tmp_path):
+    write_labelled(HYPERSIM, tmp_path)
+    save_hdf5(tmp_path / f"{FRAME}.semantic.hdf5", pattern(np.int16, -1))
+    scene = opened(HYPERSIM, tmp_path)
+    assert scene.label_space("gt").name == "nyu40"
+    expected = np.where((ids := pattern(int, 0)) == 0, 65535, ids)
+    np.testing.assert_array_equal(scene.frame(0, "gt").labels, expected)
+    assert opened(HYPERSIM, tmp_path, depth_kind="ray").options.depth_kind == "ray"
+    K = scene.intrinsics(0, (32, 48))
+    ray = np.hypot(np.hypot((0 - K.cx) / K.fx, (0 - K.cy) / K.fy), 1)
+    planar, along = scene.depth(0)[0, 0], opened(HYPERSIM, tmp_path, depth_kind="ray").depth(0)[0, 0]
+    assert along == pytest.approx(planar / ray, rel=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("damage", "said"),
+    [
+        (
+            lambda f: (f / "_detail/metadata_scene.csv").unlink(),
+            r"metadata_scene\.csv: is missing; it holds meters_per_asset",
+        ),
+        (lambda f: replace_in(f / "_detail/metadata_scene.csv", "1.0", "x"), r"meters_per_asset_unit is 'x'"),
+        (
+            lambda f: save_hdf5(f / "_detail/cam_00/camera_keyframe_positions.hdf5", np.zeros((2, 3))),
+            r"positions\.hdf5: has 2 rows, and 5 rotations, but frame 2 is there",
+        ),
+        (
+            lambda f: save_hdf5(f / "_detail/cam_00/camera_keyframe_positions.hdf5", np.zeros((5, 4))),
+            r"positions\.hdf5: dataset is no table of N x 3 numbers",
+        ),
+        (lambda f: (f / f"{FRAME}.depth_meters.hdf5").write_bytes(b"no"), r"depth_meters\.hdf5: cannot be read"),
+    ],
+)
+def test_what_is_wrong_in_hypersim_is_named(tmp_path, damage, said):
+    write_labelled(HYPERSIM, tmp_path)
+    damage(tmp_path)
+    fails(DataError, said, lambda: opened(HYPERSIM, tmp_path).frame(0, "net"))
+
+
+def test_poses_of_hypersim_in_inches_become_metres(tmp_path):
+    write_hypersim(tmp_path, source(256), unit=0.0254)
+    np.testing.assert_allclose(opened(HYPERSIM, tmp_path).T_wc(3), source(256)[3].T_wc, atol=1e-12)
