@@ -274,7 +274,7 @@ def write_syndrone(folder: Path, frames: Sequence[Frame]) -> list[str]:
 
 
 def write_hypersim(folder: Path, frames: Sequence[Frame], unit: float = 1.0) -> list[str]:
-    """Depth in half floats, poses in a unit of metres, OpenGL axes; of a frame that was left out there is a pose alone."""
+    """Depth in half floats, poses in a unit of metres, OpenGL axes; frame 0 was left out, and has a pose alone."""
     names, images = [f"{k + 1:04d}" for k in range(len(frames))], folder / "images/scene_cam_00_geometry_hdf5"
     for name, frame in zip(names, frames, strict=True):
         save_hdf5(images / f"frame.{name}.depth_meters.hdf5", frame.depth.astype(np.float16))

@@ -384,14 +384,16 @@ class LabelMaps:
         """Return the table from the ids of the files of a label source to those of its taxonomy, where they differ."""
         return self.truth.ids if model == GROUND_TRUTH else None
 
-    def labels(self, model: str, frame: FrameSource, path: Path, read: Read, own: FrameSize = ANY_SIZE) -> Labels:
+    def labels(
+        self, model: str, path: Path, read: Read, own: FrameSize = ANY_SIZE, frame: FrameSource | None = None
+    ) -> Labels:
         """Return ids (H, W) of one file of a frame, whose bytes `read` gives; `own` has the sizes that it may have.
 
         Raises:
             DataError: If that fails; the message names it.
         """
         void = self._options.void_ids.get(model, ())
-        if model == GROUND_TRUTH and self.truth.read is not None:
+        if model == GROUND_TRUTH and self.truth.read is not None and frame is not None:
             labels = self.truth.read(frame, path, read)
         else:
             labels = images.read_labels(path, self.space(model), read, own, void)

@@ -187,9 +187,8 @@ class FileScene(Scene):
         depth, labels, scores = self.depth(index), None, None
         if kind != "scores":
             own = self._sizes(index, depth.shape, file, "labels are")
-            labels = self._stored(
-                index, self._maps.labels(model, self._frame(index), file, read, own), depth.shape, file, "labels are"
-            )
+            ids = self._maps.labels(model, file, read, own, self._frame(index))
+            labels = self._stored(index, ids, depth.shape, file, "labels are")
         else:
             own = self._sizes(index, depth.shape, file, "scores are")
             stored = self._maps.scores(model, file, (depth.shape[0], depth.shape[1]), read, own)
