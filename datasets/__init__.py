@@ -92,6 +92,18 @@ REGISTRY = Registry(
         "arkitscenes": Entry("semstab.datasets.arkitscenes:ArkitScenes", "ARKitScenes, raw data"),
         "tartanair": Entry("semstab.datasets.tartanair:TartanAir", "TartanAir: simulated flights, NED poses"),
         "syndrone": Entry("semstab.datasets.syndrone:Syndrone", "Syndrone: flights simulated by CARLA"),
+        "hypersim": Entry(
+            "semstab.datasets.hypersim:Hypersim",
+            "Hypersim: rendered rooms, classes of NYU40",
+            "pip install 'semstab[midair]'",
+            ("h5py",),
+        ),
+        "habitat": Entry(
+            "semstab.datasets.habitat:Habitat", "walks that Habitat rendered: GT_Pose.txt, ids of instances"
+        ),
+        "virtual_kitti": Entry(
+            "semstab.datasets.virtual_kitti:VirtualKitti", "Virtual KITTI 2: KITTI's sequences, rendered"
+        ),
         "midair": Entry(
             "semstab.datasets.midair:MidAir",
             "Mid-Air: flights simulated low over land",
@@ -100,6 +112,10 @@ REGISTRY = Registry(
         ),
         "semantickitti": Entry(
             "semstab.datasets.semantickitti:SemanticKitti", "SemanticKITTI: LiDAR scans, a class a point"
+        ),
+        "semantickitti_images": Entry(
+            "semstab.datasets.semantickitti_images:SemanticKittiImages",
+            "SemanticKITTI: camera images, with depth and true classes of the LiDAR's points",
         ),
         "nuscenes": Entry("semstab.datasets.nuscenes:NuScenes", "nuScenes lidarseg: LiDAR key frames, a class a point"),
         "kitti360": Entry("semstab.datasets.kitti360:Kitti360", "KITTI-360: velodyne scans of its raw data"),
@@ -148,9 +164,10 @@ def open_dataset(name: str, options: dict[str, Any] | BaseModel, run_folder: Pat
 
 
 RECOGNISED = (
-    "odm", "metashape", "pix4d", "realitycapture", "uavscenes", "hololens", "tum", "seven_scenes", "replica", "scannet",
-    "semantickitti", "nuscenes", "kitti360", "tartanair", "stray_scanner", "polycam", "record3d", "arkitscenes",
-    "syndrone", "midair", "transforms_json", "colmap", "bag_scans", "bag", "posed_folder", "points_folder",
+    "odm", "metashape", "pix4d", "realitycapture", "uavscenes", "hololens", "tum", "seven_scenes", "replica",
+    "scannet", "semantickitti", "nuscenes", "kitti360", "tartanair", "stray_scanner", "polycam", "record3d",
+    "arkitscenes", "syndrone", "midair", "hypersim", "habitat", "virtual_kitti", "transforms_json", "colmap",
+    "bag_scans", "bag", "posed_folder", "points_folder",
 )  # fmt: skip
 """Formats that a folder is recognised as: the one whose scenes lie highest, of these the first."""
 

@@ -9,24 +9,22 @@ from __future__ import annotations
 from collections.abc import Iterable
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from pydantic import BaseModel
 
-from semstab.core.files import open_file
 from semstab.core.types import Float32, Float64
 from semstab.datasets.files import options as opt
 from semstab.datasets.files.labels import SceneEntry
 from semstab.datasets.files.options import FileOptions, FrameSource
 from semstab.datasets.files.reader import FileDataset, frames_of
 from semstab.datasets.formats.disk import files_named, natural, read_bytes, subfolders
+from semstab.datasets.formats.hdf5 import numbers, opened
 from semstab.datasets.formats.images import Read, read_depth
 from semstab.datasets.geometry.cameras import camera_of, from_quaternions
-from semstab.errors import DataError, MissingDependencyError, summarize_error
+from semstab.errors import DataError
 
 RECORDS = "sensor_records.hdf5"
-INSTALL = "pip install 'semstab[midair]'"
 
 SIZE = (1024, 1024)
 USUAL = (512.0, 512.0, 511.5, 511.5)
@@ -138,38 +136,12 @@ def read_flight(path: Path, flight: str) -> tuple[Float64, Float64]:
         DataError: If the file is damaged, or lacks them.
         MissingDependencyError: If h5py is not installed.
     """
-    try:
-        import h5py
-    except ImportError as error:
-        raise MissingDependencyError(f"{path}: needs h5py ({summarize_error(error)}); {INSTALL}") from error
-    try:
-        with open_file(path) as file, h5py.File(file, "r") as records:
-            truth = f"{flight}/groundtruth"
-            positions = _table(records, f"{truth}/position", 3, path)
-            attitudes = _table(records, f"{truth}/attitude", 4, path)
-    except DataError:
-        raise
-    except (OSError, LookupError, ValueError, TypeError, RuntimeError, AttributeError, MemoryError) as error:
-        raise DataError(f"{path}: cannot be read ({summarize_error(error)}); download it again") from error
+    with opened(path) as records:
+        truth = f"{flight}/groundtruth"
+        positions = numbers(records, f"{truth}/position", (None, 3), 3 * MOST, path).astype(np.float64)
+        attitudes = numbers(records, f"{truth}/attitude", (None, 4), 4 * MOST, path).astype(np.float64)
     if len(positions) != len(attitudes):
         raise DataError(
             f"{path}: {flight} has {len(positions)} positions and {len(attitudes)} attitudes; download it again"
         )
     return positions, attitudes
-
-
-def _table(records: Any, name: str, columns: int, path: Path) -> Float64:
-    """Return a dataset (n, columns) of the file itself: links and data in other files are not followed."""
-    import h5py
-
-    parts = name.split("/")
-    for k in range(1, len(parts) + 1):
-        if not isinstance(records.get("/".join(parts[:k]), getlink=True), h5py.HardLink):
-            raise DataError(f"{path}: has no {name}; download it again")
-    table = records[name]
-    own = isinstance(table, h5py.Dataset) and not table.external and not table.is_virtual
-    if not own or table.dtype.kind not in "fiu" or table.ndim != 2 or table.shape[1] != columns:
-        raise DataError(f"{path}: {name} is no table of {columns} numbers a row; download it again")
-    if len(table) > MOST:
-        raise DataError(f"{path}: {name} claims {len(table)} rows; is it damaged?")
-    return np.asarray(table[()], dtype=np.float64)

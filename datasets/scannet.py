@@ -5,7 +5,7 @@ Source: Dai et al., ScanNet, CVPR 2017, and SensReader/python (github.com/ScanNe
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable
 from pathlib import Path
 from typing import Literal
 
@@ -14,10 +14,9 @@ from pydantic import BaseModel, Field
 
 from semstab.core.types import UInt16
 from semstab.data.labels import IGNORE_16BIT
-from semstab.datasets import GROUND_TRUTH
 from semstab.datasets.files import options as opt
 from semstab.datasets.files.labels import NO_ID
-from semstab.datasets.files.options import FileOptions, FrameSource
+from semstab.datasets.files.options import FileOptions, FrameSource, Truth
 from semstab.datasets.files.reader import FileDataset, frames_of
 from semstab.datasets.formats.disk import MAX_TABLE_BYTES, files_named, read_intrinsics, read_text
 from semstab.datasets.geometry.cameras import Camera
@@ -60,10 +59,10 @@ class ScanNet(FileDataset[ScanNetOptions]):
         depth = self.depth_files(folder / "depth", "", ".png", instead=files_named(folder / "pose", "", ".txt"))
         return frames_of(folder, depth, camera, pose="pose/{name}.txt", color="color/{name}", label_camera=label_camera)
 
-    def class_ids(self) -> Mapping[str, UInt16]:
+    def truth(self, folder: Path) -> Truth:
         """Return the ids of the ground truth as those of the class table's column, where a table is given."""
         table = self.options.class_table
-        return {} if table is None else {GROUND_TRUTH: read_class_table(table, self.options.class_column)}
+        return Truth(ids=None if table is None else read_class_table(table, self.options.class_column))
 
     def _camera(self, folder: Path, which: Which) -> Camera:
         size = self.options.color_size if which == "color" else None

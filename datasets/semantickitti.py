@@ -86,27 +86,9 @@ class SemanticKitti(ScanDataset[SemanticKittiOptions]):
         return (folder / "velodyne").is_dir() and (folder / self.options.poses).is_file()
 
     def scans(self, entry: SceneEntry) -> Iterator[ScanSource]:
-        """Yield a scan for each file of points.
-
-        Raises:
-            DataError: If there are fewer poses, or the calibration is not there.
-        """
-        folder = entry.folder
-        files = files_named(folder / "velodyne", "", ".bin")
-        path = folder / self.options.poses
-        rows = read_table(path, 12, "r11 r12 r13 t1 ... of each scan").reshape(-1, 3, 4)
-        poses = as_poses(rows, self.options.pose_convention, path)
-        if self.options.pose_frame == "camera":
-            Tr = _calibration(folder / "calib.txt")
-            poses = rigid_inverse(Tr, str(folder / "calib.txt")) @ poses @ Tr  # in the world of the first LiDAR, z up
-        times = folder / "times.txt"
-        stamps = read_table(times, 1, "seconds").ravel() if times.is_file() else None
-        for k, (name, points) in enumerate(files.items()):
-            row = int(name) if name.isdigit() and len(poses) > len(files) else k
-            if row >= len(poses):
-                raise DataError(f"{path}: has {len(poses)} poses, and scan {name} is number {row}; add its pose")
-            stamp = None if stamps is None or row >= len(stamps) else float(stamps[row])
-            yield ScanSource(name, points, poses[row], path, stamp)
+        """Return a scan for each file of points; raises what `scans_of` raises."""
+        options = self.options
+        return scans_of(entry.folder, options.poses, options.pose_convention, options.pose_frame)
 
     def points(self, path: Path, read: Read) -> Float32:
         """Return the points of x, y, z and remission."""
@@ -121,12 +103,45 @@ class SemanticKitti(ScanDataset[SemanticKittiOptions]):
         return None if self.options.moving == "keep" else np.isin(ids(), MOVING)
 
 
-def _table(options: SemanticKittiOptions) -> UInt16:
+def scans_of(folder: Path, poses_file: str, convention: str, pose_frame: str) -> Iterator[ScanSource]:
+    """Yield a scan for each file of points of a sequence, with the pose of the LiDAR in the world of the first one.
+
+    Raises:
+        DataError: If there are fewer poses, or the calibration is not there.
+    """
+    files = files_named(folder / "velodyne", "", ".bin")
+    path = folder / poses_file
+    rows = read_table(path, 12, "r11 r12 r13 t1 ... of each scan").reshape(-1, 3, 4)
+    poses = as_poses(rows, convention, path)
+    if pose_frame == "camera":
+        Tr = lidar_to_camera(
+            folder / "calib.txt", "; where the poses are the LiDAR's own, set pose_frame: lidar (--option"
+            " pose_frame=lidar)"
+        )  # fmt: skip
+        poses = rigid_inverse(Tr, str(folder / "calib.txt")) @ poses @ Tr  # in the world of the first LiDAR, z up
+    times = folder / "times.txt"
+    stamps = read_table(times, 1, "seconds").ravel() if times.is_file() else None
+    for k, (name, points) in enumerate(files.items()):
+        row = int(name) if name.isdigit() and len(poses) > len(files) else k
+        if row >= len(poses):
+            raise DataError(f"{path}: has {len(poses)} poses, and scan {name} is number {row}; add its pose")
+        stamp = None if stamps is None or row >= len(stamps) else float(stamps[row])
+        yield ScanSource(name, points, poses[row], path, stamp)
+
+
+def benchmark_ids() -> UInt16:
+    """Return the benchmark's learning_map as a table (65536,) from stored ids to those of the 19 classes."""
     table = np.full(1 << 16, NO_ID, np.uint16)
     table[[*IGNORED, IGNORE_16BIT]] = IGNORE_16BIT
+    table[[*LEARNING_MAP]] = [*LEARNING_MAP.values()]
+    return table
+
+
+def _table(options: SemanticKittiOptions) -> UInt16:
     if options.learning_map is None:
-        table[[*LEARNING_MAP]] = [*LEARNING_MAP.values()]
-        return table
+        return benchmark_ids()
+    table = np.full(1 << 16, NO_ID, np.uint16)
+    table[[*IGNORED, IGNORE_16BIT]] = IGNORE_16BIT
     path = options.learning_map
     content = read_yaml(path).get("learning_map")
     if not isinstance(content, dict) or not all(isinstance(n, int) for pair in content.items() for n in pair):
@@ -139,17 +154,12 @@ def _table(options: SemanticKittiOptions) -> UInt16:
     return table
 
 
-def _calibration(path: Path) -> Float64:
-    """Return Tr (4, 4), from the LiDAR to camera 0, of KITTI's calib.txt."""
+def lidar_to_camera(path: Path, otherwise: str = "") -> Float64:
+    """Return Tr (4, 4), from the LiDAR to camera 0, of KITTI's calib.txt; raises DataError, `otherwise` at its end."""
     if not path.is_file():
-        raise DataError(
-            f"{path}: is missing; it holds Tr, from the LiDAR to the camera whose poses are given; where they are the"
-            " LiDAR's own, set pose_frame: lidar (--option pose_frame=lidar)"
-        )
+        raise DataError(f"{path}: is missing; it holds Tr, from the LiDAR to camera 0{otherwise}")
     matrices = read_matrices(path)
     for key in ("Tr", "Tr_velo_to_cam"):
         if key in matrices:
             return matrices[key]
-    raise DataError(
-        f"{path}: has no line Tr of 12 numbers; copy that of the sequence's calib.txt, or set pose_frame: lidar"
-    )
+    raise DataError(f"{path}: has no line Tr of 12 numbers; copy that of SemanticKITTI's calib.txt{otherwise}")

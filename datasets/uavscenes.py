@@ -100,7 +100,7 @@ class UavScenes(Photographs[UavScenesOptions]):
         """Return the scene, with the ground truth that lies in a folder of its own."""
         truth = _truth_of(entry.folder)
         own = {} if truth is None or options.ground_truth is not None else {GROUND_TRUTH: truth}
-        return FileScene(entry, frames, options, self.class_ids(), surface, label_folders=own)
+        return FileScene(entry, frames, options, surface=surface, label_folders=own)
 
 
 def _named(entry: SceneEntry) -> SceneEntry:

@@ -219,7 +219,7 @@ class VideoScene(Scene):
         self.name, self.folder, self.options = entry.name, entry.folder, options
         self.skips_incomplete = options.incomplete == "skip"
         self._frames, self._film, self._files = frames, film, Folders()
-        self._maps = LabelMaps(options, entry, frames, {}, self._files, {})
+        self._maps = LabelMaps(options, entry, frames, self._files, {})
         self.models, self.ground_truth = self._maps.models, self._maps.ground_truth
         if self.ground_truth and self._maps.space(GROUND_TRUTH) is None:
             logger.warning("%s: the classes of %s are not known, so it is not read", self.name, GROUND_TRUTH)

@@ -273,6 +273,57 @@ def write_syndrone(folder: Path, frames: Sequence[Frame]) -> list[str]:
     return names
 
 
+def write_hypersim(folder: Path, frames: Sequence[Frame], unit: float = 1.0) -> list[str]:
+    """Depth in half floats, poses in a unit of metres, OpenGL axes; frame 0 was left out, and has a pose alone."""
+    names, images = [f"{k + 1:04d}" for k in range(len(frames))], folder / "images/scene_cam_00_geometry_hdf5"
+    for name, frame in zip(names, frames, strict=True):
+        save_hdf5(images / f"frame.{name}.depth_meters.hdf5", frame.depth.astype(np.float16))
+        save(folder / f"images/scene_cam_00_final_preview/frame.{name}.color.jpg", frame.color)
+    poses = np.array([np.eye(4), *(with_axes(frame.T_wc, "opengl") for frame in frames)])
+    save_hdf5(folder / "_detail/cam_00/camera_keyframe_positions.hdf5", poses[:, :3, 3] / unit)
+    save_hdf5(folder / "_detail/cam_00/camera_keyframe_orientations.hdf5", poses[:, :3, :3])
+    write_lines(
+        folder / "_detail/metadata_scene.csv", ["parameter_name,parameter_value", f"meters_per_asset_unit,{unit}"]
+    )
+    return names
+
+
+def save_hdf5(path: Path, array: np.ndarray) -> None:
+    import h5py
+
+    path.parent.mkdir(parents=True, exist_ok=True)
+    with h5py.File(path, "w") as file:
+        file["dataset"] = array
+
+
+def write_habitat(folder: Path, frames: Sequence[Frame]) -> list[str]:
+    """OpenGL axes, quaternions w x y z; numbers are not padded."""
+    names, poses = [str(k) for k in range(len(frames))], []
+    for name, frame in zip(names, frames, strict=True):
+        save(folder / f"depth/{name}.png", stored(frame, 1000))
+        save(folder / f"rgb/{name}.png", frame.color)
+        T = with_axes(frame.T_wc, "opengl")
+        poses.append(numbers([*T[:3, 3], *np.roll(quaternion(T[:3, :3]), 1)]))
+    write_lines(folder / "GT_Pose.txt", poses)
+    return names
+
+
+def write_virtual_kitti(folder: Path, frames: Sequence[Frame]) -> list[str]:
+    """Depth in centimetres, the sky at its end; poses and intrinsics of both cameras, world to camera, in one table."""
+    names = [f"{k:05d}" for k in range(len(frames))]
+    poses, cameras = ["frame cameraID r1,1 r1,2 r1,3 t1 r2,1 ..."], ["frame cameraID K[0,0] K[1,1] K[0,2] K[1,2]"]
+    for k, (name, frame) in enumerate(zip(names, frames, strict=True)):
+        depth = stored(frame, 100)
+        save(folder / f"frames/depth/Camera_0/depth_{name}.png", np.where(depth == 0, 65535, depth).astype(np.uint16))
+        save(folder / f"frames/rgb/Camera_0/rgb_{name}.jpg", frame.color)
+        for camera in (0, 1):
+            poses.append(f"{k} {camera} {numbers(np.linalg.inv(frame.T_wc) + camera * 0.5)}")
+            cameras.append(f"{k} {camera} {numbers(np.add(four(frame), camera))}")
+    write_lines(folder / "extrinsic.txt", poses)
+    write_lines(folder / "intrinsic.txt", cameras)
+    return names
+
+
 def write_midair(folder: Path, frames: Sequence[Frame], flight: str = "trajectory_0000") -> list[str]:
     """A flight, with planar depth in half floats, and records of which each fourth is that of an image."""
     import h5py
@@ -666,6 +717,11 @@ FORMATS = {
         floats=True,
         within="-trajectory_0000",
     ),
+    "hypersim": Format(
+        "hypersim", write_hypersim, 256, {"intrinsics": camera_option, "depth_kind": "planar"}, floats=True
+    ),
+    "habitat": Format("habitat", write_habitat, 1000, {"intrinsics": camera_option}),
+    "virtual_kitti": Format("virtual_kitti", write_virtual_kitti, 100),
     "syndrone": Format("syndrone", write_syndrone, 65.535, {"intrinsics": camera_option}),
     "tartanair": Format("tartanair", write_tartanair, None, {"intrinsics": camera_option}),
     "tartanair, V2": Format(

@@ -170,7 +170,7 @@ IMAGES = {".png", ".jpg", ".jpeg", ".npy", ".tif"}
 
 
 def is_image(path: Path) -> bool:
-    return path.suffix.lower() in IMAGES or "depth_maps" in path.parts
+    return path.suffix.lower() in IMAGES or "depth_maps" in path.parts or path.name.endswith(".depth_meters.hdf5")
 
 
 UNREAD = [name for name, form in ds.FORMATS.items() if form.dataset != "bag" and not form.sizes_in_images]

@@ -91,8 +91,8 @@ def test_each_flight_of_a_climate_is_a_scene_with_its_own_labels(tmp_path) -> No
     ("name", "content", "said"),
     [
         ("position", np.zeros((3, 3)), "trajectory_0000 has 3 positions and 8 attitudes"),
-        ("attitude", np.zeros((8, 3)), "attitude is no table of 4 numbers a row"),
-        ("position", np.array([[b"a"] * 3] * 8), "position is no table of 3 numbers a row"),
+        ("attitude", np.zeros((8, 3)), "attitude is no table of N x 4 numbers"),
+        ("position", np.array([[b"a"] * 3] * 8), "position is no table of N x 3 numbers"),
         ("attitude", np.full((8, 4), 0.5) * 3, "the quaternion of pose 1 has length 3, not 1"),
         ("position", None, "has no trajectory_0000/groundtruth/position"),
     ],

@@ -38,7 +38,8 @@ def print_check(checked: SceneCheck, console: Console, *, verbose: bool = False)
     console.print()
     say(f"  {state.upper()}  {_conclusion(checked)}", 4, STATES[state])
     if not checked.labels:
-        say(f"  labels   none: {OF_SCANS if checked.of_scans else OF_IMAGES}", 11)
+        which = "of no model but the truth" if _of_truth(checked) else "none"
+        say(f"  labels   {which}: {OF_SCANS if checked.of_scans else OF_IMAGES}", 11)
     for text in checked.problems_of_labels:
         say(f"  LABELS  {text}", 4, STATES["unsound"])
     if checked.placed is not None:
@@ -93,6 +94,11 @@ def _tables(checked: SceneCheck) -> dict[str, tuple[str, Table]]:
     return tables
 
 
+def _of_truth(checked: SceneCheck) -> bool:
+    """Return whether the labels that were compared are the ground truth's, as no model has any."""
+    return not checked.labels and any(row.agreement == row.agreement for row in checked.overlaps)
+
+
 def _convention_table(checked: SceneCheck) -> Table:
     table = _table(("read",), ("error\n%", "co-visible\n%", "points"))
     for name, fit in checked.verdict.fits:
@@ -101,7 +107,7 @@ def _convention_table(checked: SceneCheck) -> Table:
 
 
 def _overlap_table(checked: SceneCheck) -> Table:
-    of = f" of {checked.labels[0].model}" if len(checked.labels) > 1 else ""
+    of = f" of {checked.labels[0].model}" if len(checked.labels) > 1 else " of gt" if _of_truth(checked) else ""
     numbers = ("pairs", "in view\n%", "co-visible\n%", "error\n%", f"labels{of}\nagree %")
     table = _table(("frames apart",), numbers)
     for row in checked.overlaps:

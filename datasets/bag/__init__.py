@@ -66,7 +66,7 @@ class Bag(OfBags, FileDataset[BagOptions]):
         """Return the scene of a bag, which says on which topics its parts are."""
         recorded = self._opened.pop(entry.folder)
         labels = recorded.label_folders
-        scene = FileScene(entry, frames, options, self.class_ids(), surface, recorded.messages, labels)
+        scene = FileScene(entry, frames, options, surface=surface, folders=recorded.messages, label_folders=labels)
         scene.sources = tuple(recorded.sources)
         return scene
 

@@ -12,9 +12,18 @@ from typing import Literal, Protocol
 import numpy as np
 
 from semstab.config import nearest
-from semstab.core.types import UInt16
+from semstab.core.types import Mask, UInt16
 from semstab.data.labels import IGNORE_16BIT, LabelSpace, ignore_id
-from semstab.datasets.files.options import Folders, LabelOptions, Template, inside, matching_folders
+from semstab.datasets.files.options import (
+    NO_TRUTH,
+    Folders,
+    FrameSource,
+    LabelOptions,
+    Template,
+    Truth,
+    inside,
+    matching_folders,
+)
 from semstab.datasets.formats import images
 from semstab.datasets.formats.disk import natural, subfolders
 from semstab.datasets.formats.images import ANY_SIZE, FrameSize, Read, Size
@@ -24,13 +33,14 @@ from semstab.errors import ConfigError, DataError
 
 logger = logging.getLogger("semstab")
 
-Kind = Literal["labels", "scores", "masks", "points"]
+Kind = Literal["labels", "scores", "masks", "points", "truth"]
 KINDS: tuple[Kind, ...] = ("labels", "scores")
 SUFFIXES: Mapping[Kind, tuple[str, ...]] = {
     "labels": images.LABEL_SUFFIXES,
     "scores": images.SCORE_SUFFIXES,
     "masks": images.MASK_SUFFIXES,
     "points": (".label", ".bin", ".npy", ".las", ".laz", ".ply"),
+    "truth": (*images.LABEL_SUFFIXES, ".label", ".hdf5"),
 }
 LOSSY_SUFFIXES = (".jpg", ".jpeg")
 DEFAULTS: Mapping[Kind, str] = {"labels": "labels/{model}/{name}", "scores": "scores/{model}/{name}"}
@@ -162,7 +172,7 @@ def find_sources(
         )  # fmt: skip
     if options.ground_truth and GROUND_TRUTH not in sources:
         truth = Template("ground_truth", options.ground_truth, ("scene", "name"), ("name",))
-        source = LabelSource.of("labels", entry.folder, truth.filled(scene=entry.below_root), frames, folders)
+        source = LabelSource.of("truth", entry.folder, truth.filled(scene=entry.below_root), frames, folders)
         sources |= {GROUND_TRUTH: source} if source.first is not None else {}
     return sources
 
@@ -254,7 +264,7 @@ class LabelMaps:
     """The predictions for the frames of a scene: the label sources, their classes, and the maps in their own pixels.
 
     Attributes:
-        class_ids: A table by label source, from the ids of its files to those of its taxonomy, where they differ.
+        truth: What the format says of its ground truth.
         folders: The listed content of the folders where maps may be.
         own: Folders of label maps by the label source that they are, besides those that templates find.
 
@@ -267,9 +277,9 @@ class LabelMaps:
         options: LabelOptions,
         entry: SceneEntry,
         frames: Sequence[Named],
-        class_ids: Mapping[str, UInt16],
         folders: Folders,
         own: Mapping[str, Path],
+        truth: Truth = NO_TRUTH,
     ) -> None:
         labels, base = find_sources(options, entry, frames, folders, own), options.labels_root or entry.folder
         template = Template("regions", REGIONS, ("model", "name"), ("model", "name"))
@@ -283,7 +293,7 @@ class LabelMaps:
         self.models = tuple(name for name in labels if name != GROUND_TRUTH)
         self.ground_truth = GROUND_TRUTH in labels
         self.regions = tuple(regions)
-        self.class_ids = class_ids
+        self.truth = truth
         self.unread = None if self.models else unread_labels(options, entry, frames)
         self._options = options
         self._folder = entry.folder
@@ -343,6 +353,8 @@ class LabelMaps:
         for parent in file.parents[: 1 + frame.count("/")]:  # a frame's name may be a path: cam0/0001
             if (classes := parent / LABEL_SPACE_FILE).is_file():
                 return LabelSpace.load(classes)
+        if model == GROUND_TRUTH and self.truth.space is not None:
+            return self.truth.space
         try:
             if options.classes is not None:
                 return LabelSpace(name="classes of the scene", classes=options.classes)
@@ -368,16 +380,25 @@ class LabelMaps:
             )
         return space
 
-    def labels(self, model: str, path: Path, read: Read, own: FrameSize = ANY_SIZE) -> Labels:
-        """Return ids (H, W) of one file, whose bytes `read` gives; `own` has the sizes that it may have.
+    def class_ids(self, model: str) -> UInt16 | None:
+        """Return the table from the ids of the files of a label source to those of its taxonomy, where they differ."""
+        return self.truth.ids if model == GROUND_TRUTH else None
+
+    def labels(
+        self, model: str, path: Path, read: Read, own: FrameSize = ANY_SIZE, frame: FrameSource | None = None
+    ) -> Labels:
+        """Return ids (H, W) of one file of a frame, whose bytes `read` gives; `own` has the sizes that it may have.
 
         Raises:
             DataError: If that fails; the message names it.
         """
         void = self._options.void_ids.get(model, ())
-        labels = images.read_labels(path, self.space(model), read, own, void)
-        if model in self.class_ids:
-            ids: Labels = self.class_ids[model][labels]
+        if model == GROUND_TRUTH and self.truth.read is not None and frame is not None:
+            labels = self.truth.read(frame, path, read)
+        else:
+            labels = images.read_labels(path, self.space(model), read, own, void)
+        if (table := self.class_ids(model)) is not None:
+            ids: Labels = table[labels]
             if (unknown := ids == NO_ID).any():
                 raise DataError(
                     f"{path}: the id {labels[unknown][0]} is not in the table of classes; is it the right table?"
@@ -404,5 +425,17 @@ class LabelMaps:
         return scores
 
     def mask_file(self, frame: Named) -> Path | None:
-        """Return the mask of a frame, where it has one."""
+        """Return the mask of a frame, or the ground truth that says what moves, where it has one."""
+        if self._masks is None and self.truth.moving and self.ground_truth:
+            return self._sources[GROUND_TRUTH].file(frame)
         return None if self._masks is None else self._masks.file(frame)
+
+    def mask(self, frame: FrameSource, path: Path, read: Read, own: FrameSize = ANY_SIZE) -> Mask:
+        """Return (H, W) True where a frame is left out by that file; raises DataError with the file."""
+        if self._masks is not None:
+            return images.read_mask(path, read, own)
+        if self.truth.read is None:
+            stored = images.read_labels(path, self.space(GROUND_TRUTH), read, own)
+        else:
+            stored = self.truth.read(frame, path, read)
+        return np.isin(stored, list(self.truth.moving))

@@ -13,12 +13,13 @@ from pydantic import Field, PositiveInt, model_validator
 
 from semstab.config import Settings
 from semstab.core.files import file_digest
-from semstab.core.types import Float32
+from semstab.core.types import Float32, UInt16
+from semstab.data.labels import LabelSpace
 from semstab.datasets import GROUND_TRUTH
 from semstab.datasets.formats.disk import natural, read_bytes, subfolders
 from semstab.datasets.formats.images import Read
 from semstab.datasets.geometry.cameras import Camera, Poses
-from semstab.datasets.geometry.lenses import Lens
+from semstab.datasets.geometry.lenses import Labels, Lens
 from semstab.errors import ConfigError, DataError
 
 Positive = Annotated[float, Field(gt=0, le=1e30)]
@@ -320,3 +321,27 @@ class FrameSource:
     timestamp: float | None = None
     confidence: Path | None = None
     least_confidence: int = 0
+
+
+LabelReader = Callable[[FrameSource, Path, Read], Labels]
+"""Gives stored ids (H, W) at the pixels of a frame's depth of a file, and of what reads its content."""
+
+
+@dataclass(frozen=True, eq=False)
+class Truth:
+    """What a format says of its ground truth, where the files are not label maps of the ids of a taxonomy.
+
+    Attributes:
+        read: Gives the stored ids of a file, where it is no label map.
+        ids: Table (65536,) from stored ids to those of the classes, `NO_ID` for an id that is none.
+        space: The classes, where no option says others for the ground truth.
+        moving: Stored ids of what moves; its pixels are masked where no option names other masks.
+    """
+
+    read: LabelReader | None = None
+    ids: UInt16 | None = None
+    space: LabelSpace | None = None
+    moving: Collection[int] = ()
+
+
+NO_TRUTH = Truth()

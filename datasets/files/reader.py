@@ -13,10 +13,9 @@ import numpy as np
 
 from semstab.config import nearest
 from semstab.core.files import cache_folder
-from semstab.core.types import UInt16
 from semstab.data.georeference import Georeference
 from semstab.datasets.files.labels import SceneEntry
-from semstab.datasets.files.options import FileOptions, Folders, FrameSource, inside
+from semstab.datasets.files.options import NO_TRUTH, FileOptions, Folders, FrameSource, Truth, inside
 from semstab.datasets.files.scene import FileScene
 from semstab.datasets.files.surfaces import SEEN_FROM_ABOVE, Surface
 from semstab.datasets.formats.disk import files_named, natural, subfolders
@@ -131,7 +130,7 @@ class FileDataset(ScenesBelow[Options]):
         self, entry: SceneEntry, frames: Sequence[FrameSource], options: FileOptions, surface: Surface | None
     ) -> FileScene:
         """Return the scene of these frames."""
-        return FileScene(entry, frames, options, self.class_ids(), surface)
+        return FileScene(entry, frames, options, self.truth(entry.folder), surface)
 
     def settled(self, folder: Path) -> FileOptions:
         """Return the options with which a scene's folder is read."""
@@ -166,9 +165,9 @@ class FileDataset(ScenesBelow[Options]):
         """Return whether a folder of depth images is there, or is not needed, as a surface gives the depth."""
         return self.options.surface is not None or folder.is_dir()
 
-    def class_ids(self) -> Mapping[str, UInt16]:
-        """Return by label source a table (65536,) from its files' ids to those of its taxonomy, where they differ."""
-        return {}
+    def truth(self, folder: Path) -> Truth:
+        """Return what the format says of the ground truth of a scene's folder; raises DataError with the file."""
+        return NO_TRUTH
 
     def frames_of_scene(self, entry: SceneEntry) -> Iterable[FrameSource]:
         """Return the frames of a scene, by default all of its folder. Raises what `frames` raises."""

@@ -15,12 +15,12 @@ import numpy as np
 
 from semstab.core.arrays import RecentArrays
 from semstab.core.prefetch import prefetch
-from semstab.core.types import Float32, Float64, UInt8, UInt16
+from semstab.core.types import Float32, Float64, UInt8
 from semstab.data.frames import Frame, Intrinsics
 from semstab.data.labels import LabelSpace
 from semstab.datasets.files.depth import shape_of, stored_depth, stored_scale
 from semstab.datasets.files.labels import LabelMaps, SceneEntry, label_paths
-from semstab.datasets.files.options import FileOptions, Folders, FrameSource
+from semstab.datasets.files.options import NO_TRUTH, FileOptions, Folders, FrameSource, Truth
 from semstab.datasets.files.surfaces import Surface, View
 from semstab.datasets.formats import disk
 from semstab.datasets.formats.disk import read_pose
@@ -35,7 +35,6 @@ from semstab.datasets.formats.images import (
     depth_size,
     read_color,
     read_confidence,
-    read_mask,
 )
 from semstab.datasets.geometry.cameras import UP_AXES, Camera, Poses, to_camera_to_world
 from semstab.datasets.geometry.lenses import (
@@ -71,7 +70,7 @@ class FileScene(Scene):
         entry: Its name and its folder.
         frames: The files of its frames.
         options: The settings by which they are read.
-        class_ids: Tables of class ids by label source, where they are not those of its taxonomy.
+        truth: What the format says of its ground truth.
         surface: What depth is cast at, if that is not stored.
         folders: Where files are looked up and read.
         label_folders: Folders of label maps, one file a frame, by the label source that they are.
@@ -88,7 +87,7 @@ class FileScene(Scene):
         entry: SceneEntry,
         frames: Sequence[FrameSource],
         options: FileOptions,
-        class_ids: Mapping[str, UInt16] | None = None,
+        truth: Truth = NO_TRUTH,
         surface: Surface | None = None,
         folders: Folders | None = None,
         label_folders: Mapping[str, Path] | None = None,
@@ -103,7 +102,7 @@ class FileScene(Scene):
         self.up = np.array(UP_AXES[options.up_axis], dtype=np.float64) if options.up_axis else None
         self._frames = frames
         self._folders = folders or Folders()
-        self._maps = LabelMaps(options, entry, frames, class_ids or {}, self._folders, label_folders or {})
+        self._maps = LabelMaps(options, entry, frames, self._folders, label_folders or {}, truth)
         self.models = self._maps.models
         self.ground_truth = self._maps.ground_truth
         self.regions = self._maps.regions
@@ -186,14 +185,16 @@ class FileScene(Scene):
         file, kind = self._maps.file(self._frame(index), model), self._maps.source(model).kind
         read = self._reader(index, LABELS + model)
         depth, labels, scores = self.depth(index), None, None
-        if kind == "labels":
+        if kind != "scores":
             own = self._sizes(index, depth.shape, file, "labels are")
-            labels = self._stored(index, self._maps.labels(model, file, read, own), depth.shape, file, "labels are")
+            ids = self._maps.labels(model, file, read, own, self._frame(index))
+            labels = self._stored(index, ids, depth.shape, file, "labels are")
         else:
             own = self._sizes(index, depth.shape, file, "scores are")
             stored = self._maps.scores(model, file, (depth.shape[0], depth.shape[1]), read, own)
             scores = self._stored(index, stored, depth.shape, file, "scores are")
-        return self._framed(index, depth, labels, scores, color=color, files={kind: file})
+        what = "labels" if scores is None else "scores"
+        return self._framed(index, depth, labels, scores, color=color, files={what: file})
 
     def geometry(self, index: int, *, color: bool = False) -> Frame:
         """Return the frame but for its labels: all pixels are of class 0.
@@ -364,7 +365,7 @@ class FileScene(Scene):
         settings = self.options.model_dump(mode="json", exclude=PLACES)
         digest = hashlib.blake2b(digest_size=16)
         digest.update(json.dumps([settings, space.to_dict() if space else None]).encode())
-        if (table := self._maps.class_ids.get(model)) is not None:
+        if (table := self._maps.class_ids(model)) is not None:
             digest.update(table.tobytes())
         files = [self._images(index, model) for index in indices]
         unread = [k for k, own in enumerate(files) if own.keys() - self._digests.keys()]
@@ -430,7 +431,7 @@ class FileScene(Scene):
         mask, masked = self._maps.mask_file(source), None
         if mask is not None:  # outside of the mask's view nothing is masked
             own = self._sizes(index, depth.shape, mask, "the mask is")
-            values = read_mask(mask, self._reader(index, MASK), own).astype(np.uint8)
+            values = self._maps.mask(source, mask, self._reader(index, MASK), own).astype(np.uint8)
             masked = self._stored(index, values, depth.shape, mask, "the mask is") == 1
         shown = image if source.color_lens is None else None  # a distorted one shows another view than the depth
         known = {"depth": self.surface or source.depth, "pose": source.pose_file, "color": shown, "mask": mask}

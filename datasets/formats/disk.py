@@ -356,7 +356,7 @@ def read_intrinsics(path: Path) -> Intrinsics:
         )
     side = 3 if len(numbers) == 9 else 4
     K = np.array(numbers, dtype=np.float64).reshape(side, side)[:3, :3]
-    return _pinhole(path, K)
+    return pinhole(path, K)
 
 
 def read_camera(path: Path) -> tuple[Intrinsics, tuple[int, int] | None]:
@@ -386,10 +386,11 @@ def read_camera(path: Path) -> tuple[Intrinsics, tuple[int, int] | None]:
         raise DataError(
             f"{path}: holds no camera; write width, height and intrinsic_matrix as Open3D does, or fx, fy, cx, cy"
         )
-    return _pinhole(path, K), size
+    return pinhole(path, K), size
 
 
-def _pinhole(path: Path, K: Float64) -> Intrinsics:
+def pinhole(path: Path, K: Float64) -> Intrinsics:
+    """Return intrinsics of a camera matrix (3, 3) of a file; raises DataError with the file."""
     if not np.isfinite(K).all() or K[1, 0] != 0 or K[2].tolist() != [0, 0, 1]:
         raise DataError(f"{path}: {K.tolist()} is no camera matrix; write fx 0 cx 0 fy cy 0 0 1, in rows")
     try:
@@ -444,8 +445,10 @@ def numbered_lines(file: BinaryIO) -> Iterator[tuple[int, str]]:
         yield number, line.decode("utf-8", errors="replace").strip()
 
 
-def read_table(path: Path, columns: int, what: str) -> Float64:
+def read_table(path: Path, columns: int, what: str, heading: str | None = None) -> Float64:
     """Return (n, columns) numbers, apart by whitespace or commas; `what` describes a line in errors.
+
+    A line that begins with the word `heading` is left out.
 
     Raises:
         DataError: For another number of words, or one that is no number; and for no line; the message names the line.
@@ -453,6 +456,8 @@ def read_table(path: Path, columns: int, what: str) -> Float64:
     values = array("d")
     for number, text in records(path):
         words = text.replace(",", " ").split()
+        if words[:1] == [heading]:
+            continue
         if len(words) != columns:
             require_decimal_points(f"{path}: line {number}", text)
             raise DataError(f"{path}: line {number} has {len(words)} values; expected {columns} ({what})")
