@@ -36,7 +36,6 @@ from semstab.metrics.video_flicker import Flows, VideoFlickerMeter
 from semstab.pixels.scans import pictured
 from semstab.statistics import Sampler
 from semstab.statistics.observations import SpotObservations
-from semstab.statistics.voxel_sizes import SizeSample
 from semstab.task import Task, prepare, truth_task
 
 WARM_UP_STRIDE = 8
@@ -66,7 +65,6 @@ class LiveMap:
     sampler: Sampler | None = None
     reference: NumpySample | None = None
     background: Background = field(default_factory=lambda: Background("semstab-reference", 1))
-    sizes: SizeSample | None = None
     hard: FusionBackend | None = None
     rows: Series = field(default_factory=Series)
     observations: int = 0
@@ -90,10 +88,6 @@ class LiveMap:
                 live.reference = NumpySample(config.voxel_size, K, work.within)
         if unit.assessed and work.measures_images:
             live.sampler = Sampler(K)
-            if unit.image_space and not config.frame_quality:
-                live.sizes = SizeSample(
-                    task.indices, config.voxel_size, K
-                )  # filters share the sizes of what they are put over
         return live
 
     @property
@@ -147,9 +141,6 @@ class LiveMap:
         with watch("sample"):
             if self.sampler is not None:
                 self.sampler.add(prepared.frame)
-        if self.sizes is not None:
-            with watch("voxel sizes"):
-                self.sizes.add(prepared.frame)
         if not self.work.fuses and self.work.tile is not None:
             frame, voxel_size = prepared.frame, self.config.voxel_size
             if self.origin is None:
