@@ -55,6 +55,7 @@ def fuse_sequence(fusion: Fusion) -> Iterator[Work]:
                     frame, reports = stream.prepare(fetched), {}
                     for live in (live for live in stream.maps if index in live.frames):
                         with fusion.failing([live]):
+                            live.warm_up(frame.frame)
                             reports[live] = live.integrate(frame, fusion.watch)
                             live.sample(frame, fusion.watch)
                     rows = stream.measure(frame, reports)

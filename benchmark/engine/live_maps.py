@@ -22,7 +22,6 @@ from semstab.core.process import Stopwatch
 from semstab.core.types import Float64, Int32
 from semstab.data.frames import Frame
 from semstab.data.results import FrameReport, UnitName
-from semstab.data.voxels import Extent
 from semstab.datasets import Scene
 from semstab.engine.observer import Observers
 from semstab.engine.series import FrameRow, Series
@@ -81,9 +80,9 @@ class LiveMap:
         config, K = unit.config, len(task.mapping.target)
         live = cls(work, task, frames=_as_set(work.frames))
         if work.fuses:
-            live.backend = new_map(config, K, work.within)
+            live.backend = live.new_map()
             if unit.compares_truth and truth_task(task) is not None:
-                live.truth = new_map(config, K, work.within, log=False)
+                live.truth = live.new_map(log=False)
             if unit.sampled:
                 live.reference = NumpySample(config.voxel_size, K, work.within)
         if unit.assessed and work.measures_images:
@@ -100,17 +99,29 @@ class LiveMap:
         """Its settings."""
         return self.work.unit.config
 
+    def new_map(self, *, log: bool = True) -> FusionBackend:
+        """Return an empty map; it keeps its log where that is to be written, or statistics are computed from it."""
+        config, (backend,), K = self.config, self.config.backends, len(self.task.mapping.target)
+        wanted = log and (config.events or config.statistics) and takes_option(backend.name, "history")
+        options = ({"history": True} if wanted else {}) | backend.options
+        return create(backend.name, voxel_size=config.voxel_size, num_classes=K, within=self.work.within, **options)
+
+    def warm_up(self, frame: Frame) -> None:
+        """Let the backend load and compile what it needs for such frames, once a process: no frame is timed with it."""
+        if self.backend is None:
+            return
+        options, K = json.dumps(self.config.backends[0].options), len(self.task.mapping.target)
+        kind = self.name.backend, options, K, frame.scores is None
+        if kind not in _warm:
+            _warm.add(kind)
+            self.new_map().integrate(frame.every(WARM_UP_STRIDE))
+
     def integrate(self, prepared: Prepared, watch: Stopwatch) -> FrameReport:
         """Fuse a frame, and its ground truth, into the maps."""
-        frame, K = prepared.frame, len(self.task.mapping.target)
+        frame = prepared.frame
         if self.backend is None:
             points = int(np.count_nonzero(frame.valid)) if self.work.tile is None else 0
             return FrameReport(frame.index, points, voxels=0, new_voxels=0, drift_sum=0.0, seconds=0.0, map_voxels=0)
-        config = self.config
-        kind = (self.name.backend, json.dumps(config.backends[0].options), K, frame.scores is None)
-        if kind not in _warm:  # let it load what it compiles, once a process: else the first frame costs more
-            _warm.add(kind)
-            new_map(config, K).integrate(frame.every(WARM_UP_STRIDE))
         self.background.drain()  # it would take the time of the map
         with watch(f"fuse {self.name.backend}"):
             report = self.backend.integrate(frame)
@@ -123,7 +134,7 @@ class LiveMap:
             self.background.submit(partial(self._integrate_reference, self.reference, frame, watch))
         if frame.scores is not None and self.work.unit.image_space:
             with watch("reduced scores"):
-                self.hard = self.hard or new_map(config, K, self.work.within, log=False)
+                self.hard = self.hard or self.new_map(log=False)
                 self.hard.integrate(dataclasses.replace(frame, labels=frame.predicted, scores=None))
         if self.truth is not None and prepared.truth is not None:
             self.truth.integrate(prepared.truth)
@@ -159,14 +170,6 @@ class LiveMap:
         if self.sampler is None:
             return None
         return self.sampler.sample(self.task.mapping.target.classes).without(self.left_out)
-
-
-def new_map(config: Config, num_classes: int, within: Extent | None = None, *, log: bool = True) -> FusionBackend:
-    """Return an empty map; it keeps its log where that is to be written, or statistics are computed from it."""
-    (backend,) = config.backends
-    wanted = log and (config.events or config.statistics) and takes_option(backend.name, "history")
-    options = ({"history": True} if wanted else {}) | backend.options
-    return create(backend.name, voxel_size=config.voxel_size, num_classes=num_classes, within=within, **options)
 
 
 _warm: set[tuple[str, str, int, bool]] = set()
