@@ -116,7 +116,7 @@ class LiveMap:
             _warm.add(kind)
             self.new_map().integrate(frame.every(WARM_UP_STRIDE))
 
-    def integrate(self, prepared: Prepared, watch: Stopwatch) -> FrameReport:
+    def integrate(self, prepared: Decoded, watch: Stopwatch) -> FrameReport:
         """Fuse a frame, and its ground truth, into the maps."""
         frame = prepared.frame
         if self.backend is None:
@@ -147,7 +147,7 @@ class LiveMap:
         with watch("reference"):
             reference.integrate(frame)
 
-    def sample(self, prepared: Prepared, watch: Stopwatch) -> None:
+    def sample(self, prepared: Decoded, watch: Stopwatch) -> None:
         """Keep a sample of what the frame observes."""
         with watch("sample"):
             if self.sampler is not None:
@@ -180,18 +180,21 @@ _warm: set[tuple[str, str, int, bool]] = set()
 
 @dataclass(frozen=True, eq=False)
 class Decoded:
-    """A frame as its scene has it, its ground truth, the model's frame before filters; or the error of decoding it.
+    """A frame with the labels of a model, as its scene has it; `Stream.prepare` makes it one that maps fuse.
 
     Attributes:
+        truth: Its ground truth.
+        model: The model's frame before filters.
         network: Seconds that the model took to predict on it; NaN where labels are read.
+        seconds, waited: Seconds of decoding, in a worker thread, and of waiting for it.
     """
 
-    index: int
-    frame: Frame | None = None
+    frame: Frame
     truth: Frame | None = None
     model: Frame | None = None
-    error: Exception | None = None
     network: float = math.nan
+    seconds: float = math.nan
+    waited: float = math.nan
 
     @property
     def nbytes(self) -> int:
@@ -199,18 +202,8 @@ class Decoded:
         return sum(frame.nbytes for frame in (self.frame, self.truth, self.model) if frame is not None)
 
 
-Decodings = Mapping[str, Decoded]
-"""A frame with the labels of each model that is measured in one pass: one, or of a video all."""
-
-
-@dataclass(frozen=True, eq=False)
-class Prepared:
-    """A frame as maps fuse it: labels in the run's label space, without moving objects; and its ground truth."""
-
-    fetched: Fetched[Decodings]
-    decoded: Decoded
-    frame: Frame
-    truth: Frame | None
+Decodings = Mapping[str, Decoded | Exception]
+"""A frame with the labels of each model that is measured in one pass: one, or of a video all; or why there is none."""
 
 
 class Stream:
@@ -245,24 +238,27 @@ class Stream:
         """(F, 3, 3) down, forward and centre of cameras in the world; of none where up need not be estimated."""
         return self._poses.table().reshape(-1, 3, 3)
 
-    def prepare(self, fetched: Fetched[Decodings]) -> Prepared:
-        """Return the frame as the stream's maps fuse it, with its colour only where an observer wants it."""
+    def prepare(self, fetched: Fetched[Decodings]) -> Decoded:
+        """Return the frame as the stream's maps fuse it: labels in the run's label space, without moving objects.
+
+        It has its colour only where an observer wants it.
+        """
         decoded = fetched.item[self.task.model]
-        if decoded.error is not None:
-            raise decoded.error
-        assert decoded.frame is not None
+        if isinstance(decoded, Exception):
+            raise decoded
         frame, truth = prepare(self.task, decoded.frame, self.pixel_stride), None
         if self.truth_task is not None and decoded.truth is not None:
             truth = prepare(self.truth_task, decoded.truth, self.pixel_stride)
-        if decoded.index == self.shown:
+        if decoded.frame.index == self.shown:
             self.overview = _overview(self.task, decoded.frame)
             wanted = self._observers.want_color or self.wants_color
             frame = frame if wanted else dataclasses.replace(frame, color=None)
-        return Prepared(fetched, decoded, frame, truth)
+        times = {"seconds": fetched.seconds, "waited": fetched.waited}
+        return dataclasses.replace(decoded, frame=frame, truth=truth, **times)
 
-    def measure(self, now: Prepared, reports: Mapping[LiveMap, FrameReport]) -> dict[LiveMap, FrameRow]:
+    def measure(self, now: Decoded, reports: Mapping[LiveMap, FrameReport]) -> dict[LiveMap, FrameRow]:
         """Return flicker and stability in image coordinates with the reports of the maps: a row of each series."""
-        frame, decoded, compensated = now.frame, now.decoded, math.nan
+        frame, compensated = now.frame, math.nan
         with self._watch("flicker") as lap:
             flicker = flicker_in_place(self._previous, frame)
         if self.image_space is not None:
@@ -270,7 +266,7 @@ class Stream:
                 compensated = self.image_space.add(frame, now.truth)
         if self.quality is not None:
             with self._watch("frame quality"):
-                model = frame if decoded.model is None else prepare(self.task, decoded.model, self.pixel_stride)
+                model = frame if now.model is None else prepare(self.task, now.model, self.pixel_stride)
                 self.quality.add(frame, model, now.truth)
         if self.video is not None:
             with self._watch("video measures"):
@@ -286,9 +282,9 @@ class Stream:
                 timestamp=frame.timestamp,
                 flicker_percent=flicker,
                 compensated_flicker_percent=compensated,
-                decode_seconds=now.fetched.seconds,
-                network_seconds=decoded.network,
-                wait_seconds=now.fetched.waited,
+                decode_seconds=now.seconds,
+                network_seconds=now.network,
+                wait_seconds=now.waited,
                 flicker_seconds=lap.seconds,
                 left_out=frame.left_out_pixels,
                 scores_left_out=math.nan if cut is None else cut.mean,
@@ -297,7 +293,7 @@ class Stream:
             for live, report in reports.items()
         }
 
-    def notify(self, now: Prepared, rows: Mapping[LiveMap, FrameRow]) -> None:
+    def notify(self, now: Decoded, rows: Mapping[LiveMap, FrameRow]) -> None:
         """Show the frame to observers, and append each row to the series of its map."""
         seconds = math.nan
         if watched := {live.name: row for live, row in rows.items() if live.work.watched}:
