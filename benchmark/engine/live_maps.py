@@ -253,8 +253,8 @@ class Stream:
             self.overview = _overview(self.task, decoded.frame)
             wanted = self._observers.want_color or self.wants_color
             frame = frame if wanted else dataclasses.replace(frame, color=None)
-        times = {"seconds": fetched.seconds, "waited": fetched.waited}
-        return dataclasses.replace(decoded, frame=frame, truth=truth, **times)
+        seconds, waited = fetched.seconds, fetched.waited
+        return dataclasses.replace(decoded, frame=frame, truth=truth, seconds=seconds, waited=waited)
 
     def measure(self, now: Decoded, reports: Mapping[LiveMap, FrameReport]) -> dict[LiveMap, FrameRow]:
         """Return flicker and stability in image coordinates with the reports of the maps: a row of each series."""
