@@ -9,6 +9,7 @@ Examples:
 from __future__ import annotations
 
 import inspect
+from collections.abc import Mapping
 from functools import partial
 from typing import Any, Protocol, cast
 
@@ -74,6 +75,9 @@ class FusionBackend(Protocol):
 
     A backend that associates pixels and voxels in another way says `pointwise = False`: it is compared with the
     others, but they need not agree.
+
+    A static method `check_options(voxel_size, num_classes, ...)`, with those options that it checks, raises ConfigError
+    for values that no map can have: a run calls it before it reads a frame.
     """
 
     def integrate(self, frame: Frame) -> FrameReport:
@@ -95,6 +99,19 @@ class FusionBackend(Protocol):
         return None
 
 
+def check_options(name: str, *, voxel_size: float, num_classes: int, **options: Any) -> None:
+    """Check the settings of a backend's maps by its `check_options`; the first map of a class without one checks them.
+
+    Raises:
+        ConfigError: For an unknown name or option, and for a value that the backend does not take.
+        MissingDependencyError: If its engine is not installed.
+    """
+    check = getattr(_class(name, options), "check_options", None)
+    if check is not None:
+        taken = inspect.signature(check).parameters
+        check(voxel_size, num_classes, **{option: value for option, value in options.items() if option in taken})
+
+
 def create(
     name: str, *, voxel_size: float, num_classes: int, within: Extent | None = None, **options: Any
 ) -> FusionBackend:
@@ -103,24 +120,13 @@ def create(
     voxel_size in metres, num_classes K >= 2; options are the backend's own (open3d: device, block_resolution).
 
     Raises:
-        ConfigError: For an unknown name or option, and for an extent where the backend does not associate pixel by
-            pixel.
+        ConfigError: For an unknown name or option, a value that the backend does not take, and for an extent where the
+            backend does not associate pixel by pixel.
         MissingDependencyError: If its engine is not installed.
     """
-    cls = REGISTRY.load(name)
-    known = _options(cls)
     if not isinstance(within, Extent | None):
         raise ConfigError(f"backend '{name}' has no option 'within'; the plan sets it")
-    if unknown := sorted(set(options) - set(known)):
-        listed = f"it takes {', '.join(known)}" if known else "it takes none"
-        raise ConfigError(f"backend '{name}' has no option '{unknown[0]}'; {listed}")
-    try:
-        inspect.signature(cls).bind(voxel_size=voxel_size, num_classes=num_classes, **options)
-    except TypeError as error:
-        raise ConfigError(
-            f"backend '{name}' cannot be made with voxel_size and num_classes ({error}): __init__(self, *, voxel_size,"
-            " num_classes)"
-        ) from error
+    cls = _class(name, options)
     make: Any = partial(cls, voxel_size=voxel_size, num_classes=num_classes, **options)
     if within is None:
         return cast(FusionBackend, make())
@@ -131,6 +137,23 @@ def create(
     from semstab.backends.shared.association import Restricted
 
     return Restricted(make(), voxel_size, within)
+
+
+def _class(name: str, options: Mapping[str, Any]) -> Any:
+    """Return the class of that name; raises ConfigError if it has no such options."""
+    cls = REGISTRY.load(name)
+    known = _options(cls)
+    if unknown := sorted(set(options) - set(known) | set(options) & set(GIVEN)):
+        listed = f"it takes {', '.join(known)}" if known else "it takes none"
+        raise ConfigError(f"backend '{name}' has no option '{unknown[0]}'; {listed}")
+    try:
+        inspect.signature(cls).bind(voxel_size=1.0, num_classes=2, **options)
+    except TypeError as error:
+        raise ConfigError(
+            f"backend '{name}' cannot be made with voxel_size and num_classes ({error}): __init__(self, *, voxel_size,"
+            " num_classes)"
+        ) from error
+    return cls
 
 
 def changes_of(backend: FusionBackend) -> Changes | None:

@@ -10,7 +10,8 @@ from __future__ import annotations
 
 import logging
 import time
-from typing import Any, ClassVar
+from functools import cache
+from typing import Any
 
 import numba as nb
 import numpy as np
@@ -40,7 +41,7 @@ from semstab.core.compiled import is_cached, settings
 from semstab.core.types import Float64, Int32, Int64, UInt16
 from semstab.data.events import Events
 from semstab.data.evidence import Evidence
-from semstab.data.frames import Frame, Intrinsics
+from semstab.data.frames import Frame
 from semstab.data.results import Changes, FrameReport
 from semstab.data.voxels import Extent, VoxelTable
 from semstab.errors import ConfigError
@@ -104,8 +105,6 @@ class NumbaHash:
         within: The voxels that the map is restricted to.
     """
 
-    _loaded: ClassVar[bool] = False
-
     def __init__(
         self,
         voxel_size: float,
@@ -115,14 +114,8 @@ class NumbaHash:
         history: bool = False,
         within: Extent | None = None,
     ) -> None:
-        check_settings(voxel_size, num_classes)
-        if evidence not in ("float64", "float32"):
-            raise ConfigError(f"evidence = '{evidence}': use float64 or float32")
-        if threads is not None and not 1 <= threads <= settings.NUMBA_NUM_THREADS:
-            raise ConfigError(f"threads = {threads}: use 1 to {settings.NUMBA_NUM_THREADS}, the threads that numba has")
-        if not (NumbaHash._loaded or is_cached(update)):
-            then = "the result is cached" if update.stats.cache_path else "no folder can be written to cache the result"
-            logging.getLogger("semstab").warning("backend numba: compiling, once (half a minute); %s", then)
+        self.check_options(voxel_size, num_classes, evidence, threads)
+        _announce_compiling()
         self.voxel_size = voxel_size
         self.num_classes = num_classes
         self.threads = threads
@@ -140,7 +133,20 @@ class NumbaHash:
         self._ranges = np.zeros((PARTITIONS, 4), dtype=np.int64)  # two free stretches of nodes: start, end, start, end
         self._last: tuple[Int64, BeliefChange] | None = None
         """Packed keys of the last frame's voxels, which the next frame overwrites, and their changes."""
-        _load_compiled()
+
+    @staticmethod
+    def check_options(
+        voxel_size: float,
+        num_classes: int,
+        evidence: str = "float64",
+        threads: int | None = None,
+    ) -> None:
+        """Raise ConfigError for settings that no map can have."""
+        check_settings(voxel_size, num_classes)
+        if evidence not in ("float64", "float32"):
+            raise ConfigError(f"evidence = '{evidence}': use float64 or float32")
+        if threads is not None and not 1 <= threads <= settings.NUMBA_NUM_THREADS:
+            raise ConfigError(f"threads = {threads}: use 1 to {settings.NUMBA_NUM_THREADS}, the threads that numba has")
 
     @staticmethod
     def expected_bytes(voxels: int, observations: int, num_classes: int, soft: bool = False) -> int:
@@ -284,14 +290,9 @@ def _grow(rows: npt.NDArray[Any], needed: int) -> None:
         rows.resize(max(needed, len(rows) + len(rows) // 4), refcheck=False)
 
 
-def _load_compiled() -> None:
-    """Load the code that fuses labels from numba's cache, or compile it, once a process: no frame waits for it then."""
-    if NumbaHash._loaded:
-        return
-    NumbaHash._loaded = True
-    scratch = NumbaHash(voxel_size=1.0, num_classes=2)
-    labels = np.arange(64, dtype=np.uint8).reshape(8, 8) % 2
-    depth = np.ones((8, 8), dtype=np.float32)
-    scratch.integrate(Frame(index=0, depth=depth, labels=labels, intrinsics=Intrinsics(8, 8, 4, 4), T_wc=np.eye(4)))
-    scratch._make_slots(64)
-    scratch.table()
+@cache
+def _announce_compiling() -> None:
+    """Say, once a process, that the first frame compiles: where numba has not cached the code."""
+    if not is_cached(update):
+        then = "the result is cached" if update.stats.cache_path else "no folder can be written to cache the result"
+        logging.getLogger("semstab").warning("backend numba: compiling, once (half a minute); %s", then)

@@ -46,12 +46,14 @@ class NumpyHistory:
     """The history H(q) of every voxel, from which a table is computed."""
 
     def __init__(self, voxel_size: float, num_classes: int, within: Extent | None = None) -> None:
-        check_settings(voxel_size, num_classes)
+        self.check_options(voxel_size, num_classes)
         self.voxel_size = voxel_size
         self.num_classes = num_classes
         self.within = within
         self._row: defaultdict[bytes, int] = defaultdict(itertools.count().__next__)  # voxel q, as bytes -> its row
         self._history: list[_Seen] = []  # frame after frame
+
+    check_options = staticmethod(check_settings)
 
     def append(self, frame: Frame) -> tuple[Int64, Observations]:
         """Append the frame's observations to the history; return them, and the rows of their voxels."""

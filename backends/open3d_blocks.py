@@ -63,9 +63,7 @@ class Open3DBlocks(FusionBackend):
         self, voxel_size: float, num_classes: int, device: str = "CPU:0", block_resolution: int = 4,
         within: Extent | None = None,
     ) -> None:  # fmt: skip
-        check_settings(voxel_size, num_classes)
-        if not 1 <= block_resolution <= 64:
-            raise ConfigError(f"block_resolution = {block_resolution}: use 1 to 64 (4 suits surfaces)")
+        Open3DBlocks.check_options(voxel_size, num_classes, device, block_resolution)
         self.voxel_size = voxel_size
         self.num_classes = num_classes
         self.block_resolution = block_resolution
@@ -87,6 +85,14 @@ class Open3DBlocks(FusionBackend):
         }
         voxel_bytes = sum(dtype.byte_size() * channels for dtype, channels in self.attributes.values())
         self.grid = self._new_grid(max(LEAST_BLOCKS, INITIAL_BYTES // (voxel_bytes * block_resolution**3)))
+
+    @staticmethod
+    def check_options(voxel_size: float, num_classes: int, device: str = "CPU:0", block_resolution: int = 4) -> None:
+        """Raise ConfigError for settings that no map can have."""
+        check_settings(voxel_size, num_classes)
+        if not 1 <= block_resolution <= 64:
+            raise ConfigError(f"block_resolution = {block_resolution}: use 1 to 64 (4 suits surfaces)")
+        _device(device)
 
     @staticmethod
     def expected_bytes(voxels: int, observations: int, num_classes: int, soft: bool = False) -> int:

@@ -53,10 +53,18 @@ class Open3DProjective(Open3DBlocks):
     def __init__(
         self, voxel_size: float, num_classes: int, device: str = "CPU:0", block_resolution: int = 4, band: float = 1.0
     ) -> None:
+        self.check_options(voxel_size, num_classes, device, block_resolution, band)
         super().__init__(voxel_size, num_classes, device, block_resolution)
+        self._pixels = Projector(voxel_size, num_classes, block_resolution, band)
+
+    @staticmethod
+    def check_options(
+        voxel_size: float, num_classes: int, device: str = "CPU:0", block_resolution: int = 4, band: float = 1.0
+    ) -> None:
+        """Raise ConfigError for settings that no map can have."""
+        Open3DBlocks.check_options(voxel_size, num_classes, device, block_resolution)
         if not (math.isfinite(band) and band > 0):
             raise ConfigError(f"band = {band:g}: it must be positive, in voxels")
-        self._pixels = Projector(voxel_size, num_classes, block_resolution, band)
 
 
 class Projector(Aggregator):

@@ -94,13 +94,7 @@ class TorchMaps:
         if not num_classes:
             raise ConfigError("num_classes names no model; give K of each by its name")
         for K in num_classes.values():
-            check_settings(voxel_size, K)
-        if precision not in ("float64", "float32"):
-            raise ConfigError(f"precision = '{precision}': use float64 or float32")
-        if memory_gb is not None and not memory_gb > 0:
-            raise ConfigError(f"memory_gb = {memory_gb:g}: it must be positive")
-        if reserve < 0:
-            raise ConfigError(f"reserve = {reserve}: it is a number of voxels")
+            TorchMap.check_options(voxel_size, K, device, precision, memory_gb, reserve)
         self.voxel_size = voxel_size
         self.device = device_of(device)
         self._dtype = torch.float64 if precision == "float64" else torch.float32
@@ -292,6 +286,25 @@ class TorchMap(FusionBackend):
     ) -> None:
         self.num_classes = num_classes
         self.maps = TorchMaps(voxel_size, {"": num_classes}, device, precision, memory_gb, reserve)
+
+    @staticmethod
+    def check_options(
+        voxel_size: float,
+        num_classes: int,
+        device: str | None = None,
+        precision: str = "float64",
+        memory_gb: float | None = None,
+        reserve: int = 0,
+    ) -> None:
+        """Raise ConfigError for settings that no map can have."""
+        check_settings(voxel_size, num_classes)
+        if precision not in ("float64", "float32"):
+            raise ConfigError(f"precision = '{precision}': use float64 or float32")
+        if memory_gb is not None and not memory_gb > 0:
+            raise ConfigError(f"memory_gb = {memory_gb:g}: it must be positive")
+        if reserve < 0:
+            raise ConfigError(f"reserve = {reserve}: it is a number of voxels")
+        device_of(device)
 
     @property
     def voxel_size(self) -> float:

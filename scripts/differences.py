@@ -20,7 +20,9 @@ from typing import Any
 import numpy as np
 import yaml
 
-RENAMED: dict[str, str | None] = {}
+RENAMED: dict[str, str | None] = {
+    "sizes": None,  # runs do not fuse frames again at half and twice the voxel size: `check` judges the size
+}
 """Key, column, file, header or word of the kept revision -> its name now; None: gone by design (say why in a comment).
 
 `parent.key` goes before `key`; the parent of a column is the stem of its file, or the folder if that is in FOLDERS. A

@@ -232,6 +232,17 @@ def test_options_that_cannot_be_used_are_refused(name, options, message):
     assert not backends.takes_option("numpy", "device")
     with pytest.raises(ConfigError, match=message):
         backends.create(name, voxel_size=1.0, num_classes=3, **options)
+    with pytest.raises(ConfigError, match=message):
+        backends.check_options(name, voxel_size=1.0, num_classes=3, **options)
+
+
+@pytest.mark.parametrize("name", ["numpy", "numba", "open3d", "open3d-projective"])
+def test_options_are_checked_without_a_map(name):
+    cls = backends.REGISTRY.load(name)
+    with patch.object(cls, "__init__", autospec=True, side_effect=AssertionError("a map was made")):
+        backends.check_options(name, voxel_size=1.0, num_classes=3)
+        with pytest.raises(ConfigError, match="voxel_size = 0"):
+            backends.check_options(name, voxel_size=0.0, num_classes=3)
 
 
 @pytest.mark.parametrize("name", ["numba", "open3d"])

@@ -39,16 +39,16 @@ def test_the_estimate_holds_for_a_flight_and_saturates_over_one_place(tmp_path) 
     root = tiny_scene.write(tmp_path / "wall", models=("a",), frames=60)
     plan, config = planned(root, voxel_size=0.05, pixel_stride=1)
     table = semstab.run(config, report=False).runs[0].table
-    *_, size = memory.map_sizes(plan.tasks[0], plan.units[0].config)
+    size = memory.map_size(plan.tasks[0], plan.units[0].config)
     assert size.voxels == pytest.approx(table.voxels, rel=0.3)
     assert size.observations == pytest.approx(table.observations, rel=0.3)
     still = dataclasses.replace(plan.tasks[0], indices=[0] * 60)
-    *_, size = memory.map_sizes(still, plan.units[0].config)
+    size = memory.map_size(still, plan.units[0].config)
     assert size.voxels == pytest.approx(48)
 
 
-def test_a_flight_in_legs_is_looked_at_until_their_overlap_is_seen(root, monkeypatch) -> None:
-    """A few frames far apart see no overlap; of 12 legs of 20 frames, each sees 20 by 20 voxels."""
+def test_the_overlap_of_a_flight_in_legs_is_seen(root, monkeypatch) -> None:
+    """Of 12 legs of 20 frames, each frame sees 20 by 20 voxels, and overlaps with those of the legs beside it."""
     plan, _ = planned(root)
     x, y = (axis.ravel() for axis in np.indices((20, 20)))
 
@@ -59,11 +59,10 @@ def test_a_flight_in_legs_is_looked_at_until_their_overlap_is_seen(root, monkeyp
     monkeypatch.setattr(memory, "_geometry", lambda task, settings, index: index)
     monkeypatch.setattr(memory, "voxels_in", lambda index, voxel_size: seen(index))
     flight = dataclasses.replace(plan.tasks[0], indices=[*range(240)])
-    first, *_, last = memory.map_sizes(flight, plan.units[0].config)
+    size = memory.map_size(flight, plan.units[0].config)
     true = len(np.unique(np.concatenate([seen(index) for index in range(240)]), axis=0))
-    assert first.voxels > 1.3 * true
-    assert last.voxels == pytest.approx(true, rel=0.1)
-    assert last.observations == pytest.approx(240 * 400)
+    assert size.voxels == pytest.approx(true, rel=0.1)
+    assert size.observations == pytest.approx(240 * 400)
 
 
 def test_of_large_frames_a_part_is_looked_at(root, monkeypatch) -> None:
@@ -75,7 +74,7 @@ def test_of_large_frames_a_part_is_looked_at(root, monkeypatch) -> None:
 
     monkeypatch.setattr(memory, "_geometry", lambda task, settings, index: index)
     monkeypatch.setattr(memory, "voxels_in", lambda index, voxel_size: seen(index))
-    *_, size = memory.map_sizes(dataclasses.replace(plan.tasks[0], indices=[*range(10)]), plan.units[0].config)
+    size = memory.map_size(dataclasses.replace(plan.tasks[0], indices=[*range(10)]), plan.units[0].config)
     assert size.voxels == pytest.approx(570 * 300 * 3, rel=0.03)
     assert size.by_column == 3
 
@@ -111,7 +110,7 @@ def test_tiles_are_as_large_as_the_memory_allows_and_as_many_as_processes_need(r
 
 def test_one_frame_is_enough_where_there_is_ample_room(root, monkeypatch) -> None:
     plan, config = planned(root)
-    monkeypatch.setattr(memory, "map_sizes", lambda *_: pytest.fail("frames were read"))
+    monkeypatch.setattr(memory, "map_size", lambda *_: pytest.fail("frames were read"))
     sizing = memory.planned_sizes(config, plan.units, 1)
     assert not sizing.tile_sizes
     assert not sizing.refused

@@ -77,7 +77,7 @@ def test_a_study_of_everything_has_every_table(tables_of_walls):
     assert [table.name for table in tables_of_walls] == [
         "overview", "verdicts", "flicker", "scenes", "persistence", "classes", "temporal_agreement",
         "correlogram", "class_agreement", "drift", "frames", "uncertainty", "ceiling", "correctness", "quadrants",
-        "cross_model", "sensitivity_voxel_size", "sensitivity_depth_noise", "sensitivity_frame_count", "voxel_sizes",
+        "cross_model", "sensitivity_voxel_size", "sensitivity_depth_noise", "sensitivity_frame_count",
         "fusion", "agreement",
     ]  # fmt: skip
 

@@ -275,7 +275,7 @@ RESERVED = frozenset((
     "evidence", "files", "flicker_percent", "frames", "frames_empty", "frames_left_out", "fuse_ms_per_frame",
     "image_space", "input", "iou", "key", "label", "left_out", "mean_op", "means", "miou", "model", "name", "notes",
     "observation_accuracy", "observations", "op", "pixels", "points", "precision", "psa", "quality", "recurrent",
-    "reduced", "sbd_excess", "sbd_null", "scene", "scores_left_out", "series", "share", "sizes", "stages_ms",
+    "reduced", "sbd_excess", "sbd_null", "scene", "scores_left_out", "series", "share", "stages_ms",
     "statistics", "strata", "summary", "table", "taxonomy", "truth_file", "unit", "up", "variation",
     "video_measures", "voxel_alpha", "voxel_size", "voxels", "voxels_file", "well_seen", "wrong_of_consistent",
 ))  # fmt: skip

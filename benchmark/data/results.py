@@ -186,8 +186,8 @@ class UnitSummary:
     stages_ms has mean milliseconds a frame by stage, see `STAGES`; left_out counts the pixels that were left out of
     fusion because what they show moves, frames_left_out the selected frames without a file or a pose, frames_empty
     the fused ones of which no pixel was valid; scores_left_out is there with `top_k`; statistics is what
-    `semstab.statistics.describe` reports of the map, None where it was not asked for; sizes tells whether half or twice
-    the voxel size would give another result; reduced is there for soft scores.
+    `semstab.statistics.describe` reports of the map, None where it was not asked for; reduced is there for soft
+    scores.
     """
 
     unit: UnitName = field(metadata=INLINE)
@@ -202,7 +202,6 @@ class UnitSummary:
     frames_empty: int = 0
     scores_left_out: LeftOut | None = None
     statistics: MapStatistics | None = None
-    sizes: tuple[SizeAlpha, ...] = ()
     reduced: ReducedScores | None = None
 
     def __repr__(self) -> str:
@@ -268,15 +267,6 @@ class VoxelAdvice:
     stays: float
     suggested: float | None
     chosen: bool
-
-
-@dataclass(frozen=True)
-class SizeAlpha:
-    """Krippendorff's alpha of some frames, evenly spaced, in voxels of one size; NaN where it is not defined."""
-
-    voxel_size: float
-    frames: int
-    voxel_alpha_op2: float
 
 
 @dataclass(frozen=True)

@@ -55,6 +55,7 @@ def fuse_sequence(fusion: Fusion) -> Iterator[Work]:
                     frame, reports = stream.prepare(fetched), {}
                     for live in (live for live in stream.maps if index in live.frames):
                         with fusion.failing([live]):
+                            live.warm_up(frame.frame)
                             reports[live] = live.integrate(frame, fusion.watch)
                             live.sample(frame, fusion.watch)
                     rows = stream.measure(frame, reports)
@@ -98,13 +99,13 @@ class Fusion:
     def decoded_frames(self) -> Generator[Fetched[Decodings], None, None]:
         """Yield frames in order, decoded ahead by threads."""
         fetched = prefetch(
-            self._decode, self.order, threads=self._threads, size=lambda each: sum(own.nbytes for own in each.values())
+            self._decode, self.order, threads=self._threads, size=lambda each: sum(own.nbytes for own in _of(each))
         )
         with contextlib.ExitStack() as stack:
             for model in dict.fromkeys(stream.task.model for stream in self.streams):
                 stack.enter_context(self._scene.reading(self.order, model))
             for each in stack.enter_context(contextlib.closing(fetched)):
-                in_network = min(each.waited, sum(own.network for own in each.item.values() if own.network > 0))
+                in_network = min(each.waited, sum(own.network for own in _of(each.item) if own.network > 0))
                 self.watch.seconds["read"] += each.waited - in_network
                 if in_network:
                     self.watch.seconds["network"] += in_network
@@ -114,16 +115,16 @@ class Fusion:
         """Decode a frame in a worker thread, with the labels of each model; its image and truth are decoded once."""
         wanting = [stream for stream in self.streams if index in stream.frames]
         color = self._observers.want_color or any(stream.wants_color or stream.shown == index for stream in wanting)
-        decodings: dict[str, Decoded] = {}
+        decodings: dict[str, Decoded | Exception] = {}
         for model in dict.fromkeys(stream.task.model for stream in wanting):
             own = [stream for stream in wanting if stream.task.model == model]
-            known = next((each for each in decodings.values() if each.error is None), None)
+            known = next(_of(decodings), None)
             decodings[model] = self._decoded(index, model, own, known, color=color)
         return decodings
 
     def _decoded(
         self, index: int, model: str, wanting: Sequence[Stream], known: Decoded | None, *, color: bool
-    ) -> Decoded:
+    ) -> Decoded | Exception:
         """Decode a model's frame; an error fails the units that need the frame, not those that do not."""
         scene, same = self._scene, None if known is None else known.frame
         try:
@@ -135,9 +136,9 @@ class Fusion:
             measures_quality = any(stream.quality is not None for stream in wanting)
             name = scene.filtering(model).model if measures_quality else model  # without filters
             unfiltered = None if name == model else scene.frame(index, name, color=False)
-            return Decoded(index, frame, truth, unfiltered, network=scene.prediction_seconds(index, model))
+            return Decoded(frame, truth, unfiltered, network=scene.prediction_seconds(index, model))
         except Exception as error:  # noqa: BLE001 - raised again by `Stream.prepare`
-            return Decoded(index, error=error)
+            return error
 
     @contextlib.contextmanager
     def failing(self, maps: Sequence[LiveMap]) -> Iterator[None]:
@@ -171,6 +172,11 @@ class Fusion:
                 with self.failing([largest]):
                     raise self._budget.outgrown(largest)
         return any(stream.maps for stream in self.streams)
+
+
+def _of(decodings: Decodings) -> Iterator[Decoded]:
+    """Yield what could be decoded."""
+    return (each for each in decodings.values() if isinstance(each, Decoded))
 
 
 # --- Open scenes ------------------------------------------------------------------------------------------------------

@@ -22,7 +22,6 @@ from semstab.core.process import Stopwatch
 from semstab.core.types import Float64, Int32
 from semstab.data.frames import Frame
 from semstab.data.results import FrameReport, UnitName
-from semstab.data.voxels import Extent
 from semstab.datasets import Scene
 from semstab.engine.observer import Observers
 from semstab.engine.series import FrameRow, Series
@@ -36,7 +35,6 @@ from semstab.metrics.video_flicker import Flows, VideoFlickerMeter
 from semstab.pixels.scans import pictured
 from semstab.statistics import Sampler
 from semstab.statistics.observations import SpotObservations
-from semstab.statistics.voxel_sizes import SizeSample
 from semstab.task import Task, prepare, truth_task
 
 WARM_UP_STRIDE = 8
@@ -66,7 +64,6 @@ class LiveMap:
     sampler: Sampler | None = None
     reference: NumpySample | None = None
     background: Background = field(default_factory=lambda: Background("semstab-reference", 1))
-    sizes: SizeSample | None = None
     hard: FusionBackend | None = None
     rows: Series = field(default_factory=Series)
     observations: int = 0
@@ -83,17 +80,13 @@ class LiveMap:
         config, K = unit.config, len(task.mapping.target)
         live = cls(work, task, frames=_as_set(work.frames))
         if work.fuses:
-            live.backend = new_map(config, K, work.within)
+            live.backend = live.new_map()
             if unit.compares_truth and truth_task(task) is not None:
-                live.truth = new_map(config, K, work.within, log=False)
+                live.truth = live.new_map(log=False)
             if unit.sampled:
                 live.reference = NumpySample(config.voxel_size, K, work.within)
         if unit.assessed and work.measures_images:
             live.sampler = Sampler(K)
-            if unit.image_space and not config.frame_quality:
-                live.sizes = SizeSample(
-                    task.indices, config.voxel_size, K
-                )  # filters share the sizes of what they are put over
         return live
 
     @property
@@ -106,17 +99,29 @@ class LiveMap:
         """Its settings."""
         return self.work.unit.config
 
-    def integrate(self, prepared: Prepared, watch: Stopwatch) -> FrameReport:
+    def new_map(self, *, log: bool = True) -> FusionBackend:
+        """Return an empty map; it keeps its log where that is to be written, or statistics are computed from it."""
+        config, (backend,), K = self.config, self.config.backends, len(self.task.mapping.target)
+        wanted = log and (config.events or config.statistics) and takes_option(backend.name, "history")
+        options = ({"history": True} if wanted else {}) | backend.options
+        return create(backend.name, voxel_size=config.voxel_size, num_classes=K, within=self.work.within, **options)
+
+    def warm_up(self, frame: Frame) -> None:
+        """Let the backend load and compile what it needs for such frames, once a process: no frame is timed with it."""
+        if self.backend is None:
+            return
+        options, K = json.dumps(self.config.backends[0].options), len(self.task.mapping.target)
+        kind = self.name.backend, options, K, frame.scores is None
+        if kind not in _warm:
+            _warm.add(kind)
+            self.new_map().integrate(frame.every(WARM_UP_STRIDE))
+
+    def integrate(self, prepared: Decoded, watch: Stopwatch) -> FrameReport:
         """Fuse a frame, and its ground truth, into the maps."""
-        frame, K = prepared.frame, len(self.task.mapping.target)
+        frame = prepared.frame
         if self.backend is None:
             points = int(np.count_nonzero(frame.valid)) if self.work.tile is None else 0
             return FrameReport(frame.index, points, voxels=0, new_voxels=0, drift_sum=0.0, seconds=0.0, map_voxels=0)
-        config = self.config
-        kind = (self.name.backend, json.dumps(config.backends[0].options), K, frame.scores is None)
-        if kind not in _warm:  # let it load what it compiles, once a process: else the first frame costs more
-            _warm.add(kind)
-            new_map(config, K).integrate(frame.every(WARM_UP_STRIDE))
         self.background.drain()  # it would take the time of the map
         with watch(f"fuse {self.name.backend}"):
             report = self.backend.integrate(frame)
@@ -129,7 +134,7 @@ class LiveMap:
             self.background.submit(partial(self._integrate_reference, self.reference, frame, watch))
         if frame.scores is not None and self.work.unit.image_space:
             with watch("reduced scores"):
-                self.hard = self.hard or new_map(config, K, self.work.within, log=False)
+                self.hard = self.hard or self.new_map(log=False)
                 self.hard.integrate(dataclasses.replace(frame, labels=frame.predicted, scores=None))
         if self.truth is not None and prepared.truth is not None:
             self.truth.integrate(prepared.truth)
@@ -142,14 +147,11 @@ class LiveMap:
         with watch("reference"):
             reference.integrate(frame)
 
-    def sample(self, prepared: Prepared, watch: Stopwatch) -> None:
+    def sample(self, prepared: Decoded, watch: Stopwatch) -> None:
         """Keep a sample of what the frame observes."""
         with watch("sample"):
             if self.sampler is not None:
                 self.sampler.add(prepared.frame)
-        if self.sizes is not None:
-            with watch("voxel sizes"):
-                self.sizes.add(prepared.frame)
         if not self.work.fuses and self.work.tile is not None:
             frame, voxel_size = prepared.frame, self.config.voxel_size
             if self.origin is None:
@@ -170,14 +172,6 @@ class LiveMap:
         return self.sampler.sample(self.task.mapping.target.classes).without(self.left_out)
 
 
-def new_map(config: Config, num_classes: int, within: Extent | None = None, *, log: bool = True) -> FusionBackend:
-    """Return an empty map; it keeps its log where that is to be written, or statistics are computed from it."""
-    (backend,) = config.backends
-    wanted = log and (config.events or config.statistics) and takes_option(backend.name, "history")
-    options = ({"history": True} if wanted else {}) | backend.options
-    return create(backend.name, voxel_size=config.voxel_size, num_classes=num_classes, within=within, **options)
-
-
 _warm: set[tuple[str, str, int, bool]] = set()
 
 
@@ -186,18 +180,21 @@ _warm: set[tuple[str, str, int, bool]] = set()
 
 @dataclass(frozen=True, eq=False)
 class Decoded:
-    """A frame as its scene has it, its ground truth, the model's frame before filters; or the error of decoding it.
+    """A frame with the labels of a model, as its scene has it; `Stream.prepare` makes it one that maps fuse.
 
     Attributes:
+        truth: Its ground truth.
+        model: The model's frame before filters.
         network: Seconds that the model took to predict on it; NaN where labels are read.
+        seconds, waited: Seconds of decoding, in a worker thread, and of waiting for it.
     """
 
-    index: int
-    frame: Frame | None = None
+    frame: Frame
     truth: Frame | None = None
     model: Frame | None = None
-    error: Exception | None = None
     network: float = math.nan
+    seconds: float = math.nan
+    waited: float = math.nan
 
     @property
     def nbytes(self) -> int:
@@ -205,18 +202,8 @@ class Decoded:
         return sum(frame.nbytes for frame in (self.frame, self.truth, self.model) if frame is not None)
 
 
-Decodings = Mapping[str, Decoded]
-"""A frame with the labels of each model that is measured in one pass: one, or of a video all."""
-
-
-@dataclass(frozen=True, eq=False)
-class Prepared:
-    """A frame as maps fuse it: labels in the run's label space, without moving objects; and its ground truth."""
-
-    fetched: Fetched[Decodings]
-    decoded: Decoded
-    frame: Frame
-    truth: Frame | None
+Decodings = Mapping[str, Decoded | Exception]
+"""A frame with the labels of each model that is measured in one pass: one, or of a video all; or why there is none."""
 
 
 class Stream:
@@ -251,24 +238,27 @@ class Stream:
         """(F, 3, 3) down, forward and centre of cameras in the world; of none where up need not be estimated."""
         return self._poses.table().reshape(-1, 3, 3)
 
-    def prepare(self, fetched: Fetched[Decodings]) -> Prepared:
-        """Return the frame as the stream's maps fuse it, with its colour only where an observer wants it."""
+    def prepare(self, fetched: Fetched[Decodings]) -> Decoded:
+        """Return the frame as the stream's maps fuse it: labels in the run's label space, without moving objects.
+
+        It has its colour only where an observer wants it.
+        """
         decoded = fetched.item[self.task.model]
-        if decoded.error is not None:
-            raise decoded.error
-        assert decoded.frame is not None
+        if isinstance(decoded, Exception):
+            raise decoded
         frame, truth = prepare(self.task, decoded.frame, self.pixel_stride), None
         if self.truth_task is not None and decoded.truth is not None:
             truth = prepare(self.truth_task, decoded.truth, self.pixel_stride)
-        if decoded.index == self.shown:
+        if decoded.frame.index == self.shown:
             self.overview = _overview(self.task, decoded.frame)
             wanted = self._observers.want_color or self.wants_color
             frame = frame if wanted else dataclasses.replace(frame, color=None)
-        return Prepared(fetched, decoded, frame, truth)
+        seconds, waited = fetched.seconds, fetched.waited
+        return dataclasses.replace(decoded, frame=frame, truth=truth, seconds=seconds, waited=waited)
 
-    def measure(self, now: Prepared, reports: Mapping[LiveMap, FrameReport]) -> dict[LiveMap, FrameRow]:
+    def measure(self, now: Decoded, reports: Mapping[LiveMap, FrameReport]) -> dict[LiveMap, FrameRow]:
         """Return flicker and stability in image coordinates with the reports of the maps: a row of each series."""
-        frame, decoded, compensated = now.frame, now.decoded, math.nan
+        frame, compensated = now.frame, math.nan
         with self._watch("flicker") as lap:
             flicker = flicker_in_place(self._previous, frame)
         if self.image_space is not None:
@@ -276,7 +266,7 @@ class Stream:
                 compensated = self.image_space.add(frame, now.truth)
         if self.quality is not None:
             with self._watch("frame quality"):
-                model = frame if decoded.model is None else prepare(self.task, decoded.model, self.pixel_stride)
+                model = frame if now.model is None else prepare(self.task, now.model, self.pixel_stride)
                 self.quality.add(frame, model, now.truth)
         if self.video is not None:
             with self._watch("video measures"):
@@ -292,9 +282,9 @@ class Stream:
                 timestamp=frame.timestamp,
                 flicker_percent=flicker,
                 compensated_flicker_percent=compensated,
-                decode_seconds=now.fetched.seconds,
-                network_seconds=decoded.network,
-                wait_seconds=now.fetched.waited,
+                decode_seconds=now.seconds,
+                network_seconds=now.network,
+                wait_seconds=now.waited,
                 flicker_seconds=lap.seconds,
                 left_out=frame.left_out_pixels,
                 scores_left_out=math.nan if cut is None else cut.mean,
@@ -303,7 +293,7 @@ class Stream:
             for live, report in reports.items()
         }
 
-    def notify(self, now: Prepared, rows: Mapping[LiveMap, FrameRow]) -> None:
+    def notify(self, now: Decoded, rows: Mapping[LiveMap, FrameRow]) -> None:
         """Show the frame to observers, and append each row to the series of its map."""
         seconds = math.nan
         if watched := {live.name: row for live, row in rows.items() if live.work.watched}:

@@ -85,8 +85,6 @@ def finish(live: LiveMap, stream: Stream, watch: Stopwatch) -> Work:
             raise no_voxels(live.task, config)
         if fused is not None and not config.statistics:  # else columns of the statistics go along
             beside.submit(partial(files.write, _map_savers(live, fused, None)))
-        with watch("voxel sizes"):
-            sizes = () if live.sizes is None else live.sizes.alphas()
         with watch("statistics"):
             if fused is not None and work.unit.assessed:
                 log = fused.events if config.statistics else None
@@ -101,7 +99,6 @@ def finish(live: LiveMap, stream: Stream, watch: Stopwatch) -> Work:
         result = TileResult(
             {},
             None if fused is None or fused.checked is None else fused.checked.result(),
-            sizes,
             _quality(stream),
             live.origin,
             None if stream.video is None else stream.video.result(),
@@ -276,7 +273,6 @@ def record_of(unit: Unit, task: Task, rows: Series, result: TileResult, analysis
         scores_left_out=None if np.isnan(cut).all() else LeftOut(mean(cut), float(np.nanmax(most))),
         statistics=None if analysis is None else analysis.summary,
         reduced=_reduced(result.reduced) if len(result.reduced) else None,
-        sizes=result.sizes,
     )
     return Record(
         unit_key(unit.identity, task.digest),

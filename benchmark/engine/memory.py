@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, NamedTuple
 
@@ -125,14 +125,8 @@ def voxels_in(frame: Frame, voxel_size: float) -> Int64:
 DOUBT = 10
 """A sequence whose frames might see that many times the voxels of the first one, all new, is surely small enough."""
 
-SAMPLED, MOST_SAMPLED = 24, 192
-"""Frames, evenly spaced, from which the size of a map is estimated: first, and where that leaves doubt."""
-
-CERTAIN = 1.2
-"""An estimate that is at most so many times what the sampled frames see needs no more frames."""
-
-PAIRS = 8
-"""Frames of the sample that are looked at with their successors."""
+SAMPLED, PAIRS = 192, 8
+"""Frames, evenly spaced, from which the size of a map is estimated; those that are read with their successors."""
 
 DRAWN = 1 << 13
 """Voxels of a frame, about, that are looked at."""
@@ -192,10 +186,10 @@ def _plan_sizes(config: Config, group: Sequence[Unit], width: int, sizing: Sizin
             return
         if soft and read(task, task.indices[0], settings.pixel_stride).scores is not None:
             break
-    for size in map_sizes(task, settings):
-        needed = sum(kind.whole(size.voxels, size.observations) for kind in kinds)
-        if needed <= free:
-            return
+    size = map_size(task, settings)
+    needed = sum(kind.whole(size.voxels, size.observations) for kind in kinds)
+    if needed <= free:
+        return
     takes = (
         f"{task.scene.name}, {task.model}: about {size.voxels / 1e6:.2g} million voxels of {settings.voxel_size:g} m"
         f" would take {needed / GB:.2g} GB"
@@ -268,34 +262,29 @@ def _tile_edge(kind: MapMemory, size: MapSize, budget: float, width: int) -> int
     return edge
 
 
-def map_sizes(task: Task, settings: Config) -> Iterator[MapSize]:
-    """Yield estimates of the size of a map, each from twice the frames of the one before, until there is no doubt.
+def map_size(task: Task, settings: Config) -> MapSize:
+    """Estimate the size of a map from evenly spaced frames.
 
-    Frames are evenly spaced. There are no more voxels than if each frame added as many as the second one of two
-    successive frames adds to the first.
+    There are no more voxels than if each frame added as many as the second one of two successive frames adds to the
+    first.
     """
-    frames, seen_by, one_in = len(task.indices), dict[int, Int32](), 0
-    for step in (8, 4, 2, 1):
-        sampled = evenly(frames, MOST_SAMPLED)[::step]
-        if len(sampled) < min(SAMPLED, frames):
-            continue
-        following = [k + 1 for k in sampled[:: -(-len(sampled) // PAIRS)] if k + 1 < frames]
-        missing = sorted({*sampled, *following} - seen_by.keys())
-        ahead = prefetch(lambda k: _geometry(task, settings, task.indices[k]), missing, threads=settings.threads)
-        for k, fetched in zip(missing, ahead, strict=True):
-            whole = voxels_in(fetched.item, settings.voxel_size)
-            one_in = one_in or max(1, len(whole) // DRAWN)
-            seen_by[k] = _drawn(whole, one_in)
-        seen = [seen_by[k] for k in sampled]
-        together = np.concatenate(seen)
-        distinct, columns = count_distinct(together), count_distinct(together[:, :2])
-        each = float(np.mean([len(own) for own in seen]))
-        new = [_count((seen_by[k - 1], seen_by[k])) - len(seen_by[k - 1]) for k in following]
-        most = each + (frames - 1) * (float(np.mean(new)) if new else 0.0)
-        voxels = max(float(distinct), min(_of_all_frames(seen, distinct, frames), most))
-        yield MapSize(one_in * voxels, one_in * frames * each, distinct / max(columns, 1))
-        if voxels <= CERTAIN * distinct:
-            return
+    frames, seen, one_in = len(task.indices), dict[int, Int32](), 0
+    sampled = evenly(frames, SAMPLED)
+    following = [k + 1 for k in sampled[:: -(-len(sampled) // PAIRS)] if k + 1 < frames]
+    wanted = sorted({*sampled, *following})
+    ahead = prefetch(lambda k: _geometry(task, settings, task.indices[k]), wanted, threads=settings.threads)
+    for k, fetched in zip(wanted, ahead, strict=True):
+        whole = voxels_in(fetched.item, settings.voxel_size)
+        one_in = one_in or max(1, len(whole) // DRAWN)
+        seen[k] = _drawn(whole, one_in)
+    own = [seen[k] for k in sampled]
+    together = np.concatenate(own)
+    distinct, columns = count_distinct(together), count_distinct(together[:, :2])
+    each = float(np.mean([len(voxels) for voxels in own]))
+    new = [_count((seen[k - 1], seen[k])) - len(seen[k - 1]) for k in following]
+    most = each + (frames - 1) * (float(np.mean(new)) if new else 0.0)
+    voxels = max(float(distinct), min(_of_all_frames(own, distinct, frames), most))
+    return MapSize(one_in * voxels, one_in * frames * each, distinct / max(columns, 1))
 
 
 def _of_all_frames(seen: Sequence[Int32], distinct: int, frames: int) -> float:

@@ -17,7 +17,7 @@ from semstab.core.json_form import from_json, to_json
 from semstab.core.types import Float64, Int32
 from semstab.data.frames import Frame
 from semstab.data.records import FrameQuality, VideoMeasures
-from semstab.data.results import Agreement, SizeAlpha
+from semstab.data.results import Agreement
 from semstab.engine.series import NUMBERS, Series
 from semstab.errors import DataError
 
@@ -84,7 +84,6 @@ class TileMeta:
 
     files: Mapping[str, str]
     checked: Agreement | None = None
-    sizes: tuple[SizeAlpha, ...] = ()
     quality: FrameQuality | None = None
     origin: tuple[int, int, int] | None = None
     video_measures: VideoMeasures | None = None

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
 
-from semstab.backends import create, is_pointwise, keeps_log
+from semstab.backends import check_options, is_pointwise, keeps_log
 from semstab.config import (
     BACKENDS,
     BASE,
@@ -185,7 +185,7 @@ def make_plan(config: Config, scenes: Mapping[str, Scene] | None = None) -> Plan
     """
     for backend in config.fused_by():  # a missing engine is reported before all else
         if backend != NO_MAP:
-            create(backend.name, voxel_size=config.voxel_size, num_classes=2, **backend.options)
+            check_options(backend.name, voxel_size=config.voxel_size, num_classes=2, **backend.options)
     scenes = open_scenes(config, posed=False) if scenes is None else scenes
     config = fitting(config, scenes)
     _check_names(config.scene_frames, [*scenes], "scene_frames")

@@ -15,7 +15,7 @@ from semstab.report.tables.correctness import ceiling, correctness, correlogram
 from semstab.report.tables.filters import filter_tables
 from semstab.report.tables.flicker import flicker
 from semstab.report.tables.paper import paper
-from semstab.report.tables.sensitivity import reduced, sensitivity, voxel_sizes
+from semstab.report.tables.sensitivity import reduced, sensitivity
 from semstab.report.tables.stability import classes, cross_model, overview, persistence, scenes
 from semstab.report.tables.statistics import (
     class_agreement,
@@ -49,7 +49,7 @@ __all__ = [
 BUILDERS = (
     overview, paper, verdicts, flicker, video_measures, scenes, persistence, classes, temporal_agreement, correlogram,
     class_agreement, merges, ranges, drift, frames, uncertainty, ceiling, correctness, cross_model, sensitivity,
-    voxel_sizes, reduced, fusion, compared, agreement,
+    reduced, fusion, compared, agreement,
 )  # fmt: skip
 """The functions that make tables, in the paper's order; without numbers for its tables a function returns none."""
 

@@ -1,4 +1,4 @@
-"""Make the tables of the same data with other settings: sweeps, other voxel sizes, soft scores reduced to labels."""
+"""Make the tables of the same data with other settings: sweeps, and soft scores reduced to labels."""
 
 from __future__ import annotations
 
@@ -93,7 +93,7 @@ def _sweep_row(sweep: Sweep, level: Level, *, assessed: bool) -> Row:
     )
 
 
-# The same map with other settings: soft scores reduced to labels, other voxel sizes.
+# The same map with soft scores reduced to labels.
 
 
 def reduced(result: Result) -> list[Table]:
@@ -124,23 +124,3 @@ def _reduced_row(record: Record) -> Row:
         return record.unit.scene, reduced.vss_all, reduced.vss_op3, reduced.voxel_alpha_op2
     alpha = math.nan if statistics is None else statistics.agreement.voxel_alpha_op2.value
     return record.unit.scene, table[VSS], table.recurrent[VSS], alpha
-
-
-def voxel_sizes(result: Result) -> list[Table]:
-    """Return alpha at half, once and twice the voxel size, from some frames."""
-    groups = tuple(
-        Group(name, rows)
-        for name, records in by_model(result.select()).items()
-        if (
-            rows := tuple(
-                (r.unit.scene, s.voxel_size, s.frames, s.voxel_alpha_op2) for r in records for s in r.summary.sizes
-            )
-        )
-    )
-    columns = (Column("scene", "Scene"), Column("voxel_size", "Voxel (m)", 4), Column("frames", "Frames", 0))
-    caption = "The table shows Krippendorff's alpha of the same frames in voxels of other sizes."
-    return (
-        [Table("voxel_sizes", "Other voxel sizes", caption, (*columns, Column.of(VOXEL_ALPHA)), groups)]
-        if groups
-        else []
-    )

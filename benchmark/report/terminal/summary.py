@@ -29,7 +29,6 @@ STAGE_NAMES = {
     "read": "reading",
     "check": "data check",
     "reference": "check of the backend",
-    "voxel sizes": "other voxel sizes",
     "write": "writing",
 }
 
