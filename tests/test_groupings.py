@@ -11,8 +11,7 @@ import pytest
 import yaml
 from command_line import bench, error_of
 from posed_writer import write_posed
-from simulated_events import spots_of
-from simulated_scene import grid
+from simulated_events import grid, spots_of
 
 import semstab
 from semstab.data.statistics import CONFIDENCE
@@ -45,7 +44,7 @@ def sampled(labels, K=5):
 def test_coincidences_are_those_of_all_pairs_of_views():
     rng = np.random.default_rng(0)
     labels = rng.integers(-1, 3, (40, 5))
-    spots = sampled(labels.clip(-1), K=3) if len(labels) == 36 else spots_of(labels, 3)
+    spots = spots_of(labels, 3)
     pairs = np.zeros((3, 3))
     for row in labels:
         seen = row[row >= 0]
@@ -53,7 +52,6 @@ def test_coincidences_are_those_of_all_pairs_of_views():
             pairs[seen[a], seen[b]] += 1 / (len(seen) - 1)
     found = halves_of(spots, sums_of_spots(spots))
     assert found.sum(axis=0) == pytest.approx(pairs)
-    assert np.count_nonzero(found.sum(axis=(1, 2))) == 2  # each half has some
 
 
 def test_alpha_of_groups_is_that_of_the_labels_of_groups():
@@ -113,21 +111,22 @@ def test_labels_at_random_have_no_groups_on_which_views_agree():
         assert max(merge.alpha for merge in found.merges) < 0.1
 
 
-def test_what_is_promised_of_groups_is_kept_where_they_were_not_chosen():
-    """Merges chosen on one flight have the stated alpha on another flight over the same place, in the mean."""
-    stated, kept = [], []
-    for seed in range(12):
-        rng = np.random.default_rng(seed)
-        one = flight(rng, side=16, frames=4, confused=0.35, wrong=0.15)
-        spots = sampled(one)
-        found = groupings(spots, sums_of_spots(spots))
-        again = sampled(flight(np.random.default_rng(seed), side=16, frames=40, confused=0.35, wrong=0.15))
-        for n, merge in enumerate(found.merges):
-            whole = Coincidences.of(halves_of(spots, sums_of_spots(spots)).sum(axis=0))
+def test_the_choice_of_merges_does_not_flatter():
+    """Merges chosen on one flight have at least the stated alpha on a long flight over the same place, in the mean."""
+    stated, kept, chosen = [], [], []
+    for seed in range(10):
+        spots, again = (
+            sampled(flight(np.random.default_rng(seed), side=40, frames=frames, confused=0.35, wrong=0.15))
+            for frames in (4, 30)
+        )
+        whole = Coincidences.of(halves_of(spots, sums_of_spots(spots)).sum(axis=0))
+        for n, merge in enumerate(groupings(spots, sums_of_spots(spots)).merges):
             group = groups_after(5, merges_of(whole)[: n + 1])
             stated.append(merge.alpha)
+            chosen.append(whole.merged(group).alpha())
             kept.append(value(sums_of_spots(grouped(again, group)), "alpha"))
-    assert np.mean(stated) == pytest.approx(np.mean(kept), abs=0.02)
+    assert np.mean(kept) - 0.05 < np.mean(stated) < np.mean(kept) + 0.005
+    assert np.mean(stated) < np.mean(chosen)
 
 
 def test_two_classes_have_nothing_to_merge():
@@ -182,7 +181,7 @@ def test_a_run_with_the_groups_as_taxonomy_has_the_alpha_that_was_promised(home)
     written = yaml.safe_load((home / "groups.yaml").read_text())
     assert [entry["name"] for entry in written["classes"]] == ["wall", "door + curtain", "window + blinds"]
     bench("wall", "--voxel-size", "0.1", "--taxonomy", "groups.yaml", "-o", "again", cwd=home)
-    (before,), (after,) = (semstab.load(home / name).select() for name in ("run", "again"))
+    (before,), (after,) = (semstab.load_result(home / name).select() for name in ("run", "again"))
     promised = before.statistics.groupings.told.alpha
     assert after.statistics.verdict.level == "stable"
     assert after.statistics.headline.alpha.value == pytest.approx(promised.value, abs=0.02)
