@@ -12,6 +12,7 @@ import numpy as np
 
 from semstab.config import Config, Exclusion, Part, Perturbation, as_range, nearest
 from semstab.core.types import Mask
+from semstab.data.distances import distances_of
 from semstab.data.frames import Frame
 from semstab.data.labels import LabelMapping, LabelSpace
 from semstab.data.results import UnitName
@@ -101,6 +102,7 @@ def tasks_of(scene: Scene, config: Config, others: Sequence[str] = ()) -> Iterat
         source = scene.label_space(model)
         target = source if config.taxonomy is None else LabelSpace.load(config.taxonomy)
         mapping = source.mapping_to(target)
+        distances_of(target, config.distances)  # a file that cannot be used is named before any frame is read
         predicted = [*dict.fromkeys((*source.classes, *target.classes))]
         for setting, known in (("classes", target.classes), ("predicted_classes", predicted)):
             for name in getattr(config.exclude, setting):

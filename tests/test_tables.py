@@ -75,8 +75,8 @@ def test_the_walls_tables_are_as_in_the_golden_file(tables_of_walls, suffix):
 
 def test_a_study_of_everything_has_every_table(tables_of_walls):
     assert [table.name for table in tables_of_walls] == [
-        "overview", "verdicts", "flicker", "scenes", "persistence", "classes", "temporal_agreement",
-        "correlogram", "class_agreement", "merges", "drift", "frames", "uncertainty", "ceiling", "correctness", "quadrants",
+        "overview", "verdicts", "flicker", "scenes", "persistence", "classes", "temporal_agreement", "correlogram",
+        "class_agreement", "merges", "drift", "frames", "uncertainty", "ceiling", "correctness", "quadrants",
         "cross_model", "sensitivity_voxel_size", "sensitivity_depth_noise", "sensitivity_frame_count",
         "fusion", "agreement",
     ]  # fmt: skip

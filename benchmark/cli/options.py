@@ -221,6 +221,9 @@ class Measurement:
     taxonomy: Annotated[str | None, typer.Option(
         help="Taxonomy to fuse in: a name or a YAML file.", show_default="the dataset's; city: uavid7",
         autocompletion=taxonomies, rich_help_panel=SETTINGS)] = None
+    distances: Annotated[str | None, typer.Option(
+        metavar="FILE", help="Distances between classes: a table .csv or .npy, or embeddings .npy.",
+        show_default="of the taxonomy's groups", rich_help_panel=SETTINGS)] = None
     voxel_size: VoxelSize = None
     pixel_stride: Annotated[int | None, typer.Option(
         help="Use every n-th pixel of each axis.", show_default="1", rich_help_panel=SETTINGS)] = None
@@ -258,7 +261,8 @@ class Measurement:
         """Return the settings of a run by their names in a file of settings."""
         named = {
             "backends": backends, "scenes": source.scene, "models": source.model, "taxonomy": self.taxonomy,
-            "voxel_size": self.voxel_size, "pixel_stride": self.pixel_stride, "top_k": self.top_k,
+            "distances": self.distances, "voxel_size": self.voxel_size, "pixel_stride": self.pixel_stride,
+            "top_k": self.top_k,
             "check": self.check, "events": self.events, "statistics": self.statistics,
             "video_measures": self.video_measures, "scope": self.scope,
             "check_geometry": False if self.trust_geometry else None,

@@ -84,7 +84,7 @@ def _filled(sample: SpotObservations, asked: SpotObservations, ignored: Float64)
     further = asked.only(np.repeat(np.arange(len(asked)), ignored.astype(np.int64)))
     none = np.full(len(further), sample.K, np.uint16)
     further = dataclasses.replace(further, label=none, neighbour=none, beyond=none)
-    return dataclasses.replace(SpotObservations.stacked([sample, further]), K=sample.K + 1, classes=())
+    return dataclasses.replace(SpotObservations.stacked([sample, further]), K=sample.K + 1, classes=(), distances=None)
 
 
 def psa_bounds(log: Events) -> tuple[float, float]:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 
 from semstab.data.measures import ENTROPY, RECURRENT, VSS, Quantity, measures
-from semstab.statistics.agreement import ALPHA, PSA, VOXEL_ALPHA
+from semstab.statistics.agreement import ALPHA, ALPHA_BY_MEANING, PSA, VOXEL_ALPHA
 from semstab.statistics.correctness import ACCURACY, ECE, MIOU
 
 RECURRENT_VSS = Quantity(key="vss", title="VSS", better="higher", op=RECURRENT, digits=VSS.digits)
@@ -25,7 +25,8 @@ PRECISION = Quantity(key="precision", title="Precision", better="higher", needs=
 IOU = Quantity(key="iou", title="IoU", better="higher", needs="truth", op=2)
 
 HEADLINES = (
-    ALPHA, PSA, RECURRENT_VSS, SBD_EXCESS, FLICKER, COVERAGE, ACCURACY, MIOU, ECE, MISLEADING, VOXEL_ALPHA,
+    ALPHA, ALPHA_BY_MEANING, PSA, RECURRENT_VSS, SBD_EXCESS, FLICKER, COVERAGE, ACCURACY, MIOU, ECE, MISLEADING,
+    VOXEL_ALPHA,
 )  # fmt: skip
 """Measures that every table shows; verdicts rest on the first."""
 
@@ -43,7 +44,19 @@ def by_name(chosen: Sequence[Quantity]) -> Mapping[str, Quantity]:
     return {quantity.name: quantity for quantity in chosen}
 
 
-IN_SUMS = (ALPHA, VOXEL_ALPHA, PSA, RECURRENT_VSS, SBD_EXCESS, ENTROPY, ACCURACY, MIOU, ECE, MISLEADING)
+IN_SUMS = (
+    ALPHA,
+    ALPHA_BY_MEANING,
+    VOXEL_ALPHA,
+    PSA,
+    RECURRENT_VSS,
+    SBD_EXCESS,
+    ENTROPY,
+    ACCURACY,
+    MIOU,
+    ECE,
+    MISLEADING,
+)
 """Measures that follow from the sums by frame and location alone."""
 
 ONE_AGAINST_ALL = (ALPHA, VOXEL_ALPHA, RECALL, PRECISION, IOU)

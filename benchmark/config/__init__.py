@@ -161,6 +161,9 @@ class Config(Settings):
     )
     tolerance: float = Field(1e-9, ge=0, description="largest difference at which two backends agree")
     taxonomy: str | None = Field(None, description="label space to fuse in; the dataset's own where not given")
+    distances: str | None = Field(
+        None, description="distances between classes: .csv or .npy; those of the taxonomy's groups where not given"
+    )
     shared_taxonomy: str | None = Field(None, description="label space in which models are compared; null: none")
     voxel_size: float = Field(
         0.2, ge=1e-9, le=1e9, description="edge, metres; where not given, the suggestion of `check` for data of files"

@@ -130,6 +130,7 @@ class LabelSpace:
         colors: RGB of each class.
         members: Names, for each class, of other taxonomies that fall into it.
         ignored: Names of other taxonomies that are left out.
+        groups: The group of each class, 'vehicle/two wheels', from which distances between classes follow; '' for none.
 
     Raises:
         ConfigError: If these contradict each other.
@@ -146,6 +147,7 @@ class LabelSpace:
     colors: tuple[Color, ...] = ()
     members: tuple[tuple[str, ...], ...] = ()
     ignored: tuple[str, ...] = ()
+    groups: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
         K = len(self.classes)
@@ -157,7 +159,8 @@ class LabelSpace:
         object.__setattr__(self, "ids", self.ids or tuple(range(K)))
         object.__setattr__(self, "colors", self.colors or palette(K))
         object.__setattr__(self, "members", self.members or ((),) * K)
-        for what in ("ids", "colors", "members"):
+        object.__setattr__(self, "groups", self.groups or ("",) * K)
+        for what in ("ids", "colors", "members", "groups"):
             if len(getattr(self, what)) != K:
                 raise ConfigError(f"taxonomy {self.name}: {len(getattr(self, what))} {what} for {K} classes")
         if len(set(self.ids)) != K or min(self.ids) < 0 or max(self.ids) >= IGNORE_16BIT:
@@ -193,9 +196,11 @@ class LabelSpace:
             raise ConfigError(f"{where}: unknown key {reprlib.repr(unknown[0])}; known: {', '.join(known)}")
         entries = [entry if isinstance(entry, dict) else {"name": entry} for entry in content["classes"]]
         for entry in entries:
-            if not isinstance(entry.get("name"), str) or set(entry) - {"name", "id", "color", "members"}:
+            known_keys = {"name", "id", "color", "members", "group"}
+            texts = (entry.get("name"), entry.get("group", ""))
+            if not all(isinstance(text, str) for text in texts) or set(entry) - known_keys:
                 got = reprlib.repr(entry)
-                raise ConfigError(f"{where}: a class needs a name, and may have id, color, members; got {got}")
+                raise ConfigError(f"{where}: a class needs a name, and may have id, color, members, group; got {got}")
         return cls(
             name=str(content.get("name", Path(where).stem)),
             classes=tuple(entry["name"] for entry in entries),
@@ -205,12 +210,16 @@ class LabelSpace:
             ),
             members=tuple(_names(entry.get("members", []), where) for entry in entries),
             ignored=_names(content.get("ignored", []), where),
+            groups=tuple(entry.get("group", "") for entry in entries),
         )
 
     def to_dict(self) -> dict[str, Any]:
         """Return the content of a taxonomy file; `from_dict` reads it back."""
-        rows = zip(self.classes, self.ids, self.colors, self.members, strict=True)
-        classes = [{"name": n, "id": i, "color": list(c), "members": list(m)} for n, i, c, m in rows]
+        rows = zip(self.classes, self.ids, self.colors, self.members, self.groups, strict=True)
+        classes: list[dict[str, Any]] = [
+            {"name": n, "id": i, "color": list(c), "members": list(m)} | ({"group": g} if g else {})
+            for n, i, c, m, g in rows
+        ]
         return {"name": self.name, "classes": classes, "ignored": list(self.ignored)}
 
     @property

@@ -20,6 +20,7 @@ from semstab.core.background import Background
 from semstab.core.prefetch import Fetched
 from semstab.core.process import Stopwatch
 from semstab.core.types import Float64, Int32
+from semstab.data.distances import distances_of
 from semstab.data.frames import Frame
 from semstab.data.results import FrameReport, UnitName
 from semstab.datasets import Scene
@@ -169,7 +170,9 @@ class LiveMap:
         """Return the sampled observations, without the locations that are left out."""
         if self.sampler is None:
             return None
-        return self.sampler.sample(self.task.mapping.target.classes).without(self.left_out)
+        space = self.task.mapping.target
+        sample = self.sampler.sample(space.classes, distances_of(space, self.config.distances))
+        return sample.without(self.left_out)
 
 
 _warm: set[tuple[str, str, int, bool]] = set()

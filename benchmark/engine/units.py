@@ -26,6 +26,7 @@ from semstab.config import (
     Sweeps,
 )
 from semstab.core.code import Code
+from semstab.data.distances import distances_of
 from semstab.data.labels import LabelSpace
 from semstab.data.measures import measures
 from semstab.data.records import REGIONS, Variation
@@ -46,12 +47,12 @@ OF_MAPS = (
 )  # fmt: skip
 """Settings that a video, which has no map, does not use."""
 
-FORMAT = 13
+FORMAT = 14
 """Part of every key: raise it with any change of the numbers that a unit's settings and input lead to, and with a
 setting's default."""
 
 NOT_IN_KEYS = {
-    "dataset", "scenes", "models", "region_maps", "backends", "taxonomy", "frames", "scene_frames",
+    "dataset", "scenes", "models", "region_maps", "backends", "taxonomy", "distances", "frames", "scene_frames",
     "name", "description", "benchmark", "check", "tolerance", "shared_taxonomy", "sweeps", "seed", "events",
 }  # fmt: skip
 """Settings that no number of a unit follows from. What the first ones select is in its key: the digest of the input,
@@ -361,13 +362,15 @@ def _check_count(variation: Variation, task: Task) -> None:
 def identity(config: Config, task: Task) -> str:
     """Return the hash of the settings that a unit's numbers depend on in addition to its input."""
     mapping, filtering = task.mapping, task.scene.filtering(task.model)
-    content = {
+    content: dict[str, Any] = {
         "unit": dataclasses.asdict(task.units[0]),
         "options": config.backends[0].options,
         **({} if config.backends[0].code is None else {"code": Code.load(config.backends[0].code, "backend").digest}),
         "frames": [*task.indices],
         "taxonomy": [mapping.target.name, mapping.target.classes, mapping.source.ids, mapping.rows],
     }
+    if (distances := distances_of(mapping.target, config.distances)) is not None:
+        content["distances"] = distances.tolist()
     truth = truth_task(task) if config.truth else None
     compared = {} if truth is None else {"truth": truth.mapping.rows}
     beside = {"beside": filtering.model} if config.frame_quality else {}

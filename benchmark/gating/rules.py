@@ -23,7 +23,7 @@ from semstab.comparison.quantities import (
 from semstab.config import nearest
 from semstab.data.measures import ENTROPY, Quantity
 from semstab.errors import ConfigError
-from semstab.statistics.agreement import ALPHA, PSA, VOXEL_ALPHA
+from semstab.statistics.agreement import ALPHA, ALPHA_BY_MEANING, PSA, VOXEL_ALPHA
 from semstab.statistics.cluster_sums import summed
 from semstab.statistics.correctness import ACCURACY, ECE, MIOU
 
@@ -59,6 +59,7 @@ class GateMeasure:
 MEASURES = (
     GateMeasure(PSA, "psa"),
     GateMeasure(ALPHA, "alpha", of_class=True),
+    GateMeasure(ALPHA_BY_MEANING, "alpha by meaning", if_missing="run it with distances between classes (--distances)"),
     GateMeasure(RECURRENT_VSS, "vss"),
     GateMeasure(VOXEL_ALPHA, "voxel alpha", of_class=True),
     GateMeasure(ENTROPY, "entropy"),

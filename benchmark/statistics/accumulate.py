@@ -34,6 +34,7 @@ from semstab.statistics.cluster_sums import (
     width,
 )
 from semstab.statistics.intervals import estimate
+from semstab.statistics.meaning import add_meaning
 from semstab.statistics.observations import SpotObservations
 
 # Cubes of space over any set of voxels, and intervals for these frames of any statistic of their sums.
@@ -158,7 +159,10 @@ def with_spots(whole: ClusterSums, spots: SpotObservations, edge: float | None =
     """
     logs = spots.logs()
     cubes = Cubes.of_log(logs[0][0], edge)
-    answers = (replace(_sums_of_log(log, cubes, square=square), classes=whole.classes) for log, square in logs)
+    answers = (
+        replace(_sums_of_log(log, cubes, square=square, distances=spots.distances), classes=whole.classes)
+        for log, square in logs
+    )
     return replace(whole, answers=tuple(answers))
 
 
@@ -183,10 +187,12 @@ def _sums_of_log(
     true_label: Int64 | None = None,
     likely: Float64 | None = None,
     square: Float64 | None = None,
+    distances: Float64 | None = None,
 ) -> ClusterSums:
     """Return the sums by cube and group of frames of the locations of a log, whose dominant classes are `fused`.
 
-    square (m,) are the squared distances of answers from their spots, whose sums are kept, too.
+    square (m,) are the squared distances of answers from their spots, whose sums are kept, too; distances (K, K) are
+    those between classes, whose sums are kept, too.
     """
     from semstab.core.compiled import in_chunks
     from semstab.statistics.loops.clusters import add_influences
@@ -198,7 +204,7 @@ def _sums_of_log(
     again = np.flatnonzero(cubes.at >= 0)
     order = again[np.argsort(cubes.at[again], kind="stable")]
     bounds = np.concatenate([[0], np.cumsum(np.bincount(cubes.at[again], minlength=cubes.count))])
-    slices = layout(K, truth=truth)
+    slices = layout(K, truth=truth, meaning=distances is not None)
     sums = np.zeros((cubes.count * len(groups), width(slices)))
     longest = int((events.ends - events.starts).max(initial=0))
     own = np.zeros(0, np.int64) if fused is None else fused
@@ -212,6 +218,8 @@ def _sums_of_log(
         counted = np.flatnonzero(cubes.at[events.voxel] >= 0)
         at = cubes.at[events.voxel[counted]].astype(np.int64) * len(groups) + group[counted]
         sums[:, slices["square"].start] = np.bincount(at, square[counted], len(sums))
+    if distances is not None:
+        add_meaning(events, cubes.at, group, len(groups), distances, slices, sums)
     rows = np.flatnonzero(sums[:, slices["observations"].start])
     cell, frame = np.divmod(rows, max(len(groups), 1))
     return ClusterSums(

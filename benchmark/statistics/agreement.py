@@ -25,6 +25,9 @@ KAPPA = Quantity(key="kappa", title="Kappa", better="higher", digits=(2, 4))
 ALPHA = Quantity(key="alpha", title="Alpha", better="higher", digits=(3, 4))
 """The agreement of two views at the same spot beyond chance: the number that decides, see `docs/metrics.md`."""
 
+ALPHA_BY_MEANING = Quantity(key="alpha_by_meaning", title="Alpha by meaning", better="higher", digits=(3, 4))
+"""The same with distances between classes, where they are given: see `docs/open-vocabulary.md`."""
+
 VOXEL_ALPHA = Quantity(key="voxel_alpha", title="Voxel alpha", better="higher", digits=(3, 4), op=2)
 """Krippendorff's alpha of the voxels of a map, which depends on their size."""
 
@@ -154,6 +157,20 @@ def alpha_of(sums: Float64) -> Float64:
     with np.errstate(invalid="ignore", divide="ignore"):
         expected = ((sums[..., 3:] ** 2).sum(axis=-1) - sums[..., 2]) / (n * (n - 1))
     return beyond_chance(1 - ratio_of(sums[..., :2]), 1 - expected)
+
+
+def meaning_alpha_of(sums: Float64) -> Float64:
+    """Return alpha (...,) with distances between classes, which are points: sums (..., 4 + 2 K) of `MEANING_SUMS`.
+
+    With points z and squared distances d(a, b) = |z_a|^2 + |z_b|^2 - 2 z_a . z_b, alpha = 1 - mean d of two labels of
+    one spot / mean d of two labels of anywhere (Krippendorff 2018, Content Analysis, ch. 12). The last K coordinates
+    count negatively.
+    """
+    n, K = sums[..., 1], (sums.shape[-1] - 4) // 2
+    with np.errstate(invalid="ignore", divide="ignore"):
+        total = (sums[..., 4 : 4 + K] ** 2).sum(axis=-1) - (sums[..., 4 + K :] ** 2).sum(axis=-1)
+        norm, apart = sums[..., 3] / n, (total - sums[..., 2]) / (n * (n - 1))
+        return beyond_chance(norm - sums[..., 0] / n, norm - apart)
 
 
 def class_alpha_of(sums: Float64) -> Float64:

@@ -204,9 +204,8 @@ def grouped(spots: SpotObservations, group: Int64) -> SpotObservations:
     """Return the answers with groups (K,) of classes in place of classes; an answer without a label stays without."""
     K = int(group.max()) + 1
     of = np.concatenate([group, [K]]).astype(np.uint16)
-    return dataclasses.replace(
-        spots, label=of[spots.label], neighbour=of[spots.neighbour], beyond=of[spots.beyond], K=K, classes=()
-    )
+    answers = {name: of[getattr(spots, name)] for name in ("label", "neighbour", "beyond")}
+    return dataclasses.replace(spots, **answers, K=K, classes=(), distances=None)
 
 
 def _alpha_of(spots: SpotObservations, group: Int64, scope: Scope, less: float) -> Interval:

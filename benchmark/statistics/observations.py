@@ -120,6 +120,7 @@ class SpotObservations:
         share: Sampled share of the coarse cells, times 2^32.
         classes: Names of the classes.
         frames: Number of frames, of which some may share a view.
+        distances: (K, K) distances between the classes, symmetric, 0 on the diagonal; None if all are alike.
     """
 
     spot: Int32
@@ -137,6 +138,7 @@ class SpotObservations:
     share: int = 1 << 32
     classes: tuple[str, ...] = ()
     frames: int = 0
+    distances: Float64 | None = None
 
     def __len__(self) -> int:
         return len(self.spot)
@@ -253,7 +255,9 @@ class SpotObservations:
         for name in COLUMNS[1:]:
             values = arrays.column(getattr(self, name)[order])
             columns[name] = pa.ListArray.from_arrays(arrays.column(ends), values)
-        about = {name: getattr(self, name) for name in ("spacing", "K", "share", "classes", "frames")}
+        about: dict[str, Any] = {name: getattr(self, name) for name in ("spacing", "K", "share", "classes", "frames")}
+        if self.distances is not None:
+            about["distances"] = self.distances.tolist()
         content = pa.table(columns)
         text = json.dumps({"schema": SCHEMA, "kind": "SpotObservations", **about, "views": self.views.rows().tolist()})
         with atomic_path(path) as temporary, pq.ParquetWriter(temporary, content.schema, compression="zstd") as file:
@@ -275,6 +279,8 @@ class SpotObservations:
                 raise DataError("it is of another kind or version; run it again")
             views = Views.of(about.pop("views"))
             about["classes"] = tuple(about["classes"])
+            if "distances" in about:
+                about["distances"] = np.array(about["distances"], np.float64).reshape(about["K"], about["K"])
             point = np.stack([arrays.values_of(content.column(name)) for name in "xyz"], axis=1)
             lists = {name: content.column(name).combine_chunks() for name in COLUMNS[1:]}
             counts = {name: np.asarray(each.value_lengths()) for name, each in lists.items()}

@@ -326,8 +326,8 @@ class Sampler:
         self._spots = n
         self._table = self._rebuilt(len(self._table))
 
-    def sample(self, classes: tuple[str, ...] = ()) -> SpotObservations:
-        """Return a copy of the sample so far, without the pixels that are left out."""
+    def sample(self, classes: tuple[str, ...] = (), distances: Float64 | None = None) -> SpotObservations:
+        """Return a copy of the sample so far, without the pixels that are left out; distances are (K, K)."""
         counted = np.flatnonzero(self._columns["label"][: self._answers] <= self.K)
         answers: dict[str, Any] = {name: column[counted] for name, column in self._columns.items()}
         return SpotObservations(
@@ -340,6 +340,7 @@ class Sampler:
             share=self._share,
             classes=classes,
             frames=self._frames,
+            distances=distances,
         )
 
 

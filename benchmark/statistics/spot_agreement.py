@@ -10,11 +10,13 @@ import numpy as np
 from semstab.core.types import THIS_SCENE, Float64, Scope
 from semstab.data import labels
 from semstab.data.measures import dominant
-from semstab.data.statistics import ClassAlpha, MovingClasses, SpotAgreement
+from semstab.data.statistics import ClassAlpha, Meaning, MovingClasses, SpotAgreement
 from semstab.data.voxels import VoxelTable
 from semstab.statistics.accumulate import sums_of_spots
 from semstab.statistics.cluster_sums import MOST_CLASSES, ClusterSums, chance_of, value
-from semstab.statistics.intervals import confidence_intervals, probability_above, scope_of, spec_of
+from semstab.statistics.groupings import halves_of
+from semstab.statistics.intervals import confidence_intervals, estimate, probability_above, scope_of, spec_of
+from semstab.statistics.meaning import share_near
 from semstab.statistics.observations import SpotObservations
 from semstab.statistics.silence import silence
 from semstab.statistics.verdict import LIMITS, Limits
@@ -77,7 +79,17 @@ def spot_agreement(
         moving=moving_classes(spots, sums, moving) if disagreement[moving].sum() >= MUCH else None,
         pixels_labelled=silent.pixels,
         pairs_labelled=silent.pairs,
+        meaning=_meaning(spots, sums, scope),
     )
+
+
+def _meaning(spots: SpotObservations, sums: ClusterSums, scope: Scope) -> Meaning | None:
+    """Return agreement with the distances between classes; None without any."""
+    if spots.distances is None or not sums.answers:
+        return None
+    number = "alpha_by_meaning"
+    near = share_near(halves_of(spots, sums).sum(axis=0), spots.distances)
+    return Meaning(estimate(sums, number, scope=scope_of(sums, scope, number)), near)
 
 
 def moving_classes(spots: SpotObservations, sums: ClusterSums, moving: Sequence[int]) -> MovingClasses | None:

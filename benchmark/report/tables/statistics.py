@@ -23,7 +23,7 @@ from semstab.data.statistics import (
 from semstab.metrics import macro_mean
 from semstab.report.means import by_model
 from semstab.report.tables.table import Cell, Column, Group, Row, Table
-from semstab.statistics.agreement import ALPHA, KAPPA, PSA, VOXEL_ALPHA
+from semstab.statistics.agreement import ALPHA, ALPHA_BY_MEANING, KAPPA, PSA, VOXEL_ALPHA
 from semstab.statistics.drift import FLIP_RATE
 from semstab.statistics.frame_disagreement import LEAST_EXCESS, LEAST_PLACES, LEVEL
 from semstab.statistics.frame_disagreement import LEAST_FRAMES as LEAST_JUDGED
@@ -46,6 +46,7 @@ def temporal_agreement(result: Result) -> list[Table]:
     """Return alpha with the data that it rests on, and the agreement at voxels, which depends on their size."""
     columns = (
         Column.of(ALPHA),
+        Column.of(ALPHA_BY_MEANING),
         Column("spots", "Spots", 0),
         Column("views", "Views", 0),
         Column("labelled_percent", "Labelled (%)", 0, "higher"),
@@ -57,6 +58,7 @@ def temporal_agreement(result: Result) -> list[Table]:
     )
     numbers: tuple[Number, ...] = (
         lambda stats: stats.headline.alpha.ends,
+        of_spots(lambda spots: math.nan if spots.meaning is None else spots.meaning.alpha.ends),
         of_spots(lambda spots: spots.spots),
         of_spots(lambda spots: spots.views),
         of_spots(lambda spots: 100 * spots.labelled),
@@ -342,7 +344,7 @@ def ordered(take: Callable[[DriftStatistics], float | Estimate]) -> Number:
     return lambda stats: take(stats.drift) if stats.order_known else math.nan
 
 
-def of_spots(take: Callable[[SpotAgreement], float]) -> Number:
+def of_spots(take: Callable[[SpotAgreement], float | Estimate]) -> Number:
     """Return a function that takes a number of the spots; NaN without spots."""
     return lambda stats: math.nan if stats.spots is None else take(stats.spots)
 

@@ -72,6 +72,8 @@ def _verdict(run: UnitSummary) -> Iterator[str]:
         yield from wrapped(statistics.told_ranges.text)
     if statistics.groupings is not None:
         yield from wrapped(statistics.groupings.text)
+    if statistics.spots is not None and statistics.spots.meaning is not None:
+        yield from wrapped(statistics.spots.meaning.text)
     yield ""
 
 

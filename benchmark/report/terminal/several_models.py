@@ -89,7 +89,9 @@ def several_models(result: Result, records: Sequence[Record], width: int) -> Ite
             continue
         ranges = "" if statistics.told_ranges is None else statistics.told_ranges.text
         merged = "" if statistics.groupings is None else statistics.groupings.text
-        for text in filter(None, (statistics.verdict.difference, ranges, merged)):
+        meaning = statistics.spots.meaning if statistics.spots is not None else None
+        texts = (statistics.verdict.difference, ranges, merged, "" if meaning is None else meaning.text)
+        for text in filter(None, texts):
             yield from wrapped(f"{record.unit.model}: {text}")
     yield ""
 

@@ -22,6 +22,8 @@ DRIFT = ("sbd_excess", "sbd_known")
 WITH_TRUTH = ("known", "right", "observed", "observed_right", "consistent", "consistent_wrong")
 BY_TRUE_CLASS = ("class_known", "class_right", "class_predicted")
 CALIBRATION = ("calibrated", "gap")
+OF_MEANING, POINTS = ("similar", "similar_own", "twice_similar", "norm"), ("toward", "against")
+"""Sums of labels as points, whose distances are those of the classes: see `semstab.statistics.meaning`."""
 OF_TRUTH = (*WITH_TRUTH, *BY_TRUE_CLASS, *CALIBRATION)
 WITHOUT_FRAMES = (*DRIFT, *CALIBRATION)
 """Sums that belong to no frame: they stand in rows whose frame is -1, as do sums of the register of measures."""
@@ -33,10 +35,10 @@ def of_measure(key: str) -> tuple[str, str]:
 
 
 @functools.lru_cache(maxsize=16)
-def layout(K: int, *, truth: bool, measured: tuple[str, ...] = ()) -> Mapping[str, slice]:
+def layout(K: int, *, truth: bool, measured: tuple[str, ...] = (), meaning: bool = False) -> Mapping[str, slice]:
     """Return the columns of the sums by name: K columns for sums by class, one for each bin for `gap`, else one.
 
-    Columns of the measures with the keys `measured` come last.
+    Columns of the measures with the keys `measured` come last, and those of distances between classes, `meaning`.
     """
     by_class = K <= MOST_CLASSES
     widths = [(name, 1) for name in PLAIN] + [("evidence", K)]
@@ -47,6 +49,7 @@ def layout(K: int, *, truth: bool, measured: tuple[str, ...] = ()) -> Mapping[st
         widths += [(name, K) for name in BY_TRUE_CLASS] if by_class else []
         widths += [("calibrated", 1), ("gap", BINS)]
     widths += [(name, 1) for key in measured for name in of_measure(key)]
+    widths += [*((name, 1) for name in OF_MEANING), *((name, K) for name in POINTS)] if meaning else []
     return side_by_side(dict(widths))
 
 

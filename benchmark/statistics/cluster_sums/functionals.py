@@ -13,7 +13,7 @@ import numpy as np
 from semstab.core.types import Float64
 from semstab.data.measures import Measure, measures
 from semstab.metrics.correctness import calibration_error, iou, mean_iou
-from semstab.statistics.agreement import alpha_of, class_alpha_of, ratio_of
+from semstab.statistics.agreement import alpha_of, class_alpha_of, meaning_alpha_of, ratio_of
 from semstab.statistics.cluster_sums.columns import WITHOUT_FRAMES, of_measure
 from semstab.statistics.cluster_sums.sums import ClusterSums
 
@@ -116,10 +116,14 @@ SAME = 1.2
 ALPHA_SUMS = ("agreeing", "observations", "own", "evidence")
 CLASS_SUMS = ("class_apart", "observations", "evidence", "class_own")
 PAIRS = ("twice_agreeing", "twice")
+MEANING_SUMS = ("similar", "observations", "similar_own", "norm", "toward", "against")
 
 FUNCTIONALS: Mapping[str, Functional] = {
     "psa": Functional(("psa", "voxels"), ratio_of, pairs=PAIRS, pair_weight=0.5),
     "alpha": Functional(ALPHA_SUMS, alpha_of, -1.0, 1.0, "agreement", pairs=PAIRS, of_spots=True),
+    "alpha_by_meaning": Functional(
+        MEANING_SUMS, meaning_alpha_of, -1.0, 1.0, "agreement", pairs=("twice_similar", "twice"), of_spots=True
+    ),
     "voxel_alpha": Functional(ALPHA_SUMS, alpha_of, -1.0, 1.0, "agreement", pairs=PAIRS),
     "vss": Functional(("vss", "recurrent"), ratio_of),
     "entropy_op2": Functional(("entropy", "voxels"), ratio_of, by_location=True),
@@ -130,10 +134,10 @@ FUNCTIONALS: Mapping[str, Functional] = {
     "miou": Functional(("known", "known", "class_right", "class_known", "class_predicted"), miou_of, scale="plain"),
     "ece": Functional(("calibrated", "calibrated", "gap"), ece_of, scale="plain"),
 }
-"""Numbers by key: alpha, of spots that two views saw or more; PSA, Krippendorff's alpha of voxels and entropy at
-OP >= 2 (`entropy_op2`); VSS at OP >= 3; SBD minus SBD in random order if the order is known. With ground truth:
-accuracy of the fused labels at OP >= 2 and of single observations, the wrong among the consistent locations at OP >= 3,
-mean intersection over union and expected calibration error at OP >= 2."""
+"""Numbers by key: alpha, of spots that two views saw or more, and the same with distances between classes; PSA,
+Krippendorff's alpha of voxels and entropy at OP >= 2 (`entropy_op2`); VSS at OP >= 3; SBD minus SBD in random order if
+the order is known. With ground truth: accuracy of the fused labels at OP >= 2 and of single observations, the wrong
+among the consistent locations at OP >= 3, mean intersection over union and expected calibration error at OP >= 2."""
 
 BY_CLASS: Mapping[str, Functional] = {
     "alpha": Functional(CLASS_SUMS, class_alpha_of, -1.0, 1.0, "agreement", of_spots=True),

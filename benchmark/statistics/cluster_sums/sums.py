@@ -170,10 +170,12 @@ class ClusterSums:
         about |= {name: [getattr(part, name) for part in parts] for name in ("edge", "step", "voxel_size", "fused")}
         lengths = [len(part.frame) for part in parts]
         cell, frame = np.concatenate([part.cell for part in parts]), np.concatenate([part.frame for part in parts])
-        columns = np.zeros((sum(lengths), self.columns.shape[1]))
+        names = [*dict.fromkeys(name for part in parts for name in column_names(part.layout))]
+        at = {name: k for k, name in enumerate(names)}
+        columns = np.zeros((sum(lengths), len(names)))
         for part, rows in zip(parts, np.split(np.arange(len(columns)), np.cumsum(lengths)[:-1]), strict=True):
-            columns[rows, : part.columns.shape[1]] = part.columns
-        names = column_names(self.layout)
+            for name, column in zip(column_names(part.layout), part.columns.T, strict=True):
+                columns[rows, at[name]] = column
         stored = columns.astype(np.float32) if single else columns
         arrays = [np.repeat(np.arange(len(parts)), lengths), *cell.T, frame, *stored.T]
         content = pa.table({name: arrow.column(array) for name, array in zip([*KEYS, *names], arrays, strict=True)})
@@ -204,12 +206,14 @@ class ClusterSums:
                 raise DataError(f"{len(names) - len(KEYS)} columns of sums for {meta.K} classes")
             stored = dict(zip(names, content.columns, strict=True))
             measured = tuple(each.key for each in measures() if stored.keys() >= {*of_measure(each.key)})
-            slices = layout(meta.K, truth=meta.truth, measured=measured)
-            columns = np.full((len(content), width(slices)), np.nan)
-            for k, name in enumerate(column_names(slices)):
-                if name in stored:
-                    columns[:, k] = arrow.values_of(stored[name])
-            if np.any(np.abs(columns) > LARGEST**2):
+            of_map = layout(meta.K, truth=meta.truth, measured=measured)
+            of_answers = layout(meta.K, truth=False, meaning="similar" in stored)
+            numbers = {
+                name: arrow.values_of(stored[name])
+                for name in dict.fromkeys((*column_names(of_map), *column_names(of_answers)))
+                if name in stored
+            }
+            if any(np.any(np.abs(column) > LARGEST**2) for column in numbers.values()):
                 raise DataError("a sum is larger than any map can have")
             if not all(0 <= frames <= LARGEST for frames in (*meta.step, *meta.fused)):
                 raise DataError("a number of frames is one that no map can have")
@@ -217,9 +221,13 @@ class ClusterSums:
             for number, (edge, step, voxel_size, fused) in enumerate(
                 zip(meta.edge, meta.step, meta.voxel_size, meta.fused, strict=True)
             ):
-                rows, its_layout = part == number, layout(meta.K, truth=False) if number else slices
+                rows, its_layout = part == number, of_answers if number else of_map
                 cell, frame = np.stack([key[rows] for key in keys[:3]], axis=1), keys[3][rows]
-                where = cell.astype(np.int32), frame.astype(np.int32), columns[rows, : width(its_layout)]
+                columns = np.full((len(frame), width(its_layout)), np.nan)
+                for k, name in enumerate(column_names(its_layout)):
+                    if name in numbers:
+                        columns[:, k] = numbers[name][rows]
+                where = cell.astype(np.int32), frame.astype(np.int32), columns
                 parts.append(cls(*where, its_layout, edge, step, voxel_size, meta.classes, fused))
         whole, *answers = parts
         return dataclasses.replace(whole, answers=tuple(answers))

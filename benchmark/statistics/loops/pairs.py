@@ -84,3 +84,54 @@ def add_coincidences(bounds, log, half, pairs):
                 pairs[half[spot], met[i], met[j]] += total[met[i]] * total[met[j]] / (T - 1)
         for i in range(many):
             total[met[i]] = 0.0
+
+
+@serial
+def add_similarity(bounds, log, cube, group, groups, products, columns, sums):
+    """Add how similar the observations of a spot are to `sums` (cubes * groups, C), as `add_influences` adds agreement.
+
+    products (K, K) are z_a . z_b of the classes' points. `columns` are those of the sums of observations with the
+    others of their spot, of observations with themselves, and of the first of spots that two views saw.
+    """
+    starts, label, weight = log
+    total, met = np.zeros(products.shape[0]), np.empty(products.shape[0], np.int64)
+    for spot in range(len(bounds) - 1):
+        first, end, many = bounds[spot], bounds[spot + 1], 0
+        T = end - first
+        if T < 2 or cube[spot] < 0:
+            continue
+        for e in range(starts[first], starts[end]):
+            if total[label[e]] == 0.0:
+                met[many] = label[e]
+                many += 1
+            total[label[e]] += weight[e]
+        alike = 0.0
+        for i in range(many):
+            for j in range(many):
+                alike += total[met[i]] * total[met[j]] * products[met[i], met[j]]
+        for one in range(first, end):
+            alike -= _with_itself(starts, label, weight, one, products)
+        alike /= T * (T - 1.0)
+        spread = 2.0 * (T - 1.0) / (T - 2.0) if T > 2 else 0.0
+        for one in range(first, end):
+            own, of_all = _with_itself(starts, label, weight, one, products), 0.0
+            for e in range(starts[one], starts[one + 1]):
+                for i in range(many):
+                    of_all += weight[e] * total[met[i]] * products[label[e], met[i]]
+            row = cube[spot] * groups + group[one]
+            sums[row, columns[0]] += alike + spread * ((of_all - own) / (T - 1.0) - alike)
+            sums[row, columns[1]] += own
+            if T == 2:
+                sums[row, columns[2]] += alike
+        for i in range(many):
+            total[met[i]] = 0.0
+
+
+@serial
+def _with_itself(starts, label, weight, one, products):
+    """Return the product of an observation's point with itself."""
+    own = 0.0
+    for a in range(starts[one], starts[one + 1]):
+        for b in range(starts[one], starts[one + 1]):
+            own += weight[a] * weight[b] * products[label[a], label[b]]
+    return own
