@@ -24,8 +24,9 @@ from semstab.statistics.loops.spots import (
 ON_A_PLANE = 0.03
 """Sparse points lie on a plane if it leaves at most this over of their inverse depth, relative."""
 
-NEXT = 2.25
-"""The squared distance of a point in the next pixel, of 1.5 pixels."""
+NEXT, BESIDE = 2.25, 4.0
+"""Squared distances, in pixels: of a point in the next pixel; and of the farthest point beside which a pixel of an
+image answers, since what lies between points, such as a pole before a wall, is not known."""
 
 
 @serial
@@ -185,7 +186,8 @@ def project_sparse(point, grid, u, v, w, camera, around, reach, T, spot, x, y, e
     """Find the spots that points around show; return how many. As `project`, and `nearest` takes the nearest point.
 
     A plane through the points around tells the depth there; if they lie on no plane, as at an edge, the nearest point
-    does, if it is the next pixel. `room` is the slope of the plane in a pixel, relative.
+    does, if it is the next pixel. In an image the nearest point is at most 2 pixels away. `room` is the slope of the
+    plane in a pixel, relative.
     """
     rows, columns = grid.shape
     fx, fy, cx, cy = camera
@@ -202,6 +204,8 @@ def project_sparse(point, grid, u, v, w, camera, around, reach, T, spot, x, y, e
             if not (-0.5 <= p < columns - 0.5 and -0.5 <= q < rows - 0.5):
                 continue
         there, left, at, least, along_x, along_y = surface(grid, u, v, w, p, q, reach, around)
+        if not around and (at < 0 or least > BESIDE):
+            continue
         if there == 0.0 or left > ON_A_PLANE:
             if at < 0 or least > NEXT:
                 continue
