@@ -177,7 +177,9 @@ class FromObservations(ABC):
                 f"{where}: it returned arrays of shapes {index.shape}, {evidence.shape} and {pixels.shape}; return"
                 f" (n, 3), (n, {self.num_classes}) and (n,)"
             )
-        if index.dtype.kind not in "iu" or np.abs(index).max(initial=0) > INDEX_LIMIT - 1:
+        if index.dtype.kind not in "iu" or not (
+            -INDEX_LIMIT <= index.min(initial=0) <= index.max(initial=0) < INDEX_LIMIT
+        ):
             raise DataError(f"{where}: voxel indices are whole numbers of 32 bits, floor(x_w / r); got {index.dtype}")
         total = evidence.sum(axis=1, keepdims=True, dtype=np.float64)
         if not (np.isfinite(total).all() and evidence.min(initial=0) >= 0 and (total > 0).all()):
