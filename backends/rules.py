@@ -78,7 +78,8 @@ def bayes(state: Float64, seen: Seen, *, error: float = 0.1) -> Float64:
     if not 0 < error < 1:
         raise ConfigError(f"rule bayes: error = {error:g}: use a number between 0 and 1")
     other = error / (seen.s_bar.shape[1] - 1)
-    return state + np.log(other + (1 - error - other) * seen.s_bar)
+    likelihood: Float64 = other + (1 - error - other) * seen.s_bar
+    return state + np.log(likelihood)
 
 
 def softmax(state: Float64) -> Float64:
@@ -96,7 +97,7 @@ def weighted(state: Float64, seen: Seen, *, distance: float = 2.0, score: float 
 
     1 / d^2 is the weight of depth measurements in a TSDF (Curless and Levoy 1996; Oleynikova et al. 2017, Voxblox).
     """
-    w = seen.s_bar.max(axis=1) ** score / np.maximum(seen.distance, NEAREST) ** distance
+    w: Float64 = seen.s_bar.max(axis=1) ** score / np.maximum(seen.distance, NEAREST) ** distance
     return state + w[:, None] * seen.s_bar
 
 
