@@ -42,7 +42,7 @@ def _single(frame: Frame, voxel_size: float) -> Float64:  # noqa: ARG001
 
 
 def _rounded(frame: Frame, voxel_size: float) -> Float64:  # noqa: ARG001
-    return back_project(frame).astype(np.float32)  # type: ignore[return-value]
+    return back_project(frame).astype(np.float32)
 
 
 def _floor(q: Float64) -> Float64:
