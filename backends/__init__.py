@@ -13,7 +13,7 @@ from collections.abc import Mapping
 from functools import partial
 from typing import Any, Protocol, cast
 
-from semstab.core.registry import Entry, Registry
+from semstab.core.registry import BY_RULE, Entry, Registry
 from semstab.data.events import Events
 from semstab.data.frames import Frame
 from semstab.data.results import Changes, FrameReport
@@ -71,7 +71,10 @@ class FusionBackend(Protocol):
         x_w = ((R00 * x_c + R01 * y_c) + R02 * z_c) + t0     and so on
 
     A voxel takes one evidence vector a frame: the mean over the frame's pixels in it, a distribution over the classes.
-    So the rows of evidence in the table sum to OP; a run with other rows fails.
+    So the rows of evidence in the table sum to OP; a run with other rows fails. A backend that fuses otherwise (votes
+    of pixels, products of likelihoods, weights, forgetting) gives the table a `weight`, to which each row sums: then
+    VSS, entropy, margin, labels, SBD and OP hold, and what counts frames (PSA, voxel alpha, the null of drift) is NaN.
+    `semstab.backends.from_observations` has a base class with one method, and rules for it.
 
     A backend that associates pixels and voxels in another way says `pointwise = False`: it is compared with the
     others, but they need not agree.
@@ -99,6 +102,32 @@ class FusionBackend(Protocol):
         return None
 
 
+def rule_of(name: str) -> str:
+    """Return the rule in the name of a backend, '' where it is its own: 'bayes' of 'numba+bayes'."""
+    return name.partition(BY_RULE)[2]
+
+
+def by_own_rule(name: str) -> str:
+    """Return the name of a backend without a rule: 'numba' of 'numba+bayes'."""
+    return name.partition(BY_RULE)[0]
+
+
+def _load(name: str) -> Any:
+    """Return the class of a backend, or of the one that runs rules for it."""
+    own, by, _ = name.partition(BY_RULE)
+    cls = REGISTRY.load(own)
+    if not by or "rule" in _options(cls):
+        return cls
+    from semstab.backends.from_observations import RULED
+
+    if own not in RULED:
+        raise ConfigError(
+            f"backend '{own}' has no rules but the mean; {' and '.join(RULED)} have, and subclasses of"
+            " semstab.backends.from_observations.FromObservations"
+        )
+    return RULED[own]
+
+
 def check_options(name: str, *, voxel_size: float, num_classes: int, **options: Any) -> None:
     """Check the settings of a backend's maps by its `check_options`; the first map of a class without one checks them.
 
@@ -106,6 +135,7 @@ def check_options(name: str, *, voxel_size: float, num_classes: int, **options: 
         ConfigError: For an unknown name or option, and for a value that the backend does not take.
         MissingDependencyError: If its engine is not installed.
     """
+    name, options = _with_rule(name, options)
     check = getattr(_class(name, options), "check_options", None)
     if check is not None:
         taken = inspect.signature(check).parameters
@@ -126,6 +156,7 @@ def create(
     """
     if not isinstance(within, Extent | None):
         raise ConfigError(f"backend '{name}' has no option 'within'; the plan sets it")
+    name, options = _with_rule(name, options)
     cls = _class(name, options)
     make: Any = partial(cls, voxel_size=voxel_size, num_classes=num_classes, **options)
     if within is None:
@@ -139,9 +170,24 @@ def create(
     return Restricted(make(), voxel_size, within)
 
 
+def _with_rule(name: str, options: dict[str, Any]) -> tuple[str, dict[str, Any]]:
+    """Return name and options that both say the rule: 'numba' with rule='bayes' is 'numba+bayes', as that is by itself.
+
+    The rule of the options counts, of which the name may be any other word; 'mean' alone is the backend as it is.
+    """
+    rule = options.get("rule", rule_of(name))
+    if not isinstance(rule, str):
+        raise ConfigError(f"backend '{name}': rule = {rule!r}: use a name, or FILE.py:NAME")
+    if not rule:
+        return name, options
+    if rule == "mean" and name in REGISTRY.entries():
+        return name, {key: value for key, value in options.items() if key != "rule"}
+    return name if rule_of(name) else f"{name}{BY_RULE}{rule}", options | {"rule": rule}
+
+
 def _class(name: str, options: Mapping[str, Any]) -> Any:
     """Return the class of that name; raises ConfigError if it has no such options."""
-    cls = REGISTRY.load(name)
+    cls = _load(name)
     known = _options(cls)
     if unknown := sorted(set(options) - set(known) | set(options) & set(GIVEN)):
         listed = f"it takes {', '.join(known)}" if known else "it takes none"
@@ -167,17 +213,17 @@ def is_pointwise(name: str) -> bool:
     Only then its maps can be restricted to an extent. Whether they must agree with the others may be configured, too:
     see `semstab.engine.units.must_agree`.
     """
-    return bool(getattr(REGISTRY.load(name), "pointwise", True))
+    return bool(getattr(_load(name), "pointwise", True))
 
 
 def takes_option(name: str, option: str) -> bool:
     """Return whether the backend of that name has such an option, for example 'device'."""
-    return option in _options(REGISTRY.load(name))
+    return option in _options(_load(name))
 
 
 def keeps_log(name: str) -> bool:
     """Return whether the backend of that name can give a log of observations: with option `history`, or always."""
-    return takes_option(name, "history") or getattr(REGISTRY.load(name), "keeps_log", False)
+    return takes_option(name, "history") or getattr(_load(name), "keeps_log", False)
 
 
 def expected_bytes(name: str, voxels: int, observations: int, num_classes: int, *, soft: bool = False) -> int:
@@ -186,7 +232,7 @@ def expected_bytes(name: str, voxels: int, observations: int, num_classes: int, 
     A backend says it with a static method of that name, those three parameters, and `soft` where a map of scores takes
     other than one of labels.
     """
-    says = getattr(REGISTRY.load(name), "expected_bytes", None)
+    says = getattr(_load(name), "expected_bytes", None)
     if says is None:
         return 0
     more = {"soft": soft} if "soft" in inspect.signature(says).parameters else {}

@@ -5,11 +5,12 @@ from __future__ import annotations
 import itertools
 import time
 from collections import defaultdict
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
 
+from semstab.backends.from_observations import NumpyRules
 from semstab.backends.shared.association import (
     Observations,
     check_depth,
@@ -148,17 +149,21 @@ class NumpyReference(NumpyHistory):
 class NumpySample(NumpyHistory):
     """The reference on one in `one_in` of the voxels, drawn at random by their index, through all frames.
 
-    Each sample holds those of the next thinner one, so that it can become thinner while the map grows: a defect in a
-    share p of the voxels is found with probability 1 - (1 - p)^n, and n = MOST voxels find 0.05 % of them in 99 of 100.
+    It fuses by the `rule`, with `rule_options`, where these are given. Each sample holds those of the next thinner one,
+    so that it can become thinner while the map grows: a defect in a share p of the voxels is found with probability
+    1 - (1 - p)^n, and n = MOST voxels find 0.05 % of them in 99 of 100.
     """
 
-    def __init__(self, voxel_size: float, num_classes: int, within: Extent | None = None) -> None:
+    def __init__(self, voxel_size: float, num_classes: int, within: Extent | None = None, **rule: Any) -> None:
         super().__init__(voxel_size, num_classes, within)
         self.one_in, self._left = ONE_IN, 0
+        self._by_rule = NumpyRules(voxel_size, num_classes, **rule) if rule else None
 
     def integrate(self, frame: Frame) -> None:
         """Append the frame's observations of the sample; make the sample thinner where it has become too large."""
-        self.append(frame)
+        _, seen = self.append(frame)
+        if self._by_rule is not None:
+            self._by_rule.add(frame, seen, time.perf_counter())
         while len(self._row) - self._left > MOST:
             self.one_in *= 2
             index = np.frombuffer(b"".join(self._row), dtype=np.int64).reshape(-1, 3)
@@ -166,7 +171,7 @@ class NumpySample(NumpyHistory):
 
     def table(self) -> VoxelTable:
         """Return the map of the sample so far."""
-        table = super().table()
+        table = super().table() if self._by_rule is None else self._by_rule.table()
         return table.rows(in_sample(table.index.T, self.one_in))
 
     def _observe(self, frame: Frame) -> Observations:

@@ -63,7 +63,7 @@ def require_named_code(run: Path) -> None:
         require_named(name, field)
 
 
-CODE_KEYS = ("model", "code")
+CODE_KEYS = ("model", "code", "rule")
 """Settings that may name code."""
 
 

@@ -16,7 +16,18 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from semstab.config import nearest
-from semstab.conformance.files import EXPECTED, differences, read_case, read_rows, read_table, write_case, write_rows
+from semstab.conformance.causes import likely_cause
+from semstab.conformance.files import (
+    CASE,
+    EXPECTED,
+    as_rows,
+    differences,
+    read_case,
+    read_rows,
+    read_table,
+    write_case,
+    write_rows,
+)
 from semstab.conformance.formulas import FORMULAS
 from semstab.conformance.random_cases import RANDOM, random_frames, seed_of, write_random
 from semstab.core.code import absolute, is_code
@@ -25,9 +36,9 @@ from semstab.data.voxels import VoxelTable
 from semstab.errors import ConfigError, DataError, summarize_error
 
 __all__ = [
-    "AT_FACES", "EXPECTED", "LONG", "OF_SCANS", "SECONDS", "TOLERANCE", "Verdict", "case_folder", "case_names",
-    "compared", "conform", "differences", "expected_table", "random_frames", "read_case", "read_rows",
-    "read_table", "write_case", "write_rows",
+    "AT_FACES", "EXPECTED", "LONG", "OF_SCANS", "SECONDS", "TOLERANCE", "Verdict", "as_rows", "case_folder",
+    "case_names", "compared", "conform", "differences", "expected_table", "likely_cause", "random_frames", "read_case",
+    "read_rows", "read_table", "write_case", "write_rows",
 ]  # fmt: skip
 
 TOLERANCE = 1e-9
@@ -55,10 +66,14 @@ OF_SCANS = ("scan", "scan_scores", "scan_faces", "scan_utm", "scans_and_images")
 
 @dataclass(frozen=True)
 class Verdict:
-    """The result of a case: no problem where the program's table is the expected one, else where it differs."""
+    """The result of a case: no problem where the program's table is the expected one, else where it differs.
+
+    `left_out` names what the case has and the program was declared not to take: then it was not run.
+    """
 
     case: str
     problem: str = ""
+    left_out: str = ""
 
 
 def case_names() -> tuple[str, ...]:
@@ -101,19 +116,25 @@ def _scratch() -> ScratchFolder:
 
 
 def conform(
-    command: str, only: Sequence[str] = (), tolerance: float = TOLERANCE, random: int = 0, *, scans: bool = True
+    command: str,
+    only: Sequence[str] = (),
+    tolerance: float = TOLERANCE,
+    random: int = 0,
+    *,
+    scans: bool = True,
+    scores: bool = True,
 ) -> Iterator[Verdict]:
     """Run `command CASE OUT` for each case, or for some, and compare what it wrote to OUT with what is expected.
 
     The command may be a backend's FILE.py:NAME. A program that fails alike in the first three cases is not started
-    again. So many random cases, with seeds from 0, follow. Without `scans` the cases that have some are left out.
+    again. So many random cases, with seeds from 0, follow. Without `scans` or `scores` the cases that have some are not
+    run, and said not to be.
 
     Raises:
         ConfigError: For a case that there is not, or a command that cannot be read or started, or fails alike in the
             first three cases.
     """
-    known = [name for name in case_names() if scans or name not in OF_SCANS]
-    names = [*(only or known), *(f"{RANDOM}{seed}" for seed in range(random))]
+    names = [*(only or case_names()), *(f"{RANDOM}{seed}" for seed in range(random))]
     for name in only:
         case_folder(name)
     try:
@@ -127,6 +148,9 @@ def conform(
     failures = list[str]()
     for name in names:
         folder = case_folder(name)
+        if lacking := [word for word in needs(folder) if not {"scans": scans, "scores": scores}[word]]:
+            yield Verdict(name, left_out=" and ".join(lacking))
+            continue
         with ScratchFolder() as temporary:
             out = temporary / "table.csv"
             failed = _ran(words, folder, out)
@@ -137,12 +161,22 @@ def conform(
         yield Verdict(name, problem)
 
 
+def needs(folder: Path) -> list[str]:
+    """Return what a case has besides images of labels: 'scans', 'scores'."""
+    words = [line.split() for line in (folder / CASE).read_text(encoding="utf-8").splitlines()]
+    there = {"scans": any(line[0] == "scan" for line in words), "scores": any("scores" in line[-1] for line in words)}
+    return [word for word, has in there.items() if has]
+
+
 def compared(folder: Path, out: Path, tolerance: float = TOLERANCE) -> str:
-    """Return where a program's table differs from the expected one; empty where it does not."""
+    """Return where a program's table differs from the expected one, with the likely cause; empty where it does not."""
     try:
-        return next(differences(read_rows(folder / EXPECTED), read_rows(out), tolerance), "")
+        expected, actual = read_rows(folder / EXPECTED), read_rows(out)
     except DataError as error:
         return str(error)
+    problem = next(differences(expected, actual, tolerance), "")
+    cause = likely_cause(*read_case(folder), expected, actual) if problem else ""
+    return f"{problem}; likely: {cause}" if cause else problem
 
 
 def _ran(words: Sequence[str], folder: Path, out: Path) -> str:

@@ -113,15 +113,27 @@ def write_case(folder: Path, voxel_size: float, classes: int, frames: Sequence[F
 
 def write_rows(path: Path, table: VoxelTable) -> None:
     """Write a voxel table with its measures as CSV, with all digits of a number; an undefined one is empty."""
-    columns: dict[str, npt.NDArray[Any]] = {name: getattr(table, name) for name in (*PLACE, *COUNTS, *SUMS)}
-    columns |= {f"evidence_{k}": table.evidence[:, k] for k in range(table.K)}
-    columns |= {measure.key: measure.of(table) for measure in measures()}
+    columns = _columns(table)
     text = io.StringIO()
     writer = csv.writer(text, lineterminator="\n")
     writer.writerow(columns)
     for row in zip(*(column.tolist() for column in columns.values()), strict=True):
         writer.writerow("" if value != value else repr(value) for value in row)  # noqa: PLR0124  NaN
     write_text(path, text.getvalue())
+
+
+def _columns(table: VoxelTable) -> dict[str, npt.NDArray[Any]]:
+    columns: dict[str, npt.NDArray[Any]] = {name: getattr(table, name) for name in (*PLACE, *COUNTS, *SUMS)}
+    columns |= {f"evidence_{k}": table.evidence[:, k] for k in range(table.K)}
+    return columns | {measure.key: measure.of(table) for measure in measures()}
+
+
+def as_rows(table: VoxelTable) -> Rows:
+    """Return the rows of a table by voxel, as `read_rows` reads what `write_rows` wrote."""
+    columns = _columns(table)
+    rows = zip(*(column.tolist() for column in columns.values()), strict=True)
+    voxels = zip(table.ix.tolist(), table.iy.tolist(), table.iz.tolist(), strict=True)
+    return {q: dict(zip(columns, row, strict=True)) for q, row in zip(voxels, rows, strict=True)}
 
 
 def read_rows(path: Path) -> Rows:

@@ -7,14 +7,18 @@ from __future__ import annotations
 
 import dataclasses
 import math
+import re
+import sys
 from unittest.mock import patch
 
 import numpy as np
 import pytest
+from typer.testing import CliRunner
 
 from semstab.backends.numpy_reference import NumpyReference
 from semstab.backends.shared import association
-from semstab.conformance import LONG, case_folder, case_names, compared, expected_table, write_rows
+from semstab.cli import app
+from semstab.conformance import LONG, case_folder, case_names, compared, expected_table, read_case, write_rows
 from semstab.testing import BackendConformance
 
 POINTS = association._points
@@ -505,3 +509,108 @@ def test_without_a_defect_the_data_are_passed(case):
 def test_every_kind_of_defect_has_a_mutant():
     assert len(MUTANTS) >= 40
     assert {param.values[1] for param in MUTANTS} <= {*case_names()}
+
+
+# --- The likely cause, in words ---------------------------------------------------------------------------------------
+
+
+class Rounds(Mutant):
+    def index(self, points, voxel_size, frame):
+        return np.floor(points / voxel_size + 0.5).astype(np.int64)
+
+
+class Truncates(Mutant):
+    def index(self, points, voxel_size, frame):
+        return np.trunc(points / voxel_size).astype(np.int64)
+
+
+class AppliesWorldToCamera(Mutant):
+    def read(self, frame):
+        return dataclasses.replace(frame, T_wc=np.linalg.inv(frame.T_wc))
+
+
+class PositionsInFloat32(Mutant):
+    def points(self, frame, pixels):
+        yield from (points.astype(np.float32) for points in POINTS(frame, pixels))
+
+    def index(self, points, voxel_size, frame):
+        return np.floor(points.astype(np.float32) / np.float32(voxel_size)).astype(np.int64)
+
+
+class CountsPixels(Mutant):
+    def observed(self, seen, frame):
+        return dataclasses.replace(seen, s_bar=seen.s_bar * seen.pixels[:, None])
+
+
+class OpByPixel(Mutant):
+    def finished(self, table):
+        return replaced(table, op=table.pixels)
+
+
+class ClassAxisFirst(Mutant):
+    def read(self, frame):
+        if frame.scores is None:
+            return frame
+        H, W, K = frame.scores.shape
+        return dataclasses.replace(frame, scores=frame.scores.reshape(K, H, W).transpose(1, 2, 0))
+
+
+class ClassesReversed(Mutant):
+    def finished(self, table):
+        return replaced(table, evidence=table.evidence[:][:, ::-1])
+
+
+@pytest.mark.parametrize(("kind", "case", "words"), [
+    (Rounds, "random", "half a voxel off; take floor"),
+    (Truncates, "negative", "cut towards zero; take floor"),
+    (AppliesWorldToCamera, "random", "world to camera"),
+    (PositionsInFloat32, "utm", "float32"),
+    (CountsPixels, "pixels_of_one_frame", "pixels are counted, not averaged"),
+    (OpByPixel, "pixels_of_one_frame", "OP counts pixels"),
+    (ClassAxisFirst, "random_scores", "the class axis is exchanged"),
+    (ClassesReversed, "random", "classes are exchanged"),
+])  # fmt: skip
+def test_a_failure_says_the_likely_cause(kind, case, words, tmp_path) -> None:
+    voxel_size, K, frames = read_case(case_folder(case))
+    backend = kind(voxel_size, K)
+    for frame in frames:
+        backend.integrate(frame)
+    write_rows(tmp_path / "table.csv", backend.table())
+    assert re.search(f"; likely: .*{words}", compared(case_folder(case), tmp_path / "table.csv"))
+
+
+def test_another_defect_has_no_likely_cause(tmp_path) -> None:
+    table = expected_table("random")
+    write_rows(tmp_path / "table.csv", replaced(table, drift_sum=table.drift_sum + 1))
+    assert "likely" not in compared(case_folder("random"), tmp_path / "table.csv")
+
+
+# --- Backends that leave something out --------------------------------------------------------------------------------
+
+
+class LabelsAlone(NumpyReference):
+    def integrate(self, frame):
+        assert frame.scores is None
+        assert not frame.is_scan
+        return super().integrate(frame)
+
+
+class TestLabelsAlone(BackendConformance):
+    """What it does not take is skipped, also on random frames, and nothing fails."""
+
+    scans = scores = False
+
+    def create(self, voxel_size, num_classes):
+        return LabelsAlone(voxel_size, num_classes)
+
+
+def test_conform_says_what_is_not_covered() -> None:
+    cases = [word for name in ("one_pixel", "scores", "scan_scores", "scan") for word in ("--only", name)]
+    program = f"{sys.executable} -m semstab.conformance.fuse numpy"
+    done = CliRunner().invoke(app, ["conform", program, *cases, "--no-scans", "--no-scores"])
+    assert done.stdout.splitlines() == [
+        "one_pixel: the same",
+        "scores: not covered, it has scores",
+        "scan_scores: not covered, it has scans and scores",
+        "scan: not covered, it has scans",
+    ]

@@ -54,7 +54,7 @@ def _label_sources(ctx: Any) -> Iterable[str]:
 
 
 backends, datasets, predictors = _listed("backends"), _listed("datasets"), _listed("models")
-filters = _listed("predict.filters")
+filters, rules = _listed("predict.filters"), _listed("backends.rules", "RULES.keys")
 taxonomies, studies = _listed("data.labels", "shipped_taxonomies"), _listed("settings", "shipped_studies")
 benchmarks = _listed("settings", "shipped_benchmarks")
 scenes, label_sources = _beginning(lambda ctx: [*_opened(ctx).scenes, "all"]), _beginning(_label_sources)

@@ -156,6 +156,7 @@ def conform(
         ),
     ] = None,
     scans: Annotated[bool, typer.Option("--scans/--no-scans", help="The cases that have scans of points, too.")] = True,
+    scores: Annotated[bool, typer.Option("--scores/--no-scores", help="The cases that have soft scores, too.")] = True,
     quiet: Quiet = False,
 ) -> None:
     """Test an external fusion program with the conformance data. Exit code 3 if its tables differ."""
@@ -163,12 +164,13 @@ def conform(
 
     wrong = 0
     more = random if random is not None else 0 if only else RANDOM_CASES
-    for verdict in conform(command, only or (), tolerance, more, scans=scans):
+    for verdict in conform(command, only or (), tolerance, more, scans=scans, scores=scores):
         wrong += bool(verdict.problem)
         if verdict.problem:
             say(f"{verdict.case}: {verdict.problem}")
         elif not quiet:
-            typer.echo(f"{verdict.case}: the same")
+            covered = f"not covered, it has {verdict.left_out}" if verdict.left_out else "the same"
+            typer.echo(f"{verdict.case}: {covered}")
     if wrong:
         raise typer.Exit(DIFFERS)
 

@@ -23,6 +23,9 @@ def run(
         "--backend", "-b", help="Fusion backend: a name of `list`, FILE.py:NAME; repeatable.", show_default="numba",
         autocompletion=opt.backends,
     )] = None,
+    rule: Annotated[list[str] | None, typer.Option(
+        help="Fusion rule: mean, votes, bayes, weighted, recent, first, last, max, FILE.py:NAME; repeatable.",
+        show_default="mean", autocompletion=opt.rules, rich_help_panel=opt.SETTINGS)] = None,
     config: opt.ConfigFile = None,
     source: opt.Source,
     measurement: opt.Measurement,
@@ -37,6 +40,8 @@ def run(
     from datetime import datetime
 
     loaded = _configured(prediction, config, measurement.content(source, backend, tile_size))
+    if rule:
+        loaded = _by_rules(loaded, rule)
     if measurement.device is not None:
         loaded = _on_device(loaded, measurement.device)
     out = out or Path("runs") / datetime.now().astimezone().strftime("%Y-%m-%d_%H-%M-%S")
@@ -59,6 +64,15 @@ def _configured(prediction: opt.Prediction, config: Path | None, content: dict[s
             " (classes: [name, ...]), or in --option 'classes=[name, ...]'"
         )
     return filtered_config(filters, config, content) if filters else load_config(config, content)
+
+
+def _by_rules(config: Config, rules: list[str]) -> Config:
+    """Return the configuration with each backend once for each rule."""
+    from semstab.config import Config
+
+    by_rule = [backend.fusing_by(rule) for backend in config.backends for rule in dict.fromkeys(rules)]
+    Config(backends=by_rule)  # each has a name of its own
+    return config.model_copy(update={"backends": by_rule})
 
 
 def _on_device(config: Config, device: str) -> Config:

@@ -155,7 +155,7 @@ def _regions(
 
 def joint_class(tables: Iterable[VoxelTable]) -> Int64:
     """Return the dominant class (n,) of the same voxels in several maps, each counting alike."""
-    first, *others = tables
+    first, *others = (table.summing_to_op() for table in tables)
     beliefs = first.evidence[:] / first.op[:, None]
     for other in others:
         beliefs = beliefs + other.evidence[:] / other.op[:, None]

@@ -24,7 +24,7 @@ from semstab.config.groups import (
     validated,
 )
 from semstab.core.code import absolute, is_code
-from semstab.core.registry import name_code
+from semstab.core.registry import BY_RULE, name_code
 from semstab.core.types import THIS_SCENE
 from semstab.errors import ConfigError, nearest
 
@@ -74,10 +74,32 @@ class BackendConfig(Part):
             return cls(name=text)
         return cls(name=text.rpartition(":")[2].removesuffix(".py"), code=absolute(text))
 
+    def fusing_by(self, rule: str) -> BackendConfig:
+        """Return the same backend with a rule, of that name or FILE.py:NAME; its own name then has the rule's."""
+        own, options = self.name.partition(BY_RULE)[0], {k: v for k, v in self.options.items() if k not in self.ruled}
+        if rule == "mean":
+            return self.model_copy(update={"name": own, "options": options})
+        name = f"{own}{BY_RULE}{rule.rpartition(':')[2].removesuffix('.py')}"
+        rule_options = {key: value for key, value in self.ruled.items() if key == "rule_options"}
+        by = {"rule": absolute(rule)} | rule_options
+        return self.model_copy(update={"name": name, "options": options | by})
+
+    def like(self, other: BackendConfig) -> BackendConfig:
+        """Return the same backend with the rule of another one, and the rule's options."""
+        name = "".join([self.name, *other.name.partition(BY_RULE)[1:]])
+        return self.model_copy(update={"name": name, "options": self.options | other.ruled})
+
+    @property
+    def ruled(self) -> dict[str, Any]:
+        """The options that say the rule; none where it fuses by its own."""
+        named = self.name.partition(BY_RULE)[2]
+        own = {"rule": named} if named else {}
+        return own | {key: self.options[key] for key in ("rule", "rule_options") if key in self.options}
+
     def model_post_init(self, _: Any) -> None:
         """Let the registry know the class behind the name."""
         if self.code is not None:
-            name_code("backend", self.name, self.code)
+            name_code("backend", self.name.partition(BY_RULE)[0], self.code)
 
     def __setstate__(self, state: dict[Any, Any]) -> None:
         """Let the registry of another process know it, too."""
@@ -230,6 +252,15 @@ class Config(Settings):
 
     @field_validator("backends")
     @classmethod
+    def _rules_are_named(cls, value: list[BackendConfig]) -> list[BackendConfig]:
+        """Name the rule that a backend has among its options only, so that several stand side by side."""
+        unnamed = [each.options.get("rule") if BY_RULE not in each.name else None for each in value]
+        return [
+            each.fusing_by(rule) if isinstance(rule, str) else each for each, rule in zip(value, unnamed, strict=True)
+        ]
+
+    @field_validator("backends")
+    @classmethod
     def _one_fuses_everything(cls, value: list[BackendConfig]) -> list[BackendConfig]:
         if len({backend.name for backend in value}) < len(value):
             raise ValueError("each backend can be named once")
@@ -285,7 +316,9 @@ class Config(Settings):
         """Return the backends that fuse the base units: those named, and the one they are checked against."""
         if self.check is None or self.check in (SAMPLE, *(backend.name for backend in self.backends)):
             return [*self.backends]
-        return [*self.backends, BackendConfig.of(self.check)]
+        checking, fusing = BackendConfig.of(self.check), {backend.name: backend for backend in self.backends}
+        by_rule = [checking.like(backend) for backend in self.backends]
+        return [*self.backends, *{each.name: each for each in by_rule if each.name not in fusing}.values()]
 
     def only(self, parts: Sequence[str]) -> Config:
         """Return the base units and these parts alone: sweeps, 'shared_taxonomy', 'backends'.

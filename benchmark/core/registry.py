@@ -17,6 +17,9 @@ from typing import Any
 from semstab.core.code import Code, may_run
 from semstab.errors import ConfigError, MissingDependencyError, nearest, summarize_error
 
+BY_RULE = "+"
+"""Stands between the name of a backend and that of the rule by which it fuses: 'numba+bayes'."""
+
 _code: dict[tuple[str, str], str] = {}
 """Code of users by kind and name; see `semstab.core.code`."""
 

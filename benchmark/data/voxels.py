@@ -97,6 +97,10 @@ OF_VOXELS: Types = INDEX | {
     "op": np.int32, "evidence": np.float64, "drift_sum": np.float64, "pixels": np.int64, "first_frame": np.int32,
     "last_frame": np.int32, "self_sum": np.float64, "frame_entropy_sum": np.float64,
 }  # fmt: skip
+WEIGHT: Types = {"weight": np.float64}
+OF_FRAMES = ("self_sum", "frame_entropy_sum")
+"""The column of maps by other rules, and those that they do not have."""
+
 OF_EVENTS: Types = {"voxel": np.int32, "frame": np.int32, "evidence": np.float64, "pixels": np.int32}
 """The columns of both by name: the index of a voxel, then those of its row and of an observation."""
 
@@ -164,6 +168,8 @@ class VoxelTable:
         frame_entropy_sum: (n,) float64 sum over frames of the entropy of s_bar, bits.
         voxel_size: r, metres.
         classes: The K class names, where they are known.
+        weight: (n,) float64 what the rows of evidence sum to, where that is not OP, as by another rule than the mean;
+            sums over frames of a function of s_bar are then NaN, since they say nothing of such evidence.
 
     Raises:
         DataError: If columns disagree in length or rows are not sorted and distinct.
@@ -190,9 +196,13 @@ class VoxelTable:
     frame_entropy_sum: Float64
     voxel_size: float
     classes: tuple[str, ...] = ()
+    weight: Float64 | None = None
 
     def __post_init__(self) -> None:
-        freeze(self, OF_VOXELS, self.ix)
+        if self.weight is not None:
+            for name in OF_FRAMES:
+                object.__setattr__(self, name, np.full(len(self.ix), np.nan))
+        freeze(self, self._types, self.ix)
         if self.classes and len(self.classes) != self.K:
             raise DataError(f"voxel table: evidence of shape {self.evidence.shape} for {len(self.classes)} classes")
         ascends = self.iz[1:] > self.iz[:-1]
@@ -200,6 +210,23 @@ class VoxelTable:
             ascends = (column[1:] > column[:-1]) | ((column[1:] == column[:-1]) & ascends)
         if not ascends.all():
             raise DataError("voxel table: rows must be distinct and sorted by ix, iy, iz")
+
+    @property
+    def _types(self) -> Types:
+        return OF_VOXELS if self.weight is None else OF_VOXELS | WEIGHT
+
+    @property
+    def counts_frames(self) -> bool:
+        """Whether its evidence is the sum of one distribution a frame, so that it tells how frames agree."""
+        return not np.isnan(self.self_sum).any()
+
+    def summing_to_op(self) -> VoxelTable:
+        """Return the same map, its rows of evidence scaled to sum to OP, as beliefs of voxels are added up."""
+        if self.weight is None:
+            return self
+        scale = np.repeat(self.op / self.weight, np.diff(self.evidence.starts))
+        evidence = replace(self.evidence, weight=self.evidence.weight * scale, known=None)
+        return replace(self, evidence=evidence, weight=None)
 
     def __repr__(self) -> str:
         return f"<VoxelTable: {len(self):,} voxels of {self.voxel_size:g} m, {self.K} classes>"
@@ -224,7 +251,7 @@ class VoxelTable:
 
     def rows(self, rows: Any) -> VoxelTable:
         """Return the table of some of its voxels: a slice, their numbers ascending, or a mask (n,)."""
-        columns: dict[str, Any] = {name: getattr(self, name)[rows] for name in OF_VOXELS if name != "evidence"}
+        columns: dict[str, Any] = {name: getattr(self, name)[rows] for name in self._types if name != "evidence"}
         return replace(self, **columns, evidence=self.evidence.take(rows))
 
     def measured(self) -> VoxelTable:
@@ -251,7 +278,7 @@ class VoxelTable:
             "ix": self.ix, "iy": self.iy, "iz": self.iz, "x": x, "y": y, "z": z, "op": self.op,
             "label": dominant(self), "class": named(dominant(self), names),
             **{measure.key: measure.of(self) for measure in measures()},
-            **{name: getattr(self, name) for name in OF_VOXELS if name not in (*INDEX, "op", "evidence")},
+            **{name: getattr(self, name) for name in self._types if name not in (*INDEX, "op", "evidence")},
             **{f"evidence_{name}": evidence[:, k] for k, name in enumerate(names)},
         }  # fmt: skip
 
@@ -286,7 +313,7 @@ class VoxelTable:
 
         def columns(chunk: slice) -> dict[str, npt.NDArray[Any]]:
             part = self.rows(chunk)
-            own = {name: np.asarray(getattr(part, name)) for name in OF_VOXELS}
+            own = {name: np.asarray(getattr(part, name)) for name in self._types}
             made = {name: of(part) for name, of in (computed or {}).items()}
             return own | made | {name: values[chunk] for name, values in (extra or {}).items()}
 
@@ -333,7 +360,7 @@ class VoxelTable:
         order = in_order(index)
         columns: dict[str, Any] = {
             name: np.concatenate([getattr(part, name) for part in parts])[order]
-            for name in OF_VOXELS
+            for name in parts[0]._types
             if name != "evidence"
         }
         evidence = Evidence.joined([part.evidence for part in parts], order)
@@ -342,7 +369,7 @@ class VoxelTable:
     @classmethod
     def _read(cls, path: Path) -> VoxelTable:
         with parquet.reading(path):
-            return cls(**parquet.read(path, OF_VOXELS))
+            return cls(**parquet.read(path, [*OF_VOXELS, *(WEIGHT.keys() & parquet.names_in(path))]))
 
 
 # A part of space that a map is restricted to: whole columns of voxels.

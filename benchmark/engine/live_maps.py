@@ -83,9 +83,9 @@ class LiveMap:
         if work.fuses:
             live.backend = live.new_map()
             if unit.compares_truth and truth_task(task) is not None:
-                live.truth = live.new_map(log=False)
+                live.truth = live.new_map(log=False, by_rule=False)
             if unit.sampled:
-                live.reference = NumpySample(config.voxel_size, K, work.within)
+                live.reference = NumpySample(config.voxel_size, K, work.within, **config.backends[0].ruled)
         if unit.assessed and work.measures_images:
             live.sampler = Sampler(K)
         return live
@@ -100,9 +100,13 @@ class LiveMap:
         """Its settings."""
         return self.work.unit.config
 
-    def new_map(self, *, log: bool = True) -> FusionBackend:
-        """Return an empty map; it keeps its log where that is to be written, or statistics are computed from it."""
+    def new_map(self, *, log: bool = True, by_rule: bool = True) -> FusionBackend:
+        """Return an empty map; it keeps its log where that is to be written, or statistics are computed from it.
+
+        Without its rule it is a map of the mean.
+        """
         config, (backend,), K = self.config, self.config.backends, len(self.task.mapping.target)
+        backend = backend if by_rule else backend.fusing_by("mean")
         wanted = log and (config.events or config.statistics) and takes_option(backend.name, "history")
         options = ({"history": True} if wanted else {}) | backend.options
         return create(backend.name, voxel_size=config.voxel_size, num_classes=K, within=self.work.within, **options)

@@ -166,24 +166,26 @@ def _fused_map(live: LiveMap, watch: Stopwatch) -> FusedMap:
 
 
 OF_OP = 1e-6
-"""Largest difference of a voxel's summed evidence from its OP, divided by OP."""
+"""Largest difference of a voxel's summed evidence from its OP or weight, divided by that."""
 
 
 def _check_evidence(table: VoxelTable, name: UnitName) -> None:
-    """Raise DataError where a backend's evidence of a voxel does not sum to its OP."""
+    """Raise DataError where a backend's evidence of a voxel does not sum to its OP, or to the weight that it states."""
+    stated, what = (table.op, "OP") if table.weight is None else (table.weight, "weight")
     starts, _, weight = table.evidence.entries
     for some in stretches(len(table)):
-        first, op = starts[some], table.op[some]
+        first, op = starts[some], stated[some]
         total, filled = np.zeros(len(op)), starts[some.start + 1 : some.stop + 1] > first
         total[filled] = np.add.reduceat(weight[: starts[some.stop]], first[filled]) if filled.any() else 0.0
-        wrong = np.flatnonzero(~(np.abs(total - op) <= OF_OP * op))
+        wrong = np.flatnonzero(~((np.abs(total - op) <= OF_OP * op) & (op > 0)))
         if len(wrong):
             row = some.start + wrong[0]
             voxel = ", ".join(str(axis[row]) for axis in (table.ix, table.iy, table.iz))
             raise DataError(
                 f"{name.scene}, {name.model}: backend '{name.backend}': the evidence of voxel ({voxel}) sums to"
-                f" {total[wrong[0]]:g}, and its OP is {op[wrong[0]]}; add one distribution over the classes for each"
-                " frame that sees a voxel (semstab.testing.BackendConformance finds where it goes wrong)"
+                f" {total[wrong[0]]:g}, and its {what} is {op[wrong[0]]:g}; add one distribution over the classes for"
+                " each frame that sees a voxel, or state in the column `weight` what a row sums to"
+                " (semstab.testing.BackendConformance finds where it goes wrong)"
             )
 
 

@@ -11,6 +11,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
+from semstab.backends import rule_of
 from semstab.check import Verdict
 from semstab.config import BACKENDS, BASE, Config
 from semstab.core.process import Stopwatch
@@ -114,7 +115,8 @@ def _agreements(config: Config, records: Sequence[Record], tables: Tables, *, mu
             groups.setdefault((record.unit.scene, record.unit.model), []).append(record)
     for group in groups.values():
         for a, b in itertools.combinations(group, 2) if must else zip(group[:1] * len(group), group[1:], strict=False):
-            if must == ({a.unit.backend, b.unit.backend} <= checked):
+            names = {a.unit.backend, b.unit.backend}
+            if must == (names <= checked and len({*map(rule_of, names)}) == 1):
                 yield _alike(config, a, b, tables)
 
 

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
 
-from semstab.backends import check_options, is_pointwise, keeps_log
+from semstab.backends import by_own_rule, check_options, is_pointwise, keeps_log
 from semstab.config import (
     BACKENDS,
     BASE,
@@ -25,7 +25,7 @@ from semstab.config import (
     Perturbation,
     Sweeps,
 )
-from semstab.core.code import Code
+from semstab.core.code import Code, is_code
 from semstab.data.distances import distances_of
 from semstab.data.labels import LabelSpace
 from semstab.data.measures import measures
@@ -264,7 +264,7 @@ def _check_video(config: Config, task: Task) -> None:
 
 def _is_sampled(config: Config, backend: BackendConfig) -> bool:
     """Return whether what that backend fuses is checked against a sample: not the reference itself."""
-    return config.check == SAMPLE and backend.name != "numpy" and must_agree(backend)
+    return config.check == SAMPLE and by_own_rule(backend.name) != "numpy" and must_agree(backend)
 
 
 def must_agree(backend: BackendConfig) -> bool:
@@ -362,9 +362,11 @@ def _check_count(variation: Variation, task: Task) -> None:
 def identity(config: Config, task: Task) -> str:
     """Return the hash of the settings that a unit's numbers depend on in addition to its input."""
     mapping, filtering = task.mapping, task.scene.filtering(task.model)
+    rule = config.backends[0].options.get("rule")
     content: dict[str, Any] = {
         "unit": dataclasses.asdict(task.units[0]),
         "options": config.backends[0].options,
+        **({"rule": Code.load(rule, "rule").digest} if isinstance(rule, str) and is_code(rule) else {}),
         **({} if config.backends[0].code is None else {"code": Code.load(config.backends[0].code, "backend").digest}),
         "frames": [*task.indices],
         "taxonomy": [mapping.target.name, mapping.target.classes, mapping.source.ids, mapping.rows],

@@ -129,6 +129,11 @@ def _without(vote: Observations, lookup: VoxelLookup, seen: VoxelTable, rows: In
     seen_rows = lookup.rows(centers)
     met = seen_rows != NONE
     at = np.searchsorted(rows, seen_rows[met])
+    if seen.weight is not None:
+        raise ConfigError(
+            "leave_one_out: no frame's vote can be taken away from evidence by another rule than the mean; do without,"
+            " or take a map by the mean (--backend)"
+        )
     evidence, op, self_sum = seen.evidence[:], seen.op.copy(), seen.self_sum.copy()
     evidence[at] = np.abs(np.round(evidence[at] - vote.s_bar[met], DECIMALS))
     op[at] -= 1

@@ -83,6 +83,7 @@ class TableSums:
     @classmethod
     def of(cls, table: VoxelTable, edges: Sequence[int] = STRATA) -> TableSums:
         """Return the sums of a table."""
+        table = table.summing_to_op()
         steps = _steps(edges)
         groups = (len(edges) + 1, table.K, 2, len(steps) + 1)
         sums = [np.zeros((1 + 3 * len(measures()), n)) for n in groups]

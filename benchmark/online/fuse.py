@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from semstab.api import run
+from semstab.config import BackendConfig
 from semstab.configure import as_config
 from semstab.core.files import ScratchFolder
 from semstab.data.frames import Frame
@@ -70,6 +71,7 @@ def fuse(
     *,
     voxel_size: float | None = None,
     backend: str = "numba",
+    rule: str = "mean",
     classes: Iterable[str] = (),
     scene: str = "frames",
     model: str = "model",
@@ -85,6 +87,7 @@ def fuse(
             torch. A generator is read once; its frames wait on disk, in a temporary folder.
         voxel_size: Edge of a voxel, metres; by default the size that `check` suggests for the data.
         backend: Name of the backend that fuses.
+        rule: Rule by which it fuses: votes, bayes, weighted, recent, ..., or FILE.py:NAME; docs/fusion-rules.md.
         classes: Names, in the order of the labels.
         scene: Name of the scene.
         model: Name of the model.
@@ -107,7 +110,8 @@ def fuse(
     sequence, token = Sequence(frames), uuid.uuid4().hex
     Frames.sequences[token] = sequence
     options = {"token": token, "scene": scene, "model": model, "classes": tuple(classes)}
-    content = {"name": scene, "dataset": {"name": "frames", "options": options}, "backends": [backend], **settings}
+    fused_by = BackendConfig.of(backend).fusing_by(rule)
+    content = {"name": scene, "dataset": {"name": "frames", "options": options}, "backends": [fused_by], **settings}
     config = as_config(content if voxel_size is None else {**content, "voxel_size": voxel_size})
     folder = ScratchFolder()
     with contextlib.ExitStack() as stack:

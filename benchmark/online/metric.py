@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from semstab.backends import FusionBackend, check_options, create
+from semstab.backends import FusionBackend, check_options, create, rule_of
 from semstab.backends.numpy_reference import ODD, in_sample
 from semstab.backends.shared.pixel_keys import drawn_of
 from semstab.core.types import Float64, Int64
@@ -198,6 +198,11 @@ class TemporalStability:
             raise ConfigError(f"num_classes = {num_classes}: stability needs at least 2 classes")
         if max_voxels < 1:
             raise ConfigError(f"max_voxels = {max_voxels}: use 1 or more")
+        if rule := rule_of(backend):
+            raise ConfigError(
+                f"backend '{backend}': maps by rule '{rule}' cannot be added up over processes; use the mean here, or"
+                " semstab.fuse(frames, rule=...)"
+            )
         check_options(backend, voxel_size=voxel_size, num_classes=num_classes)
         self.num_classes, self.voxel_size, self.ignore_index, self.soft = num_classes, voxel_size, ignore_index, soft
         self.alpha, self.max_voxels, self.backend = alpha, max_voxels, backend

@@ -8,7 +8,9 @@ from collections.abc import Iterator, Mapping, Sequence
 
 import yaml
 
+from semstab.backends import rule_of
 from semstab.comparison.caution import suspicions
+from semstab.config import BACKENDS, BASE
 from semstab.data.measures import VSS
 from semstab.data.records import Record, Result
 from semstab.data.results import UnitSummary, VoxelAdvice
@@ -76,11 +78,24 @@ def warnings(result: Result) -> Iterator[str]:
     if stable:
         names = ", ".join(dict.fromkeys(record.unit.model for record in stable))
         yield f"stable means that frames of {names} agree, not that they are right: no ground truth was compared"
+    yield from _not_counting_frames(result)
     if mixed(runs):
         yield "VSS, entropy and voxel alpha do not compare labels with soft scores: semstab-bench show RUN reduced"
     for record in result.select():
         yield from (f"{_name(record.summary, result)}: {text}" for text in (*_suspicions(record), *_traffic(record)))
     yield from _one_class_covers(runs)
+
+
+def _not_counting_frames(result: Result) -> Iterator[str]:
+    """Yield which maps have evidence by another rule than the mean, of which what counts frames is not known."""
+    units = [record.summary for sweep in (BASE, BACKENDS) for record in result.select(sweep)]
+    known = [(run.unit.backend, run.statistics) for run in units if run.statistics is not None]
+    names = [name for name, found in known if found.repeated.voxels and math.isnan(found.agreement.psa_op2.value)]
+    if names:
+        yield (
+            f"{', '.join(dict.fromkeys(names))}: evidence by this rule does not count frames, so that PSA, voxel alpha,"
+            " consistent locations and the null of SBD are not known; VSS, SBD, entropy, margin, labels and OP are"
+        )
 
 
 def _one_class_covers(runs: Sequence[UnitSummary]) -> Iterator[str]:
@@ -267,7 +282,11 @@ def _implementations(result: Result) -> Iterator[str]:
         pairs = [row for row in result.compared if row.backends[1] == name]
         missing = macro_mean([row.only_in[0] / max(1, row.voxels[0]) for row in pairs])
         other = macro_mean([row.differences["label"].mean for row in pairs])
+        base = pairs[0].backends[0]
+        way = (
+            "fuses by another rule" if rule_of(name) != rule_of(base) else "associates pixels and voxels in another way"
+        )
         yield (
-            f"{name} associates pixels and voxels in another way than {pairs[0].backends[0]}. It does not have"
+            f"{name} {way} than {base}. It does not have"
             f" {missing:.0%} of its voxels, and gives another label to {other:.1%} of those that both have."
         )

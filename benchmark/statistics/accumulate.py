@@ -272,6 +272,10 @@ def _with_frameless_sums(
     )
 
 
+OF_FRAMES = ("psa", "agreeing", "own", "twice_agreeing", "observed_right", "consistent", "consistent_wrong")
+"""Sums that are unknown where evidence does not count frames."""
+
+
 def _sums_of_table(table: VoxelTable, cubes: Cubes, true_label: Int64 | None, likely: Float64 | None) -> ClusterSums:
     """Return the sums of the locations of a table: each counts as a whole, and frames are unknown.
 
@@ -302,6 +306,9 @@ def _sums_of_table(table: VoxelTable, cubes: Cubes, true_label: Int64 | None, li
     sums = np.zeros((cubes.count, width(slices)))
     for name, column in zip(values, by_group(cubes.at, [*values.values()], cubes.count)[0].T, strict=True):
         sums[:, slices[name].start] = column
+    if not table.counts_frames:
+        for name in {*values} & {*OF_FRAMES}:
+            sums[:, slices[name].start] = np.nan
     for name, columns in by_class.items():
         sums[:, slices[name]] = columns
     unknown = np.full(cubes.count, -1, dtype=np.int32)

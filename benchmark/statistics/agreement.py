@@ -337,8 +337,11 @@ def consistency_posterior(
     Of T frames m vote for the dominant class, which happens with the probability b(m; T, p) + b(T - m; T, p) where its
     share is p. How many locations have which p is estimated from all of them without any form of its distribution
     (Kiefer and Wolfowitz 1956, Annals of Mathematical Statistics 27; by the EM algorithm), then Bayes' theorem is
-    applied. `shares` are those of the whole map, where the table has only some of its locations.
+    applied. `shares` are those of the whole map, where the table has only some of its locations. Of evidence that does
+    not count frames it is unknown: NaN.
     """
+    if not table.counts_frames:
+        return np.full(len(table), np.nan)
     seen, most, of = _votes(table)
     posterior = _likelihood(seen, most) * (shares_of(table) if shares is None else shares)
     posterior /= posterior.sum(axis=1, keepdims=True)

@@ -220,7 +220,7 @@ def quadrants(table: VoxelTable, truth: Truth, consistent: Float64, edge: float,
         wrong: The share of the consistent voxels that are wrong, with the interval of the headline.
     """
     counted, likely, right = _masks(table, truth, consistent)
-    if not counted.any():
+    if not (counted.any() and table.counts_frames):
         return Quadrants(0, *[UNKNOWN] * 5)
     cubes = Cubes.of(table, edge, where=counted)
     parts = (likely * right, likely * ~right, (1 - likely) * right, (1 - likely) * ~right)

@@ -103,6 +103,7 @@ class Analysis:
         Columns that need the log are NaN for voxels that were not drawn. True labels are known for the drawn voxels
         (-1 elsewhere), and for all where `truth`, the true labels' map of the part, is given.
         """
+        table = table.summing_to_op()
         rows, drawn = shared_rows(table, self.sample.table)
         spread: Columns = {}
         for name, values in self.drawn.items():

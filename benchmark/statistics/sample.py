@@ -59,6 +59,7 @@ class MapSample:
             require_same_map(table, events)
         if truth is not None:
             require_same_grid(table, truth)
+        table = table.summing_to_op()
         summary = TableSums.of(table, edges)
         if len(table) > most:
             rows = _drawn(table, most)

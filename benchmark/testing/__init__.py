@@ -70,4 +70,6 @@ class BackendConformance(EvidenceTests, GeometryTests, ContractTests, PropertyTe
             points beyond are refused.
         long_cases: Whether the cases of very many frames (65,538) are run too.
         scans: Whether the backend fuses scans of points too; False where it takes images alone.
+        scores: Whether it fuses soft scores too; False where it takes labels alone. Tests of what is left out are
+            skipped.
     """

@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+import functools
 import math
 import re
-from collections.abc import Iterable, Sequence
-from typing import Any
+from collections.abc import Callable, Iterable, Sequence
+from typing import Any, cast
 
 import numpy as np
 import pytest
@@ -17,6 +18,7 @@ from semstab.conformance import random_frames
 from semstab.core.types import Float64
 from semstab.data.frames import Frame, Intrinsics
 from semstab.data.measures import SBD_MAX
+from semstab.data.results import FrameReport
 from semstab.data.voxels import VoxelTable
 from semstab.metrics import entropy, sbd, vss
 from semstab.metrics.agreement import mismatches
@@ -113,15 +115,17 @@ EXACT = ("ix", "iy", "iz", "op", "pixels", "first_frame", "last_frame")
 SUMS = ("evidence", "drift_sum", "self_sum", "frame_entropy_sum")
 
 
-def assert_same_map(a: VoxelTable, b: VoxelTable, tolerance: float, leaving_out: Sequence[str] = ()) -> None:
+def assert_same_map(
+    a: VoxelTable, b: VoxelTable, tolerance: float, leaving_out: Sequence[str] = (), cause: Callable[[], str] = str
+) -> None:
     """Assert that the voxels and rows of `a` are those of `b`, the expected ones.
 
     Counts are equal, sums agree to `tolerance`, those above 1 relative to the sum. The error says what `conform` says:
-    column, voxel, what it is and what was expected.
+    column, voxel, what it is and what was expected, and the likely cause.
     """
     columns = {*EXACT, *SUMS} - {*leaving_out}
     wrong = [m for m in mismatches(a, b, tolerance) if re.sub(r"_\d+$", "", m.column) in columns]
-    assert not wrong, "; ".join(map(str, wrong))
+    assert not wrong, "; ".join([*map(str, wrong), *(f"likely: {known}" for known in [cause()] if known)])
 
 
 def share_that_differs(a: VoxelTable, b: VoxelTable, tolerance: float) -> float:
@@ -142,6 +146,31 @@ def _rows(table: VoxelTable) -> dict[Voxel, Float64]:
     return dict(zip(voxels(table), np.concatenate(columns, axis=1), strict=True))
 
 
+class _Partial:
+    """A backend that leaves something out: a test that gives it that is skipped."""
+
+    def __init__(self, backend: FusionBackend, tests: BackendTests) -> None:
+        self._backend, self._tests = backend, tests
+
+    def integrate(self, frame: Frame) -> FrameReport:
+        if not self._tests.takes(frame):
+            left_out = "scores" if frame.scores is not None and not self._tests.scores else "scans"
+            pytest.skip(f"{left_out} = False: this backend does without")
+        return self._backend.integrate(frame)
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self._backend, name)
+
+
+def _as_declared(create: Callable[..., FusionBackend]) -> Callable[..., FusionBackend]:
+    @functools.wraps(create)
+    def made(tests: BackendTests, voxel_size: float, num_classes: int) -> FusionBackend:
+        backend = create(tests, voxel_size, num_classes)
+        return backend if tests.scans and tests.scores else cast(FusionBackend, _Partial(backend, tests))
+
+    return made
+
+
 # Common to all groups of tests: a backend to test, and the fusion with it.
 
 
@@ -153,6 +182,16 @@ class BackendTests:
     reach: int = 2**31
     long_cases: bool = False
     scans: bool = True
+    scores: bool = True
+
+    def __init_subclass__(cls, **options: Any) -> None:
+        super().__init_subclass__(**options)
+        if "create" in vars(cls):
+            cls.create = _as_declared(cls.create)  # type: ignore[method-assign]
+
+    def takes(self, frame: Frame) -> bool:
+        """Return whether the backend is declared to fuse such a frame."""
+        return (self.scans or not frame.is_scan) and (self.scores or frame.scores is None)
 
     def create(self, voxel_size: float, num_classes: int) -> FusionBackend:
         """Return a new, empty map."""

@@ -2,9 +2,21 @@
 
 from __future__ import annotations
 
+import functools
+
 import pytest
 
-from semstab.conformance import AT_FACES, LONG, OF_SCANS, case_folder, case_names, expected_table, read_case
+from semstab.conformance import (
+    AT_FACES,
+    LONG,
+    OF_SCANS,
+    as_rows,
+    case_folder,
+    case_names,
+    expected_table,
+    likely_cause,
+    read_case,
+)
 from semstab.data.voxels import VoxelTable
 from semstab.testing.builders import BackendTests, assert_same_map, share_that_differs
 
@@ -23,7 +35,9 @@ class CaseTests(BackendTests):
             pytest.skip("this backend may decide otherwise at a face")
         table, expected = self.fuse_case(case), expected_table(case)
         if not self.voxel_share or share_that_differs(table, expected, self.tolerance) > self.voxel_share:
-            assert_same_map(table, expected, self.tolerance)
+            voxel_size, K, frames = read_case(case_folder(case))
+            cause = functools.partial(likely_cause, voxel_size, K, frames, as_rows(expected), as_rows(table))
+            assert_same_map(table, expected, self.tolerance, cause=cause)
 
     def fuse_case(self, case: str) -> VoxelTable:
         """Return the map of a case's frames."""

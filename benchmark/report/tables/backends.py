@@ -69,7 +69,7 @@ def _backend_row(backend: str, mean: Pooled, base: Pooled) -> Row:
 
 
 def compared(result: Result) -> list[Table]:
-    """Return the differences of maps by backends that associate pixels and voxels in another way than the base one."""
+    """Return the differences of maps by backends that fuse in another way than the base one."""
     if not result.compared:
         return []
     titles = {"op": "OP", **{measure.key: measure.title for measure in measures() if not measure.lowest_op > 1}}
@@ -87,8 +87,8 @@ def compared(result: Result) -> list[Table]:
         for pair in pairs
     )
     caption = (
-        "The same frames were fused by backends that associate pixels and voxels in another way; their maps need not"
-        " agree. Labels and differences, which have no sign, are of the voxels that both maps have."
+        "The same frames were fused by another rule, or by backends that associate pixels and voxels in another way;"
+        " their maps need not agree. Labels and differences, which have no sign, are of the voxels that both maps have."
     )
     return [Table("fusion_compared", "Differences of fusion implementations", caption, columns, groups, "backends")]
 
