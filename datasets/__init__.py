@@ -119,6 +119,10 @@ REGISTRY = Registry(
         ),
         "nuscenes": Entry("semstab.datasets.nuscenes:NuScenes", "nuScenes lidarseg: LiDAR key frames, a class a point"),
         "kitti360": Entry("semstab.datasets.kitti360:Kitti360", "KITTI-360: velodyne scans of its raw data"),
+        "kitti360_images": Entry(
+            "semstab.datasets.kitti360_images:Kitti360Images",
+            "KITTI-360: rectified camera images, with depth of the LiDAR's points",
+        ),
         "points_folder": Entry(
             "semstab.datasets.points_folder:PointsFolder",
             "folders points/ (LAS, LAZ, PLY, NPY), pose/ and labels/MODEL/, one file a scan",
