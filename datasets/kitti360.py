@@ -82,6 +82,6 @@ def camera_in_imu(folder: Path, camera: str) -> Float64:
 
 def lidar_in_imu(folder: Path) -> Float64:
     """Return the pose (4, 4) of the LiDAR in the IMU: of camera 0 in the IMU, after that of the LiDAR in camera 0."""
-    path = folder / "calib_cam_to_velo.txt"
+    T_ic, path = camera_in_imu(folder, CAMERA), folder / "calib_cam_to_velo.txt"
     T_lc = matrix_of(read_table(path, 12, "r11 r12 r13 t1 ...")[0])
-    return camera_in_imu(folder, CAMERA) @ rigid_inverse(T_lc, str(path))
+    return T_ic @ rigid_inverse(T_lc, str(path))

@@ -6,11 +6,22 @@ import json
 
 import numpy as np
 import pytest
-from dataset_writers import FORMATS, opened, save, save_hdf5, source, write_hypersim, write_labelled, write_lines
+from dataset_writers import (
+    FORMATS,
+    opened,
+    save,
+    save_hdf5,
+    save_rgba,
+    source,
+    write_hypersim,
+    write_labelled,
+    write_lines,
+)
 from posed_scene import fails
 from scipy.spatial.transform import Rotation
 
 from semstab.data.labels import LabelSpace
+from semstab.datasets import recognise
 from semstab.datasets.hypersim import read_lens
 from semstab.errors import DataError
 
@@ -232,3 +243,104 @@ def test_what_is_wrong_in_hypersim_is_named(tmp_path, damage, said):
 def test_poses_of_hypersim_in_inches_become_metres(tmp_path):
     write_hypersim(tmp_path, source(256), unit=0.0254)
     np.testing.assert_allclose(opened(HYPERSIM, tmp_path).T_wc(3), source(256)[3].T_wc, atol=1e-12)
+
+
+# --- CARLA
+
+
+CARLA, KITTI_CARLA = FORMATS["carla"], FORMATS["carla, KITTI-CARLA"]
+
+
+def rgba(red, green=0, blue=0):
+    one = np.broadcast_to(0, np.shape(red))
+    return np.stack([one + red, one + green, one + blue, one + 255], axis=2).astype(np.uint8)
+
+
+def test_a_pixel_of_carla_lies_where_its_left_handed_pose_says(tmp_path):
+    """By the matrix of carla.Transform: x forward, y right, z up, in the world and in the camera."""
+    write_labelled(CARLA, tmp_path)
+    units = np.full((32, 48), 200_000)
+    save_rgba(tmp_path / "depth/000000.png", rgba(units & 255, units >> 8 & 255, units >> 16))
+    pitch, yaw, roll = np.radians([-20, 70, 5])
+    pose = {"x": 12.0, "y": -7.0, "z": 3.0, "pitch": -20.0, "yaw": 70.0, "roll": 5.0}
+    (tmp_path / "camera/000000.json").write_text(json.dumps(pose))
+    frame = opened(CARLA, tmp_path, intrinsics=None, fov=70).frame(0, "net")
+    z = 200_000 / (2**24 - 1) * 1000
+    assert frame.depth[3, 40] == pytest.approx(z, rel=1e-6)
+    f = 24 / np.tan(np.radians(35))
+    local = np.array([1.0, (40 - 23.5) / f, -(3 - 15.5) / f]) * z
+    by_yaw = np.array([[np.cos(yaw), -np.sin(yaw), 0], [np.sin(yaw), np.cos(yaw), 0], [0, 0, 1]])
+    by_pitch = np.array([[np.cos(pitch), 0, -np.sin(pitch)], [0, 1, 0], [np.sin(pitch), 0, np.cos(pitch)]])
+    by_roll = np.array([[1, 0, 0], [0, np.cos(roll), np.sin(roll)], [0, -np.sin(roll), np.cos(roll)]])
+    x, y, up = by_yaw @ by_pitch @ by_roll @ local + [12, -7, 3]
+    ours = frame.T_wc @ [(40 - 23.5) / f * z, (3 - 15.5) / f * z, z, 1]
+    np.testing.assert_allclose(ours[:3], [x, -y, up], atol=1e-3)
+
+
+def test_a_pixel_of_kitti_carla_is_seen_over_72_degrees_at_the_time_of_its_image(tmp_path):
+    write_labelled(KITTI_CARLA, tmp_path)
+    scene = opened(KITTI_CARLA, tmp_path, intrinsics=None)
+    assert scene.intrinsics(0, (32, 48)).fx == pytest.approx(24 / np.tan(np.radians(36)))
+    assert scene.timestamps.tolist() == pytest.approx([0, 0.1, 0.2, 0.3])
+    np.testing.assert_allclose(scene.T_wc(2), source(1000)[2].T_wc, atol=1e-9)
+
+
+@pytest.mark.parametrize(("tags", "name"), [("carla", "road"), ("carla23", "building")])
+def test_tags_of_carla_are_the_red_channel_and_mean_what_its_version_says(tmp_path, tags, name):
+    write_labelled(CARLA, tmp_path)
+    save_rgba(tmp_path / "semantic/000000.png", rgba(pattern(int)))
+    save(tmp_path / "semantic/000001.png", pattern(np.uint8))
+    scene = opened(CARLA, tmp_path, tags=tags)
+    space = scene.label_space("gt")
+    assert space.classes[space.ids.index(1)] == name
+    for k in (0, 1):
+        np.testing.assert_array_equal(scene.frame(k, "gt").labels, np.where(pattern(int) == 0, 255, pattern(int)))
+
+
+def test_tags_of_kitti_carla_are_colours(tmp_path):
+    write_labelled(KITTI_CARLA, tmp_path)
+    colours = np.array(LabelSpace.load("carla23").colors)[pattern(int)]
+    save_rgba(tmp_path / "images_ss/0000_10.png", rgba(*np.moveaxis(colours, 2, 0)))
+    scene = opened(KITTI_CARLA, tmp_path)
+    np.testing.assert_array_equal(scene.frame(0, "gt").labels, np.where(pattern(int) == 0, 255, pattern(int)))
+    save_rgba(tmp_path / "images_ss/0000_10.png", rgba(pattern(int), 7, 9))
+    fails(DataError, r"0000_10\.png: colour \(\d, 7, 9\) at pixel", opened(KITTI_CARLA, tmp_path).frame, 0, "gt")
+
+
+@pytest.mark.parametrize(
+    ("form", "damage", "said"),
+    [
+        (
+            CARLA,
+            lambda f: save(f / "depth/000000.png", np.full((32, 48, 3), 90, np.uint8)),
+            r"000000\.png: its three channels are equal: a picture of the depth, .* without a ColorConverter",
+        ),
+        (CARLA, lambda f: (f / "camera/000002.json").unlink(), r"000002\.json: is missing; it holds x, y, z, pitch"),
+        (
+            KITTI_CARLA,
+            lambda f: replace_in(f / "full_ts_camera.txt", "\n2 0.2", ""),
+            r"full_ts_camera\.txt: has no row of image 0002",
+        ),
+        (
+            KITTI_CARLA,
+            lambda f: replace_in(f / "full_ts_camera.txt", "\n2 0.2", "\n2 0.22"),
+            r"full_poses_lidar\.txt: has no pose at 0\.22 s, of image 0002",
+        ),
+        (KITTI_CARLA, lambda f: (f / "lidar_to_cam0.txt").unlink(), r"lidar_to_cam0\.txt: cannot be read"),
+        (
+            KITTI_CARLA,
+            lambda f: replace_in(f / "lidar_to_cam0.txt", "-1.0", "-0.5"),
+            r"lidar_to_cam0\.txt: the rotation is not orthonormal",
+        ),
+    ],
+)
+def test_what_is_wrong_in_carla_is_named(tmp_path, form, damage, said):
+    write_labelled(form, tmp_path)
+    damage(tmp_path)
+    fails(DataError, said, lambda: opened(form, tmp_path).frame(0, "net"))
+
+
+def test_carla_and_syndrone_are_told_apart_by_the_coding_of_depth(tmp_path):
+    for name in ("carla", "carla, KITTI-CARLA", "syndrone"):
+        write_labelled(FORMATS[name], tmp_path / name)
+        assert recognise(tmp_path / name)[0] == FORMATS[name].dataset
