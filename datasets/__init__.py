@@ -93,6 +93,7 @@ REGISTRY = Registry(
         "tartanair": Entry("semstab.datasets.tartanair:TartanAir", "TartanAir: simulated flights, NED poses"),
         "syndrone": Entry("semstab.datasets.syndrone:Syndrone", "Syndrone: flights simulated by CARLA"),
         "carla": Entry("semstab.datasets.carla:Carla", "CARLA: images as its cameras save them, and KITTI-CARLA"),
+        "airsim": Entry("semstab.datasets.airsim:AirSim", "AirSim: its recordings, airsim_rec.txt and images/"),
         "hypersim": Entry(
             "semstab.datasets.hypersim:Hypersim",
             "Hypersim: rendered rooms, classes of NYU40",
@@ -171,8 +172,8 @@ def open_dataset(name: str, options: dict[str, Any] | BaseModel, run_folder: Pat
 RECOGNISED = (
     "odm", "metashape", "pix4d", "realitycapture", "uavscenes", "hololens", "tum", "seven_scenes", "replica",
     "scannet", "semantickitti", "nuscenes", "kitti360", "tartanair", "stray_scanner", "polycam", "record3d",
-    "arkitscenes", "carla", "syndrone", "midair", "hypersim", "habitat", "virtual_kitti", "transforms_json", "colmap",
-    "bag_scans", "bag", "posed_folder", "points_folder",
+    "arkitscenes", "airsim", "carla", "syndrone", "midair", "hypersim", "habitat", "virtual_kitti", "transforms_json",
+    "colmap", "bag_scans", "bag", "posed_folder", "points_folder",
 )  # fmt: skip
 """Formats that a folder is recognised as: the one whose scenes lie highest, of these the first."""
 

@@ -313,6 +313,24 @@ def write_kitti_carla(folder: Path, frames: Sequence[Frame]) -> list[str]:
     return names
 
 
+def write_airsim(folder: Path, frames: Sequence[Frame], kind: int = 1) -> list[str]:
+    """A recording of a multirotor, whose depth in .pfm begins with the top row; times of images differ by some ns."""
+    start, names = 1_530_000_000_000_000_000, []
+    lines = ["VehicleName\tTimeStamp\tPOS_X\tPOS_Y\tPOS_Z\tQ_W\tQ_X\tQ_Y\tQ_Z\tImageFile"]
+    for k, frame in enumerate(frames):
+        names.append(f"img_Drone_0_0_{start + 100 * k}")
+        save(folder / f"images/{names[-1]}.png", frame.color)
+        depth = f"img_Drone_0_{kind}_{start + 100 * k + 7}.pfm"
+        metres = np.where(frame.depth > 0, frame.depth, np.float32(65504)).astype("<f4")
+        (folder / f"images/{depth}").write_bytes(b"Pf\n%d %d\n-1\n" % metres.shape[::-1] + metres.tobytes())
+        T = with_axes(frame.T_wc, "ned")
+        pose = [*T[:3, 3], *np.roll(quaternion(T[:3, :3]), 1)]
+        columns = "\t".join(repr(float(value)) for value in pose)
+        lines.append(f"Drone\t{1000 + 50 * k}\t{columns}\t{names[-1]}.png;{depth}")
+    write_lines(folder / "airsim_rec.txt", lines)
+    return names
+
+
 def save_rgba(path: Path, image: np.ndarray) -> None:
     path.parent.mkdir(parents=True, exist_ok=True)
     assert cv2.imwrite(str(path), image[..., [2, 1, 0, 3]])
@@ -767,6 +785,7 @@ FORMATS = {
     ),
     "habitat": Format("habitat", write_habitat, 1000, {"intrinsics": camera_option}),
     "virtual_kitti": Format("virtual_kitti", write_virtual_kitti, 100),
+    "airsim": Format("airsim", write_airsim, None, {"intrinsics": camera_option}, sizes_in_images=True),
     "carla": Format("carla", write_carla, BITS_24, {"intrinsics": camera_option}, sizes_in_images=True),
     "carla, KITTI-CARLA": Format(
         "carla", write_kitti_carla, BITS_24, {"intrinsics": camera_option}, sizes_in_images=True
