@@ -67,7 +67,7 @@ class AirSim(FileDataset[AirSimOptions]):
     """{name} is the image's name without suffix: img_0_0_1530000000000000000; that of any image of its row is found."""
 
     Options: type[BaseModel] = AirSimOptions
-    contents = f"{RECORDING}, and images/ with depth in .pfm"
+    contents = f"{RECORDING}, and the images that it names, with depth"
 
     def is_scene(self, folder: Path) -> bool:
         """Return whether a recording is there, and its images."""
