@@ -229,7 +229,7 @@ COMMANDS: Mapping[Callable[..., None], tuple[str, str]] = {
     relabel: ("relabel new --out fused", "relabel new --out steady --category stable"),
     conform: ("conform './fuse'", "conform './fuse' --only pinhole"),
     show: ("show new overview --out overview.tex", "show old new --out glance"),
-    view: ("view new", "view new/recording.rrd", "view new --screenshot view.png"),
+    view: ("view new", "view new/recording.rrd"),
     list_: ("list", "list --check"),
 }  # fmt: skip
 """The commands, with two command lines of each, of a scene `flight` and of finished runs, which end its help."""
