@@ -92,6 +92,8 @@ REGISTRY = Registry(
         "arkitscenes": Entry("semstab.datasets.arkitscenes:ArkitScenes", "ARKitScenes, raw data"),
         "tartanair": Entry("semstab.datasets.tartanair:TartanAir", "TartanAir: simulated flights, NED poses"),
         "syndrone": Entry("semstab.datasets.syndrone:Syndrone", "Syndrone: flights simulated by CARLA"),
+        "carla": Entry("semstab.datasets.carla:Carla", "CARLA: images as its cameras save them, and KITTI-CARLA"),
+        "airsim": Entry("semstab.datasets.airsim:AirSim", "AirSim: its recordings, airsim_rec.txt and images/"),
         "hypersim": Entry(
             "semstab.datasets.hypersim:Hypersim",
             "Hypersim: rendered rooms, classes of NYU40",
@@ -119,6 +121,10 @@ REGISTRY = Registry(
         ),
         "nuscenes": Entry("semstab.datasets.nuscenes:NuScenes", "nuScenes lidarseg: LiDAR key frames, a class a point"),
         "kitti360": Entry("semstab.datasets.kitti360:Kitti360", "KITTI-360: velodyne scans of its raw data"),
+        "kitti360_images": Entry(
+            "semstab.datasets.kitti360_images:Kitti360Images",
+            "KITTI-360: rectified camera images, with depth of the LiDAR's points",
+        ),
         "points_folder": Entry(
             "semstab.datasets.points_folder:PointsFolder",
             "folders points/ (LAS, LAZ, PLY, NPY), pose/ and labels/MODEL/, one file a scan",
@@ -166,8 +172,8 @@ def open_dataset(name: str, options: dict[str, Any] | BaseModel, run_folder: Pat
 RECOGNISED = (
     "odm", "metashape", "pix4d", "realitycapture", "uavscenes", "hololens", "tum", "seven_scenes", "replica",
     "scannet", "semantickitti", "nuscenes", "kitti360", "tartanair", "stray_scanner", "polycam", "record3d",
-    "arkitscenes", "syndrone", "midair", "hypersim", "habitat", "virtual_kitti", "transforms_json", "colmap",
-    "bag_scans", "bag", "posed_folder", "points_folder",
+    "arkitscenes", "airsim", "carla", "syndrone", "midair", "hypersim", "habitat", "virtual_kitti", "transforms_json",
+    "colmap", "bag_scans", "bag", "posed_folder", "points_folder",
 )  # fmt: skip
 """Formats that a folder is recognised as: the one whose scenes lie highest, of these the first."""
 

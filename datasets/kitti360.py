@@ -51,26 +51,37 @@ class Kitti360(ScanDataset[Kitti360Options]):
         """
         folder = entry.folder.absolute()
         root, path = folder.parents[1], folder.parents[1] / "data_poses" / folder.name / "poses.txt"
-        rows = read_table(path, 13, "frame r11 r12 r13 t1 ...")
-        poses = as_poses(rows[:, 1:].reshape(-1, 3, 4), "camera_to_world", path) @ _lidar_in_imu(root / "calibration")
-        by_frame = dict(zip(rows[:, 0].tolist(), poses, strict=True))
+        by_frame, T = imu_poses(path), lidar_in_imu(root / "calibration")
         lost = np.full((4, 4), np.nan)
         for name, points in files_named(folder / "velodyne_points/data", "", ".bin").items():
             if not name.isdecimal():
                 raise DataError(f"{points}: the name is no number of a frame; rename or remove the file")
-            yield ScanSource(name, points, by_frame.get(int(name), lost), path)
+            yield ScanSource(name, points, by_frame.get(int(name), lost) @ T, path)
 
     def points(self, path: Path, read: Read) -> Float32:
         """Return the points of x, y, z and reflectance."""
         return floats_of(path, read(path), 4)[:, :3]
 
 
-def _lidar_in_imu(folder: Path) -> Float64:
+def imu_poses(path: Path) -> dict[float, Float64]:
+    """Return the poses (4, 4) of the IMU in the world, z up, by the frame's number; raises DataError if damaged."""
+    rows = read_table(path, 13, "frame r11 r12 r13 t1 ...")
+    poses = as_poses(rows[:, 1:].reshape(-1, 3, 4), "camera_to_world", path)
+    return dict(zip(rows[:, 0].tolist(), poses, strict=True))
+
+
+def camera_in_imu(folder: Path, camera: str) -> Float64:
+    """Return the pose (4, 4) of a camera, as image_00, in the IMU, by the folder of calibrations; raises DataError."""
+    path = folder / "calib_cam_to_pose.txt"
+    cameras = read_matrices(path)
+    if camera not in cameras:
+        raise DataError(f"{path}: has no line {camera}; get KITTI-360's calibration anew")
+    rigid_inverse(cameras[camera], str(path))
+    return cameras[camera]
+
+
+def lidar_in_imu(folder: Path) -> Float64:
     """Return the pose (4, 4) of the LiDAR in the IMU: of camera 0 in the IMU, after that of the LiDAR in camera 0."""
-    to_imu, to_lidar = folder / "calib_cam_to_pose.txt", folder / "calib_cam_to_velo.txt"
-    cameras = read_matrices(to_imu)
-    if CAMERA not in cameras:
-        raise DataError(f"{to_imu}: has no line {CAMERA}; get KITTI-360's calibration anew")
-    rigid_inverse(cameras[CAMERA], str(to_imu))
-    camera_in_lidar = matrix_of(read_table(to_lidar, 12, "r11 r12 r13 t1 ...")[0])
-    return cameras[CAMERA] @ rigid_inverse(camera_in_lidar, str(to_lidar))
+    T_ic, path = camera_in_imu(folder, CAMERA), folder / "calib_cam_to_velo.txt"
+    T_lc = matrix_of(read_table(path, 12, "r11 r12 r13 t1 ...")[0])
+    return T_ic @ rigid_inverse(T_lc, str(path))

@@ -12,6 +12,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any
 
 import numpy as np
@@ -75,6 +76,7 @@ class Scene(ABC):
         replaced: Label sources in its files that predictions stand for, and that are not read.
         unread: The images in a folder of label maps of which none is read, and what reads them; None if there are none.
         in_program: Whether its frames are those of a program, and not in files.
+        usual: Values of options that the format's own data have where nothing is said, as they are typed.
     """
 
     name: str
@@ -101,6 +103,7 @@ class Scene(ABC):
     posed: bool = True
     replaced: Sequence[str] = ()
     in_program: bool = False
+    usual: Mapping[str, str] = MappingProxyType({})
 
     @abstractmethod
     def __len__(self) -> int:

@@ -72,7 +72,7 @@ class SemanticKittiImages(FileDataset[SemanticKittiImagesOptions]):
                 camera=Camera(K),
                 pose=scan.pose @ T_lc,
                 color=color,
-                depth_reader=partial(_depth, color=color, K=K, T_cl=T_cl),
+                depth_reader=partial(lidar_depth, color=color, K=K, T_cl=T_cl),
                 timestamp=scan.timestamp,
             )
 
@@ -103,7 +103,12 @@ def _seen(path: Path, color: Path, read: Read, K: Intrinsics, T_cl: Float64) -> 
     return seen_points(floats_of(path, read(path), 4)[:, :3], T_cl, K, (H, W))
 
 
-def _depth(path: Path, scale: float | None, read: Read, *, color: Path, K: Intrinsics, T_cl: Float64) -> Float32:
+def lidar_depth(path: Path, scale: float | None, read: Read, *, color: Path, K: Intrinsics, T_cl: Float64) -> Float32:
+    """Return depth (H, W), metres, of a scan (float32 x y z and another) in an image; T_cl (4, 4) is LiDAR to camera.
+
+    Raises:
+        DataError: For a damaged scan, or an image that is missing.
+    """
     return _seen(path, color, read, K, T_cl).depth_image() / np.float32(scale or 1)
 
 

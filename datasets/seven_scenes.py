@@ -5,20 +5,25 @@ Source: Shotton et al., Scene Coordinate Regression Forests, CVPR 2013, and the 
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 
 from pydantic import BaseModel
 
 from semstab.data.frames import Intrinsics
+from semstab.datasets.files.labels import SceneEntry
 from semstab.datasets.files.options import DepthScale, FileOptions, FourIntrinsics, FrameSource, InvalidDepth, Size
 from semstab.datasets.files.reader import FileDataset, frames_of
+from semstab.datasets.files.scene import FileScene
+from semstab.datasets.files.surfaces import Surface
 from semstab.datasets.formats.disk import files_named, read_intrinsics
 from semstab.datasets.geometry.cameras import Camera, camera_of
 
 IMAGE_SIZE = (640, 480)
 INTRINSICS_FILE = "camera-intrinsics.txt"
 USUAL = (585.0, 585.0, 320.0, 240.0)
+KINECT_COLOR = (525, 525, 320, 240)
+"""fx, fy, cx, cy of depth, and of colour, which is not registered to it."""
 
 
 class SevenScenesOptions(FileOptions):
@@ -44,6 +49,15 @@ class SevenScenes(FileDataset[SevenScenesOptions]):
     def is_scene(self, folder: Path) -> bool:
         """Return whether the first frame's pose or of any frame is there."""
         return (folder / "frame-000000.pose.txt").is_file() or any(folder.glob("frame-*.pose.txt"))
+
+    def opened(
+        self, entry: SceneEntry, frames: Sequence[FrameSource], options: FileOptions, surface: Surface | None
+    ) -> FileScene:
+        """Return the scene, which knows the camera of the Kinect's colour."""
+        scene = super().opened(entry, frames, options, surface)
+        if self.options.color_intrinsics is None:
+            scene.usual = {"color_intrinsics": str(list(KINECT_COLOR))}
+        return scene
 
     def frames(self, folder: Path) -> Iterable[FrameSource]:
         """Return a frame for each depth image."""

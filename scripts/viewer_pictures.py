@@ -9,50 +9,24 @@ takes Mesa's lavapipe (Debian: mesa-vulkan-drivers), a minute or two, and cores 
 from __future__ import annotations
 
 import argparse
-import contextlib
-import os
-import signal
 import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 from PIL import Image
 from rerun.experimental import ViewerClient
 
-WINDOW, BAR, WIDTH = (1500, 850), 38, 1200
-"""Pixels of the viewer, of the bar of menus at its top, which is cut off, and of a picture."""
+from semstab.recording.screenshot import SETTLED_S, headless, paint
 
-PORT, ATTEMPTS, PATIENCE_S = 9911, 12, 12
+WIDTH = 1200
+"""Pixels of a picture."""
 
 CITY = ["--scene", "scene0", "--check", "none"]
 SHELF = ["--voxel-size", "0.01", "--model", "fcn", "--backend", "numba", "--backend", "open3d-projective",
          "--check", "none"]  # fmt: skip
-
-
-@contextlib.contextmanager
-def viewer(recording: Path) -> Iterator[ViewerClient]:
-    """One that has loaded the recording and is painting it."""
-    size = "x".join(map(str, WINDOW))
-    command = [
-        str(Path(sys.executable).with_name("rerun")),
-        str(recording),
-        "--headless",
-        "--bind",
-        "127.0.0.1",
-        "--port",
-        str(PORT),
-    ]
-    started = subprocess.Popen([*command, "--window-size", size], start_new_session=True)
-    try:
-        time.sleep(PATIENCE_S)
-        yield ViewerClient.connect(f"rerun+http://127.0.0.1:{PORT}/proxy")
-    finally:
-        os.killpg(started.pid, signal.SIGTERM)  # the command starts the viewer as a process of its own
-        started.wait()
 
 
 def show(client: ViewerClient, tab: str) -> None:
@@ -66,19 +40,15 @@ def show(client: ViewerClient, tab: str) -> None:
         if of["container_kind"] == "Tabs" and wanted in of["contents"]:
             of["active_tab"] = wanted
     client.set_blueprint(layout, "recording")
-    time.sleep(PATIENCE_S)
+    time.sleep(SETTLED_S)
 
 
-def paint(client: ViewerClient, path: Path) -> None:
-    """What the viewer shows now, as a PNG. Painting without a graphics card is slow: a viewer may ask for more time."""
-    for _ in range(ATTEMPTS):
-        with contextlib.suppress(TimeoutError):
-            client.save_screenshot(str(path))
-            break
-    with Image.open(path) as screen:
-        picture = screen.convert("RGB").crop((0, BAR, *WINDOW))
-    picture = picture.resize((WIDTH, round(WIDTH * picture.height / picture.width)), Image.Resampling.LANCZOS)
-    picture.save(path, optimize=True)
+def small(path: Path) -> None:
+    """Bring a picture to the width that the pages show."""
+    with Image.open(path) as picture:
+        size = WIDTH, round(WIDTH * picture.height / picture.width)
+        smaller = picture.resize(size, Image.Resampling.LANCZOS)
+    smaller.save(path, optimize=True)
 
 
 def main() -> None:
@@ -98,10 +68,11 @@ def main() -> None:
             subprocess.run(
                 [sys.executable, "-m", "semstab", *words, "--report", "off", "--quiet", "--out", str(run)], check=True
             )
-            with viewer(run / "recording.rrd") as client:
+            with headless(run / "recording.rrd") as client:
                 if tab:
                     show(client, tab)
-                paint(client, (arguments.folder / name).resolve())
+                paint(client, run / "recording.rrd", arguments.folder / name)
+            small(arguments.folder / name)
 
 
 if __name__ == "__main__":

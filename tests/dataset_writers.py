@@ -21,6 +21,9 @@ from semstab.data.voxels import VoxelTable
 from semstab.datasets import open_dataset
 
 W, H, COUNT, SHRUNK = 48, 32, 4, 10
+BITS_24 = (2**24 - 1) / 1000
+"""Units in a metre of depth in the three channels of an image."""
+
 CLASSES = ["clutter", "building", "road", "static car", "tree", "low vegetation", "human", "moving car"]
 SIDES = {"opencv": ([0, 1, 2], [1, 1, 1]), "opengl": ([0, 1, 2], [1, -1, -1]), "ned": ([2, 0, 1], [1, 1, 1])}
 """For each convention of camera axes, which OpenCV axis each of its axes is, and with which sign."""
@@ -40,8 +43,8 @@ def shrunk(frame: Frame) -> Frame:
 
 
 def stored(frame: Frame, scale: float) -> np.ndarray:
-    """Depth (H, W) as a 16-bit image holds it."""
-    return np.rint(frame.depth.astype(np.float64) * scale).astype(np.uint16)
+    """Depth (H, W) as an image of 16 bits holds it, or one of 24, whose scale is larger."""
+    return np.rint(frame.depth.astype(np.float64) * scale).astype(np.uint16 if scale < BITS_24 else np.uint32)
 
 
 def source(scale: float | None = None) -> list[Frame]:
@@ -260,17 +263,77 @@ def write_syndrone(folder: Path, frames: Sequence[Frame]) -> list[str]:
         save(folder / f"depth/{name}.png", np.round(metres * 65535 / 1000).astype(np.uint16))
         save(folder / f"rgb/{name}.png", frame.color)
         save(folder / f"semantic/{name}.png", frame.labels)
-        R, (x, y, z) = frame.T_wc[:3, :3] * [[1], [-1], [1]], frame.T_wc[:3, 3]
-        right, down, forward = R.T
-        angles = {
-            "pitch": np.arcsin(forward[2]), "yaw": np.arctan2(forward[1], forward[0]),
-            "roll": np.arctan2(-right[2], -down[2]),
-        }  # fmt: skip
-        path = folder / f"camera/{name}.json"
-        path.parent.mkdir(parents=True, exist_ok=True)
-        degrees = {key: float(np.degrees(value)) for key, value in angles.items()}
-        path.write_text(json.dumps({"x": float(x), "y": float(-y), "z": float(z)} | degrees))
+        write_carla_pose(folder / f"camera/{name}.json", frame.T_wc)
     return names
+
+
+def write_carla_pose(path: Path, T_wc: np.ndarray) -> None:
+    """Position and angles in CARLA's left-handed axes: x forward, y right, z up."""
+    R, (x, y, z) = T_wc[:3, :3] * [[1], [-1], [1]], T_wc[:3, 3]
+    right, down, forward = R.T
+    angles = {
+        "pitch": np.arcsin(forward[2]), "yaw": np.arctan2(forward[1], forward[0]),
+        "roll": np.arctan2(-right[2], -down[2]),
+    }  # fmt: skip
+    path.parent.mkdir(parents=True, exist_ok=True)
+    degrees = {key: float(np.degrees(value)) for key, value in angles.items()}
+    path.write_text(json.dumps({"x": float(x), "y": float(-y), "z": float(z)} | degrees))
+
+
+def packed(frame: Frame) -> np.ndarray:
+    """Depth as CARLA's camera saves it, RGBA (H, W, 4); the sky, which has none, is 1000 m."""
+    units = np.where(frame.depth > 0, stored(frame, BITS_24), 2**24 - 1)
+    return np.stack([units & 255, units >> 8 & 255, units >> 16, np.full_like(units, 255)], axis=2).astype(np.uint8)
+
+
+def write_carla(folder: Path, frames: Sequence[Frame]) -> list[str]:
+    """A dump of cameras that save images as they are, with a file of a pose beside."""
+    names = [f"{k:06d}" for k in range(len(frames))]
+    for name, frame in zip(names, frames, strict=True):
+        save_rgba(folder / f"depth/{name}.png", packed(frame))
+        save(folder / f"rgb/{name}.png", frame.color)
+        write_carla_pose(folder / f"camera/{name}.json", frame.T_wc)
+    return names
+
+
+def write_kitti_carla(folder: Path, frames: Sequence[Frame]) -> list[str]:
+    """A pose of the LiDAR each millisecond, of which those of the camera's times are meant; right-handed axes."""
+    names = [f"{k:04d}" for k in range(len(frames))]
+    mount = np.array([[0.0, -1, 0, 0.1], [1, 0, 0, -0.3], [0, 0, 1, -0.1], [0, 0, 0, 1]])
+    forward = np.array([[0.0, -1, 0, 0], [0, 0, -1, 0], [1, 0, 0, 0], [0, 0, 0, 1]])
+    lines = ["# R(0,0) R(0,1) R(0,2) t(0) R(1,0) ... timestamp"]
+    for k, (name, frame) in enumerate(zip(names, frames, strict=True)):
+        save_rgba(folder / f"images_depth/{name}_20.png", packed(frame))
+        save(folder / f"images_rgb/{name}_0.png", frame.color)
+        T = frame.T_wc @ forward @ mount
+        lines += [f"{numbers(T[:3])} {0.1 * k}", f"{numbers(np.eye(4)[:3])} {0.1 * k + 0.05}"]
+    write_lines(folder / "full_poses_lidar.txt", lines)
+    write_lines(folder / "full_ts_camera.txt", ["# frame_id timestamp", *(f"{k} {0.1 * k}" for k in range(len(names)))])
+    write_lines(folder / "lidar_to_cam0.txt", ["#R(0,0) R(0,1) ...", numbers(mount[:3])])
+    return names
+
+
+def write_airsim(folder: Path, frames: Sequence[Frame], kind: int = 1) -> list[str]:
+    """A recording of a multirotor, whose depth in .pfm begins with the top row; times of images differ by some ns."""
+    start, names = 1_530_000_000_000_000_000, []
+    lines = ["VehicleName\tTimeStamp\tPOS_X\tPOS_Y\tPOS_Z\tQ_W\tQ_X\tQ_Y\tQ_Z\tImageFile"]
+    for k, frame in enumerate(frames):
+        names.append(f"img_Drone_0_0_{start + 100 * k}")
+        save(folder / f"images/{names[-1]}.png", frame.color)
+        depth = f"img_Drone_0_{kind}_{start + 100 * k + 7}.pfm"
+        metres = np.where(frame.depth > 0, frame.depth, np.float32(65504)).astype("<f4")
+        (folder / f"images/{depth}").write_bytes(b"Pf\n%d %d\n-1\n" % metres.shape[::-1] + metres.tobytes())
+        T = with_axes(frame.T_wc, "ned")
+        pose = [*T[:3, 3], *np.roll(quaternion(T[:3, :3]), 1)]
+        columns = "\t".join(repr(float(value)) for value in pose)
+        lines.append(f"Drone\t{1000 + 50 * k}\t{columns}\t{names[-1]}.png;{depth}")
+    write_lines(folder / "airsim_rec.txt", lines)
+    return names
+
+
+def save_rgba(path: Path, image: np.ndarray) -> None:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    assert cv2.imwrite(str(path), image[..., [2, 1, 0, 3]])
 
 
 def write_hypersim(folder: Path, frames: Sequence[Frame], unit: float = 1.0) -> list[str]:
@@ -722,6 +785,11 @@ FORMATS = {
     ),
     "habitat": Format("habitat", write_habitat, 1000, {"intrinsics": camera_option}),
     "virtual_kitti": Format("virtual_kitti", write_virtual_kitti, 100),
+    "airsim": Format("airsim", write_airsim, None, {"intrinsics": camera_option}, sizes_in_images=True),
+    "carla": Format("carla", write_carla, BITS_24, {"intrinsics": camera_option}, sizes_in_images=True),
+    "carla, KITTI-CARLA": Format(
+        "carla", write_kitti_carla, BITS_24, {"intrinsics": camera_option}, sizes_in_images=True
+    ),
     "syndrone": Format("syndrone", write_syndrone, 65.535, {"intrinsics": camera_option}),
     "tartanair": Format("tartanair", write_tartanair, None, {"intrinsics": camera_option}),
     "tartanair, V2": Format(

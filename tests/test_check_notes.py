@@ -10,15 +10,17 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+from dataset_writers import four, write_labels, write_seven_scenes
 from posed_config import configure, dataset_of
 from posed_writer import write_posed
 from room_scene import CLASSES, Room, walk, write
 from typer.testing import CliRunner
 
 import semstab
-from semstab.check import check
+from semstab.check import check, registration
 from semstab.check.no_depth import find_sentinel
 from semstab.check.registration import find_offset, grey_levels
+from semstab.check.reprojection import View
 from semstab.cli import app
 from semstab.datasets import open_dataset
 from semstab.pixels.edges import depth_edges, image_edges
@@ -118,6 +120,21 @@ def test_labels_that_are_not_registered_are_pointed_out(tmp_path, scale, x):
     )
     enlarged = float(note.partition("enlarged ")[2].split()[0])
     assert enlarged == pytest.approx(1 / scale, abs=0.05)
+
+
+@pytest.mark.parametrize(("stated", "said"), [(False, "[525, 525, 320, 240]"), (True, "[fx, fy, cx, cy]")])
+def test_labels_of_7_scenes_are_given_the_camera_of_its_colour_to_paste(tmp_path, stated, said):
+    room = Unregistered(525 / 585)
+    color = np.zeros((*room.frame(0, "net").shape, 3), np.uint8)
+    frames = [dataclasses.replace(room.frame(k, "net"), color=color) for k in range(len(room))]
+    write_labels(tmp_path, write_seven_scenes(tmp_path, frames), frames)
+    options = {"root": tmp_path, "classes": list(CLASSES), "intrinsics": four(frames[0])}
+    if stated:  # wrongly: they are those of depth
+        options |= {"color_intrinsics": four(frames[0]), "color_size": frames[0].shape[::-1]}
+    scene = open_dataset("seven_scenes", options).scene(tmp_path.name)
+    views = [View.of(scene.frame(k, "net"), 500) for k in range(len(scene))]
+    (line,) = registration.notes(scene, views, "net")
+    assert line.endswith(f"set dataset.options.color_intrinsics: {said}, or register them to the depth")
 
 
 def test_labels_that_are_registered_are_not(tmp_path):

@@ -137,6 +137,25 @@ def test_a_viewer_without_a_display_is_told_in_one_line(tmp_path, monkeypatch) -
     assert "x.rrd: there is no display for the viewer; copy the file to a machine with one" in done.stderr
 
 
+def test_a_display_that_does_not_answer_is_told_in_one_line_and_other_words_are_passed_on(
+    tmp_path, monkeypatch
+) -> None:
+    (tmp_path / "x.rrd").write_bytes(b"")
+    monkeypatch.setenv("DISPLAY", ":99")
+    words = "Error: winit EventLoopError: os error at linux/mod.rs: Failed to open connection to X server"
+    for said, code, expected in ((words, 2, "there is no display for the viewer"), ("other\n", 1, "other\n")):
+
+        def ends(command, *, check, stderr, said=said):
+            stderr.write(said.encode())
+            return subprocess.CompletedProcess(command, 1)
+
+        monkeypatch.setattr(subprocess, "run", ends)
+        done = CliRunner().invoke(cli.app, ["view", str(tmp_path / "x.rrd")])
+        assert done.exit_code == code
+        assert expected in done.stderr
+        assert "winit" not in done.stderr
+
+
 def listens(port: int) -> bool:
     with socket.socket() as probe:
         return probe.connect_ex(("127.0.0.1", port)) == 0

@@ -15,6 +15,7 @@ from semstab.check.conventions import Reading, reading
 from semstab.check.geometry import assess, with_mistakes
 from semstab.check.histogram import Tally
 from semstab.check.intrinsics import with_intrinsics
+from semstab.check.mounting import with_mounting
 from semstab.check.precision import with_precision
 from semstab.check.registration import assess_surface, match_images
 from semstab.check.reprojection import Sample, View, frames_at, pairs_within, reader
@@ -140,7 +141,12 @@ class Inspection:
         if (mistaken := with_mistakes(verdict, sample)) != verdict:
             return mistaken
         timed = with_lateness(verdict, self.scene, sample, how)
-        verdict = with_intrinsics(verdict, sample, how) if timed == verdict else timed
+        if timed != verdict:
+            verdict = timed
+        elif self.scene.made or (mounted := with_mounting(verdict, sample)) == verdict:
+            verdict = with_intrinsics(verdict, sample, how)
+        else:
+            verdict = mounted
         verdict = with_precision(verdict, sample)
         if self.scene.made and not thorough:
             return verdict  # rendering its frames takes longer than fusing them

@@ -316,7 +316,8 @@ def notes(scene: Scene, views: Sequence[View], model: str) -> Iterator[str]:
         what = "the images" if sampled[0].labels is None else f"labels of {model}"
         mend = "register them to the depth"
         if "color_intrinsics" in scene.settings:
-            mend = f"set {OPTION}color_intrinsics: [fx, fy, cx, cy], or {mend}"
+            value = scene.usual.get("color_intrinsics", "[fx, fy, cx, cy]")
+            mend = f"set {OPTION}color_intrinsics: {value}, or {mend}"
         yield f"{what} look as if they were not registered to the depth: {offset}; {mend}"
 
 

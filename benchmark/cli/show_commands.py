@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import shlex
 import sys
+import tempfile
 import textwrap
 from enum import StrEnum
 from pathlib import Path
@@ -103,15 +104,24 @@ def _show_several(
         print_lines(map(str, [*written, *runs_figure(results).save(out, svg=figures is FigureFormat.svg)]))
 
 
+NO_WINDOW = "winit"
+"""What the viewer names in its words where no window can be opened: the library that opens one."""
+
+
 def view(
     run: Annotated[Path, typer.Argument(metavar="RUN", help="Run folder, or an .rrd file.")],
     code: OwnCode = None,
+    screenshot: Annotated[
+        Path | None, typer.Option(metavar="FILE.png", help="Save what the viewer shows, without a window or a display.")
+    ] = None,
 ) -> None:
     """Open a run's recording in the rerun viewer; it is made again if units have no pictures in it."""
     import subprocess
 
     from semstab.recording import lacks_pictures, record_finished, viewer_command
 
+    if screenshot is not None and (screenshot.suffix.lower() != ".png" or not screenshot.absolute().parent.is_dir()):
+        raise ConfigError(f"--screenshot {screenshot}: name a file .png in a folder that is there")
     if not run.exists():
         raise ConfigError(f"{run}: there is no such run or file; give the folder of --out, or one of runs/")
     recording, finished = run / "recording.rrd" if run.is_dir() else run, (run / "summary.json").is_file()
@@ -120,14 +130,23 @@ def view(
     if finished and lacks_pictures(run, recording):
         say(f"making {recording}")
         record_finished(run, recording, code or ())
+    if screenshot is not None:
+        from semstab.recording.screenshot import screenshot as save
+
+        save(recording, screenshot)
+        print_lines([str(screenshot)])
+        return
     display = sys.platform != "linux" or bool(os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY"))
-    stderr = None if display else subprocess.DEVNULL  # where it says in several lines that there is none
-    ended = subprocess.run([*viewer_command(), str(recording)], check=False, stderr=stderr).returncode
-    if ended and not display:
+    with tempfile.TemporaryFile() as said:  # several lines where there is no display, or none that answers
+        ended = subprocess.run([*viewer_command(), str(recording)], check=False, stderr=said).returncode
+        said.seek(0)
+        words = said.read().decode(errors="replace")
+    if ended and (not display or NO_WINDOW in words):
         raise ConfigError(
-            f"{recording}: there is no display for the viewer; copy the file to a machine with one, or show it in a"
-            f" browser: rerun --serve-web {shlex.quote(str(recording))}"
+            f"{recording}: there is no display for the viewer; copy the file to a machine with one, show it in a"
+            f" browser (rerun --serve-web {shlex.quote(str(recording))}), or save a picture: --screenshot FILE.png"
         )
+    sys.stderr.write(words)
     raise typer.Exit(ended)
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -55,6 +56,13 @@ class Camera:
         stated, size = self.intrinsics, (shape[1], shape[0])
         K = Intrinsics(stated.fx, stated.fy, stated.cx - centre, stated.cy - centre)
         return K if self.size in (None, size) else K.resized(self.size or size, size)
+
+
+def seen_across(degrees: float, size: tuple[int, int], where: str) -> Camera:
+    """Return the camera of square pixels that sees that angle across an image (width, height); `where` is the file."""
+    W, H = size
+    f = W / 2 / math.tan(math.radians(degrees) / 2)
+    return Camera.stated((f, f, (W - 1) / 2, (H - 1) / 2), size, where)
 
 
 def camera_of(stated: FxFyCxCy | None, usual: FxFyCxCy, size: tuple[int, int]) -> Camera:
