@@ -347,6 +347,21 @@ def test_clouds_that_cannot_be_classified(fused, points):
     assert not list(fused.glob("never*"))
 
 
+def test_a_cloud_whose_fields_cannot_be_kept_is_named_not_the_disk(fused):
+    """Points of 332 bytes of which no field is told: laspy writes such a header, and cannot read it."""
+    las = laspy.LasData(laspy.LasHeader(point_format=0, version="1.4"))
+    las.x, las.y, las.z = np.zeros((3, 1))
+    las.write(fused / "wide.las")
+    content = bytearray((fused / "wide.las").read_bytes())
+    content[105:107] = (20 + 312).to_bytes(2, "little")
+    (fused / "wide.las").write_bytes(content + bytes(312))
+    fails(
+        DataError, r"wide\.las: cannot be read", export, fused / "run", fused / "never.las", model="a",
+        classify=fused / "wide.las",
+    )  # fmt: skip
+    assert not (fused / "never.las").exists()
+
+
 def test_the_command(fused):
     done = bench("export", fused / "run", "--to", "a.ply", "--to", "a.las", "-m", "a", "--class", "door", cwd=fused)
     assert "a.ply: " in done.stdout

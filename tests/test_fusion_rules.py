@@ -26,6 +26,7 @@ from semstab.data.voxels import VoxelTable
 from semstab.engine import load_result
 from semstab.errors import ConfigError, DataError
 from semstab.metrics import dominant, vss
+from semstab.report.tables import tables
 from semstab.testing import SEQUENCES, BackendConformance, as_frames, assert_same_map, checks, random_frames, sight_line
 
 K, EACH = 3, [*RULES]
@@ -307,6 +308,13 @@ def test_rules_stand_side_by_side(folder) -> None:
     assert math.isnan(statistics.agreement.voxel_alpha_op2.value)
     assert math.isnan(statistics.correctness.quadrants.consistent_right.value)
     assert statistics.correctness.accuracy_op2.value > 0.5
+    (table,) = (made for made in tables(result) if made.name == "fusion_correctness")
+    keys, (group,) = [column.key for column in table.columns], table.groups
+    assert [row[0] for row in group.rows] == ["numba", "numba+bayes", "numba+sharp"]
+    for row in group.rows:
+        known = result.record(backend=row[0]).statistics.correctness
+        assert row[keys.index("accuracy_op2")] == pytest.approx(known.accuracy_op2.value)
+        assert row[keys.index("ece_op2")] == next(own.ece for own in known.strata if own.name == "OP>=2")
 
 
 def test_a_rule_alone_is_checked_by_the_reference_with_that_rule(folder) -> None:

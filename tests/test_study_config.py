@@ -113,7 +113,7 @@ def test_bad_settings_are_one_line_that_names_the_setting(tmp_path, content, mes
 
 
 def test_the_shipped_studies_fit_together() -> None:
-    assert shipped_studies() == ("filters", "ladder", "paper", "uavid3d")
+    assert shipped_studies() == ("filters", "ladder", "paper", "rules", "uavid3d")
     assert all(load_study(name).description for name in shipped_studies())
     grid = make_plan(resolve(load_study("paper")))
     assert {cell.variation.sweep for cell in grid.units} == {

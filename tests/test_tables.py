@@ -78,7 +78,7 @@ def test_a_study_of_everything_has_every_table(tables_of_walls):
         "overview", "verdicts", "flicker", "scenes", "persistence", "classes", "temporal_agreement", "correlogram",
         "class_agreement", "merges", "drift", "frames", "uncertainty", "ceiling", "correctness", "quadrants",
         "cross_model", "sensitivity_voxel_size", "sensitivity_depth_noise", "sensitivity_frame_count",
-        "fusion", "agreement",
+        "fusion", "fusion_correctness", "agreement",
     ]  # fmt: skip
 
 

@@ -236,16 +236,25 @@ def _outside(cloud: Path, finder: _Finder) -> DataError:
 
 
 def _classify_las(voxels: Voxels, cloud: Path, out: Path, find: Finder, asprs: Path | None) -> None:
-    las = clouds.with_lazrs(cloud)
+    clouds.with_lazrs(cloud)
     with open_las(cloud) as reader:
         _require_same_crs(voxels, reader.header, cloud)
         header, records = _extended(reader.header, voxels), type(reader.header.vlrs)(_without_copc(reader.evlrs or ()))
-        las.open(io.BytesIO(), "w", header=copy.deepcopy(header)).close()  # one that cannot be written is the cloud's
+        _require_header(header)
     with clouds.las_writer(out, header) as writer:
         for points in _las_chunks(cloud):
             writer.write_points(_classified_points(points, writer.header, voxels, find, asprs))
         if records:
             writer.write_evlrs(records)
+
+
+def _require_header(header: laspy.LasHeader) -> None:
+    """Write and read an empty file: if its fields cannot be kept, the error is the cloud's, not the disk's."""
+    import laspy
+
+    empty = io.BytesIO()
+    laspy.open(empty, "w", header=copy.deepcopy(header), closefd=False).close()
+    laspy.open(io.BytesIO(empty.getvalue())).close()
 
 
 def _las_chunks(cloud: Path) -> Iterator[laspy.ScaleAwarePointRecord]:

@@ -10,7 +10,7 @@ from semstab.core.files import keep_only, write_json, write_text
 from semstab.data.records import Result
 from semstab.errors import ConfigError
 from semstab.report.filter_study import of_interest
-from semstab.report.tables.backends import agreement, compared, fusion
+from semstab.report.tables.backends import agreement, compared, fusion, fusion_correctness
 from semstab.report.tables.correctness import ceiling, correctness, correlogram
 from semstab.report.tables.filters import filter_tables
 from semstab.report.tables.flicker import flicker
@@ -49,7 +49,7 @@ __all__ = [
 BUILDERS = (
     overview, paper, verdicts, flicker, video_measures, scenes, persistence, classes, temporal_agreement, correlogram,
     class_agreement, merges, ranges, drift, frames, uncertainty, ceiling, correctness, cross_model, sensitivity,
-    reduced, fusion, compared, agreement,
+    reduced, fusion, fusion_correctness, compared, agreement,
 )  # fmt: skip
 """The functions that make tables, in the paper's order; without numbers for its tables a function returns none."""
 

@@ -8,14 +8,19 @@ from semstab.config import BACKENDS
 from semstab.data.measures import measures
 from semstab.data.records import Record, Result
 from semstab.data.results import Agreement
+from semstab.data.statistics import CorrectnessStatistics
+from semstab.metrics.summary import macro_mean
 from semstab.report.means import Pooled, pooled
 from semstab.report.tables.stability import SBD_OVER, of_measures, settings
 from semstab.report.tables.table import ALL_VOXELS, Column, Group, Row, Table
+from semstab.statistics.correctness import ACCURACY, BRIER, ECE, MIOU
 
 # The fusion implementations: the same frames through every backend, and the differences of the measures.
 
 DIFFERENCE = "Difference to the first"
 LARGEST = "Largest difference"
+SEEN_TWICE = "OP>=2"
+"""The stratum of voxels that were seen twice or more."""
 
 
 def fusion(result: Result) -> list[Table]:
@@ -66,6 +71,38 @@ def _backend_row(backend: str, mean: Pooled, base: Pooled) -> Row:
         mean.mean_op - base.mean_op,
         *(mean.every[measure] - base.every[measure] for measure in measures()),
     )
+
+
+def fusion_correctness(result: Result) -> list[Table]:
+    """Return how right each backend's labels are, over the scenes that every backend fused; none without truth."""
+    groups = []
+    for model in result.models:
+        rows: dict[str, dict[str, CorrectnessStatistics]] = {}
+        for record in (*result.select(model=model), *result.select(BACKENDS, model=model)):
+            if record.statistics is not None and record.statistics.correctness is not None:
+                rows.setdefault(record.unit.backend, {})[record.unit.scene] = record.statistics.correctness
+        scenes = set.intersection(*(set(of_backend) for of_backend in rows.values())) if rows else set()
+        if len(rows) > 1 and scenes:
+            of_rows = ((name, [own for scene, own in by.items() if scene in scenes]) for name, by in rows.items())
+            groups.append(Group(model, tuple((name, *_right(own)) for name, own in of_rows)))
+    if not groups:
+        return []
+    columns = (
+        Column("backend", "Backend"), *(Column.of(quantity) for quantity in (ACCURACY, MIOU, ECE, BRIER)),
+    )  # fmt: skip
+    caption = (
+        f"{settings(result.select())} The table shows the voxels seen twice or more with a true class. ECE is the"
+        " expected calibration error of the largest belief; Brier is the Brier score, 0 to 2. They are macro means:"
+        " each scene counts once. The base backend is first."
+    )
+    return [Table("fusion_correctness", "Accuracy of fusion", caption, columns, tuple(groups))]
+
+
+def _right(scenes: Sequence[CorrectnessStatistics]) -> tuple[float, ...]:
+    """Return the macro means of accuracy, mIoU, ECE and Brier score at OP >= 2."""
+    repeated = [next(row for row in own.strata if row.name == SEEN_TWICE) for own in scenes]
+    numbers = zip(*((row.accuracy, row.miou, row.ece, row.brier) for row in repeated), strict=True)
+    return tuple(macro_mean(own) for own in numbers)
 
 
 def compared(result: Result) -> list[Table]:

@@ -83,13 +83,16 @@ def screen(
 
 
 def _checks(result: Result) -> Iterator[str]:
-    """Yield the agreement of the backends: one line for each pair."""
+    """Yield the agreement of the backends, and how far others differ by design: one line for each pair."""
     for pair in dict.fromkeys(row.backends for row in result.agreement):
         rows = [row for row in result.agreement if row.backends == pair]
         yield from wrapped(_check(pair, rows))
-    for row in result.compared:
-        relabelled = 100 * row.differences["label"].mean
-        yield f"  {row.backends[1]} differs from {row.backends[0]} by design: {relabelled:.1f} % of the labels"
+    for first, other in dict.fromkeys(row.backends for row in result.compared):
+        of_pair = [row for row in result.compared if row.backends == (first, other)]
+        shares = sorted(f"{100 * row.differences['label'].mean:.1f}" for row in of_pair)
+        least, most = min(shares, key=float), max(shares, key=float)
+        relabelled = least if least == most else f"{least} to {most}"
+        yield from wrapped(f"{other} differs from {first} by design: {relabelled} % of the labels")
 
 
 def _check(pair: tuple[str, str], rows: Sequence[Agreement]) -> str:
