@@ -78,7 +78,9 @@ def test_a_lever_arm_is_named_with_the_translation_that_mends_it():
 
 
 @pytest.mark.parametrize(
-    "plant", [lambda frames: frames, doctor.camera(0.9), doctor.camera(1.1), doctor.camera(right=4)], ids=str
+    "plant",
+    [lambda frames: frames, doctor.camera(0.9), doctor.camera(1.1), doctor.camera(right=4)],
+    ids=["nothing", "focal .9", "focal 1.1", "cx 4"],
 )
 def test_nothing_else_is_taken_for_it(plant):
     assert [said(sample(seed, plant)) for seed in (10, 11, 13)] == [""] * 3
