@@ -69,7 +69,7 @@ def test_list_names_what_there_is(tmp_path) -> None:
     text = bench("list", cwd=tmp_path, columns=200).stdout
     assert {"open3d", "numpy", "city", "posed_folder", "uavid7", "ready"} <= set(text.split())
     studies = [line.split() for line in text.splitlines() if line.split()[:1] == ["study"]]
-    assert [row[2] for row in studies] == ["filters", "ladder", "paper", "uavid3d"]
+    assert [row[2] for row in studies] == ["filters", "ladder", "paper", "rules", "uavid3d"]
 
 
 def test_a_run_on_a_folder(wall, tmp_path) -> None:

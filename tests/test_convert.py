@@ -409,4 +409,5 @@ def test_every_format_gives_the_same_voxels(tmp_path, name):
     assert len(table) > 500
     assert_same_map(table, fused(reader, "net", 0.1), 0.0)
     if form.scale is not None and form.scale < dataset_writers.BITS_24:
-        assert converted.depth == f"16-bit PNG, {form.scale:g} units per metre"
+        scale = 1000 if 1000 % form.scale == 0 else form.scale  # millimetres hold centimetres, too
+        assert converted.depth == f"16-bit PNG, {scale:g} units per metre"

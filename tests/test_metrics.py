@@ -357,7 +357,9 @@ def without(table, row):
 
 
 COLUMNS = [
-    field.name for field in dataclasses.fields(VoxelTable) if field.name not in ("voxel_size", "classes", "copies")
+    field.name
+    for field in dataclasses.fields(VoxelTable)
+    if field.name not in ("voxel_size", "classes", "copies", "weight")
 ]
 
 

@@ -269,7 +269,7 @@ ENTROPY = Measure(
 MARGIN = Measure(key="margin", title="Margin", short="M", better="higher", of=margin, range=(0.0, 1.0), panel=False)
 
 RESERVED = frozenset((
-    "K", "accuracy", "advice", "alpha", "backend", "categories", "checked", "classes",
+    "K", "accuracy", "advice", "alpha", "alpha_by_meaning", "backend", "categories", "checked", "classes",
     "compensated_flicker_percent", "confused_with", "coverage", "ece", "entropy_between", "entropy_op2",
     "entropy_within",
     "evidence", "files", "flicker_percent", "frames", "frames_empty", "frames_left_out", "fuse_ms_per_frame",

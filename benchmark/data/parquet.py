@@ -214,13 +214,17 @@ def reading(path: str | Path, kind: str = "a semstab table") -> Iterator[None]:
         raise DataError(f"{path}: not {kind} ({summarize_error(error)})") from error
 
 
-def read(path: str | Path, names: Iterable[str]) -> dict[str, Any]:
-    """Return columns by name, voxel_size and classes; what it raises becomes a DataError in `reading`."""
+def read(path: str | Path, names: Iterable[str], optional: Iterable[str] = ()) -> dict[str, Any]:
+    """Return columns by name, optional ones if they are there, voxel_size and classes.
+
+    What it raises becomes a DataError in `reading`.
+    """
     with opened(path) as content:
         about = parse_json((content.schema_arrow.metadata or {})[b"semstab"])
         if about["schema"] != SCHEMA:
             raise DataError(f"written with schema {about['schema']}, this version reads {SCHEMA}")
-        parts: dict[str, list[Any]] = {name: [] for name in names}
+        there = set(content.schema_arrow.names)
+        parts: dict[str, list[Any]] = {name: [] for name in (*names, *there.intersection(optional))}
         for group in range(content.num_row_groups):
             rows = content.read_row_group(group, columns=list(parts))
             for name, values in parts.items():

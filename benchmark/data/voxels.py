@@ -369,7 +369,7 @@ class VoxelTable:
     @classmethod
     def _read(cls, path: Path) -> VoxelTable:
         with parquet.reading(path):
-            return cls(**parquet.read(path, [*OF_VOXELS, *(WEIGHT.keys() & parquet.names_in(path))]))
+            return cls(**parquet.read(path, OF_VOXELS, WEIGHT))
 
 
 # A part of space that a map is restricted to: whole columns of voxels.

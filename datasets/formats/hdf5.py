@@ -34,7 +34,16 @@ def opened(path: Path, data: bytes | None = None) -> Iterator[Any]:
             yield records
     except DataError:
         raise
-    except (OSError, LookupError, ValueError, TypeError, RuntimeError, AttributeError, MemoryError) as error:
+    except (
+        OSError,
+        ArithmeticError,
+        LookupError,
+        ValueError,
+        TypeError,
+        RuntimeError,
+        AttributeError,
+        MemoryError,
+    ) as error:
         raise DataError(f"{path}: cannot be read ({summarize_error(error)}); download it again") from error
 
 
