@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+import functools
 import itertools
 import math
 import time
 from abc import ABC, abstractmethod
 from collections import defaultdict
 from collections.abc import Mapping
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import numpy.typing as npt
@@ -32,6 +33,9 @@ from semstab.data.information import entropy_bits, js_divergence, normalise
 from semstab.data.results import Changes, FrameReport
 from semstab.data.voxels import Extent, VoxelTable, index_columns
 from semstab.errors import DataError
+
+if TYPE_CHECKING:
+    from semstab.backends.shared.aggregator import Aggregator
 
 Given = Observations | tuple[npt.ArrayLike, npt.ArrayLike, npt.ArrayLike]
 
@@ -189,8 +193,8 @@ class FromObservations(ABC):
         return Observations(index.astype(np.int64), evidence / total, pixels.astype(np.int64))
 
 
-class NumpyRules(FromObservations):
-    """The reference's observations, fused by a rule."""
+class _OfExtent(FromObservations):
+    """A map of the voxels of an extent, of all by default."""
 
     def __init__(
         self,
@@ -203,27 +207,24 @@ class NumpyRules(FromObservations):
         super().__init__(voxel_size, num_classes, rule, rule_options)
         self._within = within
 
+
+class NumpyRules(_OfExtent):
+    """The reference's observations, fused by a rule."""
+
     def observe(self, frame: Frame) -> Observations:
         """Return what the valid pixels observe that fall into the extent."""
         pixels = None if self._within is None else frame.valid & falling_into(self._within, frame, self.voxel_size)
         return observe(frame, self.voxel_size, self.num_classes, pixels)
 
 
-class NumbaRules(FromObservations):
+class NumbaRules(_OfExtent):
     """The observations of the backend `numba`, made by its compiled loops, fused by a rule."""
 
-    def __init__(
-        self,
-        voxel_size: float,
-        num_classes: int,
-        rule: str = MEAN,
-        rule_options: Mapping[str, Any] | None = None,
-        within: Extent | None = None,
-    ) -> None:
+    @functools.cached_property
+    def _pixels(self) -> Aggregator:
         from semstab.backends.shared.aggregator import Aggregator
 
-        super().__init__(voxel_size, num_classes, rule, rule_options)
-        self._pixels = Aggregator(voxel_size, num_classes, within)
+        return Aggregator(self.voxel_size, self.num_classes, self._within)
 
     def observe(self, frame: Frame) -> Observations:
         """Return the observations of a frame, by partitions of the hash."""

@@ -45,18 +45,8 @@ def by_name(chosen: Sequence[Quantity]) -> Mapping[str, Quantity]:
 
 
 IN_SUMS = (
-    ALPHA,
-    ALPHA_BY_MEANING,
-    VOXEL_ALPHA,
-    PSA,
-    RECURRENT_VSS,
-    SBD_EXCESS,
-    ENTROPY,
-    ACCURACY,
-    MIOU,
-    ECE,
-    MISLEADING,
-)
+    ALPHA, ALPHA_BY_MEANING, VOXEL_ALPHA, PSA, RECURRENT_VSS, SBD_EXCESS, ENTROPY, ACCURACY, MIOU, ECE, MISLEADING,
+)  # fmt: skip
 """Measures that follow from the sums by frame and location alone."""
 
 ONE_AGAINST_ALL = (ALPHA, VOXEL_ALPHA, RECALL, PRECISION, IOU)

@@ -73,8 +73,7 @@ class SceneNumbers:
 
 def _level(whole: ClusterSums, spots: Spots, alpha: Interval, wrong: Interval) -> Level:
     """Return the level of the verdict, with all answers that a model has to give."""
-    first = whole.first_answers
-    assert first is not None
+    first = whole.answers[0]
     voxels, evidence = round(float(whole["voxels"].sum())), first["evidence"].sum(axis=0)
     largest, n = int(evidence.argmax()), float(evidence.sum())
     agreement = SpotAgreement(
@@ -92,8 +91,7 @@ def _at_least_wrong(sums: ClusterSums, truth: Mapping[Number, Interval]) -> Inte
 
     Two views agree on a wrong label at least as often as they agree, less the share of the right labels.
     """
-    first, wrong = sums.first_answers, truth.get("wrong_of_consistent", UNKNOWN)
-    assert first is not None
+    first, wrong = sums.answers[0], truth.get("wrong_of_consistent", UNKNOWN)
     n = float(first["observations"].sum())
     agreeing = float(first["agreeing"].sum()) / n if n else math.nan
     least = 1 - truth["accuracy"].high / agreeing if truth and agreeing > 0 else math.nan

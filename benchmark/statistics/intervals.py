@@ -421,7 +421,7 @@ def shares_of(new: ClusterSums, base: ClusterSums) -> dict[str, float]:
 
 def counted(value: float, sums: ClusterSums) -> Interval:
     """Return a change that is a count of the frames of some sums, and no estimate; undecided where it is undefined."""
-    of = sums if sums.step or sums.first_answers is None else sums.first_answers
+    of = sums if sums.step or not sums.answers else sums.answers[0]
     return Interval(
         value, value, value, frames=of.frame_count, locations=sums.cells, degrees=math.inf,
         undecided=NO_LOCATIONS if math.isnan(value) else "", p_value=0.0 if abs(value) > 0 else math.nan,
@@ -446,7 +446,7 @@ def _groups_of(a: ClusterSums, b: ClusterSums) -> tuple[Int64, Int64]:
 
     Without a log these are the views of the cells.
     """
-    a, b = (part if part.step or part.first_answers is None else part.first_answers for part in (a, b))
+    a, b = (part if part.step or not part.answers else part.answers[0] for part in (a, b))
     step, known = max(a.step, b.step), bool(a.step and b.step)
     one, other = (np.unique(part.frame[part.frame >= 0] // (step // part.step if known else 1)) for part in (a, b))
     return (one.astype(np.int64), other.astype(np.int64)) if known else (np.zeros(0, np.int64), np.zeros(0, np.int64))

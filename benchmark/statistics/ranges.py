@@ -46,8 +46,7 @@ def range_agreement(
     for low, high in itertools.pairwise(edges):
         within = spots.only((distance >= low) & ((distance < high) | (high == edges[-1])))
         sums = sums_of_spots(within)
-        first = sums.first_answers
-        assert first is not None
+        first = sums.answers[0]
         seen_twice = round(float(first["voxels"].sum()))
         assessed = seen_twice >= LEAST_SEEN_TWICE and chance_of(first) * LEAST_CLASSES <= 1
         alpha = estimate(sums, "alpha", scope=scope_of(sums, scope)) if assessed else UNKNOWN

@@ -43,8 +43,7 @@ def spot_agreement(
         critical: Classes that the verdict depends on; where none is named, those with enough locations.
         limits: Limits of the verdict.
     """
-    first = sums.first_answers
-    assert first is not None
+    first = sums.answers[0]
     names, named = sums.classes or tuple(str(k) for k in range(table.K)), set(critical) & set(sums.classes)
     locations = np.bincount(dominant(table)[table.op >= 2], minlength=table.K).tolist()
     scope_of_spots, evidence = scope_of(sums, scope), first["evidence"].sum(axis=0)
@@ -99,8 +98,7 @@ def moving_classes(spots: SpotObservations, sums: ClusterSums, moving: Sequence[
     """
 
     def disagreeing(of: ClusterSums, alpha: float) -> float:
-        first = of.first_answers
-        assert first is not None
+        first = of.answers[0]
         return float(first["observations"].sum()) * (1 - alpha) * (1 - chance_of(first))
 
     rest = sums_of_spots(spots.without(moving))

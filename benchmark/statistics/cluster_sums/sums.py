@@ -97,11 +97,6 @@ class ClusterSums:
         return int(evidence.stop - evidence.start)
 
     @property
-    def first_answers(self) -> ClusterSums | None:
-        """The sums of the first answers of spots; None without spots."""
-        return self.answers[0] if self.answers else None
-
-    @property
     def truth(self) -> bool:
         """Whether sums of ground truth are included."""
         return "known" in self.layout
