@@ -217,7 +217,7 @@ class VoxelTable:
 
     @property
     def counts_frames(self) -> bool:
-        """Whether its evidence is the sum of one distribution a frame, so that it tells how frames agree."""
+        """True if its evidence is the sum of one distribution a frame, so that it tells how frames agree."""
         return not np.isnan(self.self_sum).any()
 
     def summing_to_op(self) -> VoxelTable:

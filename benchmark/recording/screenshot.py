@@ -27,7 +27,7 @@ PATIENCE_S, SETTLED_S = 300.0, 5.0
 """How long a viewer has to start, and to paint, which is slow without a graphics card; and to show what it loaded."""
 
 INSTALL = "apt-get install mesa-vulkan-drivers"
-"""What brings Vulkan without a graphics card to Debian and Ubuntu."""
+"""The package that brings Vulkan without a graphics card to Debian and Ubuntu."""
 
 
 def screenshot(recording: Path, picture: Path) -> None:

@@ -1,4 +1,4 @@
-"""Which distinctions between classes hold: classes are merged until views agree on the groups.
+"""Merge classes until views agree on the groups, which tells which distinctions hold.
 
 One matrix of coincidences, how often two views of a spot give it two classes, tells alpha of any groups of classes
 (Krippendorff 2011, Computing Krippendorff's Alpha-Reliability, where it is named so). So merges are tried without the

@@ -329,7 +329,7 @@ LabelReader = Callable[[FrameSource, Path, Read], Labels]
 
 @dataclass(frozen=True, eq=False)
 class Truth:
-    """What a format says of its ground truth, where the files are not label maps of the ids of a taxonomy.
+    """Description of ground truth that a format brings in files that are not label maps of a taxonomy's ids.
 
     Attributes:
         read: Gives the stored ids of a file, where it is no label map.

@@ -23,7 +23,7 @@ BEHIND, BEHIND_METRES = 1.1, 0.3
 
 @dataclass(frozen=True, eq=False)
 class Seen:
-    """What a camera sees of a cloud, a point a pixel.
+    """The points of a cloud that a camera sees, one a pixel.
 
     Attributes:
         v: (n,) rows of the pixels.

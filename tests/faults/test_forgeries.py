@@ -11,7 +11,8 @@ RESULTS = Path(__file__).parents[2] / "results"
 
 
 @pytest.mark.parametrize(("named", "model"), [
-    ("livingroom@1", "espnetv2-1.0"), ("city@1", "trick-world-locked"), ("apc_shelf@1", "fcn-scores"),
+    ("livingroom@1", "espnetv2-1.0"), ("livingroom@1", "dicenet-0.2"),
+    ("city@1", "trick-world-locked"), ("apc_shelf@1", "fcn-scores"),
 ])  # fmt: skip
 def test_no_forgery_changes_a_rank(named, model) -> None:
     referee = forgeries.Referee.of(RESULTS, named)

@@ -1,4 +1,4 @@
-"""Which distinctions between classes hold: groupings of the classes, and the agreement of views on the groups."""
+"""Groupings of classes, and the agreement of views on the groups: they tell which distinctions hold."""
 
 from __future__ import annotations
 
