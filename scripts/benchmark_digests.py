@@ -9,8 +9,11 @@ and requires that the data is that of the hashes.
 from __future__ import annotations
 
 import argparse
+import json
 import textwrap
 from pathlib import Path
+
+import yaml
 
 from semstab.leaderboard.definition import load_benchmark
 from semstab.leaderboard.geometry import geometry_file, save_geometry
@@ -36,7 +39,7 @@ def write_hashes(file: Path, data: Path | None) -> None:
     text = file.read_text(encoding="utf-8").partition("\ndigests:")[0].rstrip("\n")
     lines = [text, "digests:  # of each frame: depth-pose"]
     for scene, hashes in found.items():
-        lines.append(f"  {scene}: >-")
+        lines.append(f"  {scene if yaml.safe_load(scene) == scene else json.dumps(scene)}: >-")
         lines += textwrap.wrap(hashes, WIDTH, initial_indent="    ", subsequent_indent="    ", break_on_hyphens=False)
     file.write_text("\n".join(lines) + "\n", encoding="utf-8")
 

@@ -15,7 +15,7 @@ import numpy as np
 
 from semstab.core.types import Float32
 from semstab.data.frames import Intrinsics
-from semstab.datasets.files.options import FileOptions, FrameSource
+from semstab.datasets.files.options import DepthReader, FileOptions, FrameSource
 from semstab.datasets.formats.disk import AGAIN, read_bytes
 from semstab.datasets.formats.images import ANY_SIZE, MAX_PIXELS, MILLIMETRES, FrameSize, Read, color_size, read_depth
 from semstab.datasets.geometry.cameras import planar
@@ -171,8 +171,7 @@ def stored_depth(
         own: The sizes that the frame's files may have.
     """
     scale = options.depth_scale or frame.depth_scale
-    reader = frame.depth_reader or FORMATS.get(frame.depth.suffix.lower(), partial(read_depth, own=own))
-    depth = reader(frame.depth, scale, read)
+    depth = _reader(frame, own)(frame.depth, scale, read)
     if np.isnan(depth[0, 0]) and np.isnan(depth).all():  # one frame that saw nothing ends no run; it is counted
         depth = np.zeros_like(depth)
     for value in options.invalid_depth:
@@ -189,8 +188,13 @@ def stored_depth(
     return planar(depth, camera((depth.shape[0], depth.shape[1]))) if options.depth_kind == "ray" else depth
 
 
+def _reader(frame: FrameSource, own: FrameSize = ANY_SIZE) -> DepthReader:
+    """Return what reads a frame's depth: its own reader, or the one of the file's suffix."""
+    return frame.depth_reader or FORMATS.get(frame.depth.suffix.lower(), partial(read_depth, own=own))
+
+
 def shape_of(frame: FrameSource, options: FileOptions) -> tuple[int, int]:
-    """Return (H, W) of the cast depth of a frame: the size of its camera, else of its depth file or colour image.
+    """Return (H, W) of the depth of a frame: the size of its camera, else of its depth file or colour image.
 
     Raises:
         DataError: If none is known.
@@ -199,7 +203,7 @@ def shape_of(frame: FrameSource, options: FileOptions) -> tuple[int, int]:
     if size is not None:
         return size[1], size[0]
     if frame.depth.is_file():
-        H, W = read_depth(frame.depth, 1.0).shape
+        H, W = _reader(frame)(frame.depth, 1.0, Path.read_bytes).shape
         return H, W
     if frame.label_camera is not None or frame.color is None or not frame.color.is_file():
         raise DataError(f"{frame.color or frame.name}: no colour image gives the size of depth; set intrinsics_size")
