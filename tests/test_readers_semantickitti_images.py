@@ -150,6 +150,14 @@ def test_the_digest_follows_points_and_truth(sequence):
         (sequence / file).write_bytes(data)
 
 
+def test_hashes_of_a_benchmark_follow_scan_and_pose(sequence):
+    before, path = opened(sequence).fingerprints(1), sequence / "velodyne/000001.bin"
+    assert len(before) == 2
+    path.write_bytes(path.read_bytes()[:-16])
+    after = opened(sequence).fingerprints(1)
+    assert [name for name in before if before[name] != after[name]] == ["velodyne/000001.bin"]
+
+
 def rewrite(path, before, after):
     text = path.read_text()
     assert before in text
