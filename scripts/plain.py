@@ -1,0 +1,137 @@
+"""Find habits of English that make sentences hard to read: `python scripts/plain.py [FILE ...]`, exit code 1 if any.
+
+It reads docstrings, comments and texts of Python files, and the prose of Markdown pages: of the named files, or of all
+files in git without the tests. Code, tables and texts in backticks are left out. CONTRIBUTING.md says what to write
+instead; a sentence that a rule meets is written again, the word is not replaced.
+"""
+
+from __future__ import annotations
+
+import ast
+import io
+import re
+import subprocess
+import sys
+import tokenize
+from collections import Counter
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+ROOT = Path(__file__).parents[1]
+MOST_WORDS = 40
+START = r"(?:^|(?<=[.!?:;] )|(?<=\n\n))"
+
+RULES = {
+    "so many: name the number": r"\bso many\b",
+    "is none of: is not a": r"\b(?:is|are|be) none of\b",
+    "that of, those of: repeat the noun": rf"{START}(?i:that|those) of\b|\bas (?:that|those) of\b",
+    "None where: None if, None without": r"\b(?:None|NaN) where\b",
+    "where it, there, no: if": r"\bwhere (?:it|there|no|none|not)\b(?! are on\b)",
+    "less: minus": r"\b(?:1|one) less (?:the|its|what)\b",
+    "anew: again": r"\banew\b",
+    "alike: the same, similar": r"\balike\b",
+    "of one's own: custom": r"\bof (?:one's|your) own\b",
+}
+"""Habits, with what to write, and their patterns."""
+
+BEGINS = re.compile(r"(?:What|Of|Whether|Which|Those|That)\b")
+BEGIN, LONG = "a docstring begins with What, Of, Whether, Which, Those, That", f"more than {MOST_WORDS} words"
+
+
+@dataclass(frozen=True, order=True)
+class Finding:
+    """A sentence that a rule meets."""
+
+    file: str
+    line: int
+    rule: str
+    text: str
+
+
+@dataclass(frozen=True)
+class Text:
+    """A text of a file, with the line on which it begins."""
+
+    line: int
+    content: str
+    docstring: bool = False
+
+
+def python_texts(source: str) -> Iterator[Text]:
+    """Yield docstrings, attribute docstrings, other texts with a space, and comments."""
+    tree, seen = ast.parse(source), set()
+    for node in ast.walk(tree):
+        if isinstance(node, ast.Expr) and isinstance(node.value, ast.Constant) and isinstance(node.value.value, str):
+            seen.add(id(node.value))
+            yield Text(node.lineno, node.value.value, docstring=True)
+    for node in ast.walk(tree):
+        text = node.value if isinstance(node, ast.Constant) and id(node) not in seen else None
+        if isinstance(text, str) and " " in text:
+            yield Text(node.lineno, text)
+    for token in tokenize.generate_tokens(io.StringIO(source).readline):
+        if token.type == tokenize.COMMENT:
+            yield Text(token.start[0], token.string.lstrip("# "))
+
+
+def page_texts(source: str) -> Iterator[Text]:
+    """Yield the paragraphs and items of a page, without code and tables."""
+    begun, lines, code = 1, [], False
+    for number, line in enumerate([*source.splitlines(), ""], 1):
+        bare = line.strip()
+        if bare.startswith("```"):
+            code = not code
+        prose = bool(bare) and not code and not line.startswith("    ") and bare[0] not in "|#`<!["
+        new = bool(re.match(r"[-*] |\d+\. ", bare))
+        if lines and (new or not prose):
+            yield Text(begun, "\n".join(lines))
+            lines = []
+        if prose:
+            begun = begun if lines else number
+            lines.append(line)
+
+
+def findings(file: str, source: str) -> Iterator[Finding]:
+    """Yield what the rules meet in a file."""
+    for text in python_texts(source) if file.endswith(".py") else page_texts(source):
+        content = re.sub(r"(?m)`[^`]*`|^ *(?:>>>|\.\.\.).*", "X", text.content)
+        if text.docstring and BEGINS.match(content):
+            yield Finding(file, text.line, BEGIN, content.split("\n")[0][:80])
+        for rule, pattern in RULES.items():
+            for found in re.finditer(pattern, content):
+                around = content[max(0, found.start() - 40) : found.end() + 30].replace("\n", " ")
+                yield Finding(file, text.line + content.count("\n", 0, found.start()), rule, around)
+        for sentence in re.split(r"(?<=[.!?:;])\s+|\n\s*\n|\n\s*[-*] |\n +\w+: ", content):
+            if len(sentence.split()) > MOST_WORDS:
+                line = text.line + content.count("\n", 0, content.index(sentence))
+                yield Finding(file, line, LONG, " ".join(sentence.split()[:10]))
+
+
+def files() -> list[str]:
+    """Return the Python files and pages of the repository, without tests, generated pages and links."""
+    listed = subprocess.run(["git", "ls-files"], cwd=ROOT, capture_output=True, text=True, check=True).stdout.split(
+        "\n"
+    )
+    return [
+        name
+        for name in listed
+        if name.endswith((".py", ".md"))
+        and not name.startswith(("tests/", "docs/reference/", "src/"))
+        and not (ROOT / name).is_symlink()
+    ]
+
+
+def main(names: list[str]) -> int:
+    """Print findings by file, and their number by rule; return the exit code."""
+    found = sorted(
+        {each for name in names or files() for each in findings(name, (ROOT / name).read_text(encoding="utf-8"))}
+    )
+    for each in found:
+        print(f"{each.file}:{each.line}: {each.rule}: ...{each.text}...")
+    for rule, count in Counter(each.rule for each in found).most_common():
+        print(f"{count:6}  {rule}", file=sys.stderr)
+    return 1 if found else 0
+
+
+if __name__ == "__main__":
+    sys.exit(main(sys.argv[1:]))
