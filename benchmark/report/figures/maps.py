@@ -176,7 +176,7 @@ def draw_overview(above: FromAbove, overview: Overview, georeference: Georeferen
     entries = [(names[k], tuple(channel / 255 for channel in palette[k])) for k in shown]
     columns = legend_columns([name for name, _ in entries])
     figure.set_figheight(figure.get_figheight() + LEGEND_LINE * math.ceil(len(entries) / columns))
-    figure.legend(handles=_handles(entries), loc="outside lower center", ncols=columns)
+    figure.legend(handles=legend_handles(entries), loc="outside lower center", ncols=columns)
     return figure
 
 
@@ -331,7 +331,8 @@ def _north(axes: Axes, degrees: float) -> None:
     )  # fmt: skip
 
 
-def _handles(entries: Sequence[tuple[str, Any]]) -> list[Any]:
+def legend_handles(entries: Sequence[tuple[str, Any]]) -> list[Any]:
+    """Return the keys of a legend: names with their colours."""
     from matplotlib.patches import Patch
 
     return [Patch(facecolor=shade, edgecolor=FAINT, linewidth=0.4, label=name) for name, shade in entries]
@@ -402,7 +403,7 @@ def draw_changes(
         mark_panel(own, letter, f"{panel.title}, {view.partition(',')[0]}")
         framed(own)
         locate(own, located, rows.shape, named=own is axes[0])
-        _number(own, panel, located, rows.shape)
+        number_places(own, panel.numbers, panel.centres, panel.links, located, rows.shape)
     return figure
 
 
@@ -421,11 +422,18 @@ def _draw(figure: Figure, axes: Axes, panel: Panel, rows: Int64) -> None:
     last.set_horizontalalignment("right")
 
 
-def _number(axes: Axes, panel: Panel, located: Located, cells: tuple[int, ...]) -> None:
-    """Draw the numbers of the areas at their centres, in a picture of so many rows and columns of cells."""
+def number_places(
+    axes: Axes,
+    numbers: Sequence[int],
+    centres: Sequence[tuple[float, float, float]],
+    links: Sequence[str],
+    located: Located,
+    cells: tuple[int, ...],
+) -> None:
+    """Draw the numbers of places at their centres, in a picture of so many rows and columns of cells."""
     from matplotlib.patheffects import withStroke
 
-    for number, centre, link in zip(panel.numbers, panel.centres, panel.links, strict=True):
+    for number, centre, link in zip(numbers, centres, links, strict=True):
         x, y = located.share(centre)
         if not (0 <= x <= 1 and 0 <= y <= 1):
             continue
