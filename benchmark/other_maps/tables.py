@@ -18,11 +18,12 @@ MOST_PLACES = 20
 OVERVIEW = ("map", "voxels", "covers", "covered", "same", "accuracy_run", "accuracy_map")
 """The columns of the table of maps on the screen."""
 
-LONGEST = 26
+LONGEST = 24
 """The most letters of the name of a map on the screen."""
 
 
-def _short(name: str) -> str:
+def short(name: str) -> str:
+    """Return a name that fits a table of the screen."""
     return name if len(name) <= LONGEST else f"{name[: LONGEST - 3]}..."
 
 
@@ -37,8 +38,8 @@ def overview(agreements: tuple[MapAgreement, ...], run: str) -> Table:
     columns = (
         Column("map", "Map"), Column("voxels", "Voxels", 0), Column("covers", "Holds %", 1),
         Column("covered", "In run %", 1), Column("outside", "Points outside %", 1),
-        Column("unlabelled", "No class %", 1), Column("same", "Same class %", 1),
-        Column("accuracy_run", "run", 3, over="Accuracy"), Column("accuracy_map", "map", 3, over="Accuracy"),
+        Column("unlabelled", "No class %", 1), Column("same", "Same %", 1),
+        Column("accuracy_run", "run", 3, over="Acc."), Column("accuracy_map", "map", 3, over="Acc."),
         Column("miou_run", "run", 3, over="mIoU"), Column("miou_map", "map", 3, over="mIoU"),
     )  # fmt: skip
     rows = tuple(
@@ -48,15 +49,15 @@ def overview(agreements: tuple[MapAgreement, ...], run: str) -> Table:
     )  # fmt: skip
     caption = (
         f"Holds: the share of the voxels of {run} that the map holds; in run: the share of the map's voxels that {run}"
-        " holds. The same class is that of the voxels that both hold and label. Accuracy and mIoU are of those of them"
-        " whose true class is known."
+        " holds. Same: the share with one class, of the voxels that both hold and label. Accuracy (acc.) and mIoU are"
+        " of those voxels whose true class is known."
     )
     return Table("maps", f"Maps of other programs and {run}", caption, columns, (Group("", rows),), "")
 
 
 def _classes(agreements: tuple[MapAgreement, ...], run: str) -> Table:
     columns = (
-        Column("class", "Class"), Column("voxels", "Voxels", 0), Column("same", "Same class %", 1),
+        Column("class", "Class"), Column("voxels", "Voxels", 0), Column("same", "Same %", 1),
         Column("instead", "Most often instead"), Column("recall_run", "run", 3, over="Recall"),
         Column("recall_map", "map", 3, over="Recall"),
     )  # fmt: skip
@@ -71,8 +72,8 @@ def _classes(agreements: tuple[MapAgreement, ...], run: str) -> Table:
 def _strata(agreements: tuple[MapAgreement, ...], run: str) -> Table:
     columns = (
         Column("op", "OP"), Column("voxels", "Voxels", 0), Column("covers", "Holds %", 1),
-        Column("same", "Same class %", 1), Column("accuracy_run", "run", 3, over="Accuracy"),
-        Column("accuracy_map", "map", 3, over="Accuracy"),
+        Column("same", "Same %", 1), Column("accuracy_run", "run", 3, over="Acc."),
+        Column("accuracy_map", "map", 3, over="Acc."),
     )  # fmt: skip
     groups = tuple(
         Group(own.name, tuple((s.name, s.voxels, 100 * s.covered, 100 * s.same, *s.accuracy) for s in own.strata))
@@ -119,7 +120,7 @@ def print_maps(agreements: tuple[MapAgreement, ...], run: str, console: Console,
         if table.name == "maps" or verbose:
             shown = table.only(*OVERVIEW) if table.name == "maps" else table
             groups = tuple(
-                Group(_short(group.name), tuple((_short(str(row[0])), *row[1:]) for row in group.rows))
+                Group(short(group.name), tuple((short(str(row[0])), *row[1:]) for row in group.rows))
                 for group in shown.groups
             )
             text = to_terminal(dataclasses.replace(shown, caption="", groups=groups), WIDTH)

@@ -9,15 +9,14 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from semstab.core.files import keep_only, write_json, write_text
-from semstab.core.types import UInt8
 from semstab.data.results import slug
-from semstab.data.topdown import EMPTY, top_down
+from semstab.data.topdown import top_down
 from semstab.exports.places import degrees_of, geojson, places_table
 from semstab.other_maps.agreement import ONLY_OTHER, ONLY_RUN, OTHER, SAME, Place, Voxelwise
 from semstab.other_maps.placing import centers
-from semstab.other_maps.tables import MOST_PLACES, tables
+from semstab.other_maps.tables import MOST_PLACES, short, tables
 from semstab.report.figures.located import Located
-from semstab.report.figures.maps import BLANK, framed, legend_handles, locate, map_panels, number_places
+from semstab.report.figures.maps import draw_kinds, framed, locate, map_panels, number_places
 from semstab.report.figures.style import LETTERS, Figure, mark_panel
 from semstab.report.figures.topdown import best_view_of
 from semstab.report.tables import save_tables
@@ -40,8 +39,7 @@ RIGHT = ("unknown", "both wrong", "map right", "run right", "both right")
 GREY, ORANGE, BLUE, PURPLE, DARK, PALE = (
     (196, 196, 196), (213, 94, 0), (0, 114, 178), (204, 121, 167), (50, 50, 50), (236, 236, 236),
 )  # fmt: skip
-OF_KIND: UInt8 = np.array([GREY, ORANGE, BLUE, PURPLE], np.uint8)
-OF_RIGHT: UInt8 = np.array([PALE, DARK, PURPLE, BLUE, GREY], np.uint8)
+OF_KIND, OF_RIGHT = (GREY, ORANGE, BLUE, PURPLE), (PALE, DARK, PURPLE, BLUE, GREY)
 
 
 def write(comparison: MapComparison, out: Path) -> list[Path]:
@@ -55,7 +53,7 @@ def write(comparison: MapComparison, out: Path) -> list[Path]:
     palette, size = comparison.first.colors, comparison.run.grid.size
     views = {
         name: [
-            Colored("difference", LEGEND, union.index, OF_KIND[union.kind]),
+            Colored("difference", LEGEND, union.index, np.array(OF_KIND, np.uint8)[union.kind]),
             Colored("map", name, union.index[union.theirs >= 0], palette[union.theirs[union.theirs >= 0]]),
             Colored("run", comparison.run.name, comparison.run.grid.index, palette[comparison.run.grid.label]),
         ]
@@ -121,7 +119,9 @@ def draw(comparison: MapComparison, own: Voxelwise) -> Canvas:
     laid = centers(union.index, size)
     shown, axis, view = best_view_of(laid, size, up)
     laid = laid[shown]
-    panels = [(f"{own.agreement.name}, {view}", union.kind[shown], RANK_OF_KIND, OF_KIND, tuple(KINDS.values()))]
+    panels: list[tuple[str, Any, Any, Any, Any]] = [
+        (f"{short(own.agreement.name)}, {view}", union.kind[shown], RANK_OF_KIND, OF_KIND, tuple(KINDS.values()))
+    ]
     if union.right is not None:
         panels.append(("which is right", union.right[shown], RANK_OF_RIGHT, OF_RIGHT, RIGHT))
     seen = [top_down(laid, size, axis, rank[values]) for _, values, rank, _, _ in panels]
@@ -129,13 +129,7 @@ def draw(comparison: MapComparison, own: Voxelwise) -> Canvas:
     for panel, letter, (title, values, _, colors, names), (rows, cell, corner) in zip(
         axes, LETTERS, panels, seen, strict=False
     ):
-        picture = np.array([*colors, BLANK], np.uint8)[np.where(rows == EMPTY, -1, values[rows])]
-        panel.imshow(picture, interpolation_stage="rgba")
-        entries = [(name, color / 255) for name, color in zip(names, colors, strict=True)]
-        panel.legend(
-            handles=legend_handles(entries), loc="upper center", bbox_to_anchor=(0.5, 0), borderaxespad=3.6,
-            ncols=min(3, len(names)), handlelength=0.9, columnspacing=1.0, handletextpad=0.4,
-        )  # fmt: skip
+        draw_kinds(figure, panel, rows, values, colors, names)
         located = Located.seen_along(axis, corner, (rows.shape[1] * cell, rows.shape[0] * cell), laid, georeference)
         mark_panel(panel, letter, title)
         framed(panel)

@@ -53,7 +53,7 @@ def draw_stability(above: FromAbove, georeference: Georeference | None = None) -
     table, rows, located = above.table, above.rows, Located.of(above, georeference)
     shown = [measure for measure in measures() if measure.panel]
     figure, (kind, *panels) = map_panels(rows, 1 + len(shown))
-    _draw_categories(figure, kind, rows, categories(table))
+    draw_kinds(figure, kind, rows, categories(table), CATEGORY_COLORS, CATEGORIES)
     for axes, measure in zip(panels, shown, strict=True):
         values = np.where(table.op > 1, measure.of(table), np.nan)
         _draw_measure(figure, axes, rows, values, measure.range, best_first=measure.better == "lower")
@@ -176,7 +176,7 @@ def draw_overview(above: FromAbove, overview: Overview, georeference: Georeferen
     entries = [(names[k], tuple(channel / 255 for channel in palette[k])) for k in shown]
     columns = legend_columns([name for name, _ in entries])
     figure.set_figheight(figure.get_figheight() + LEGEND_LINE * math.ceil(len(entries) / columns))
-    figure.legend(handles=legend_handles(entries), loc="outside lower center", ncols=columns)
+    figure.legend(handles=_handles(entries), loc="outside lower center", ncols=columns)
     return figure
 
 
@@ -215,16 +215,18 @@ def _colored(labels: Int64, colors: Colors) -> Image:
     return image
 
 
-def _draw_categories(figure: Figure, axes: Axes, rows: Int64, category: UInt8) -> None:
-    """Draw the categories with their names on a colour bar."""
+def draw_kinds(
+    figure: Figure, axes: Axes, rows: Int64, kind: npt.NDArray[Any], colors: Colors, names: Sequence[str]
+) -> None:
+    """Draw the kind (n,) of each voxel, as its category, with the names of the kinds on a colour bar."""
     from matplotlib.cm import ScalarMappable
     from matplotlib.colors import BoundaryNorm, ListedColormap
 
-    axes.imshow(_painted(rows, category, CATEGORY_COLORS), interpolation_stage="rgba")
-    shades = ListedColormap(np.array(CATEGORY_COLORS) / 255)
-    edges = np.arange(len(CATEGORIES) + 1) - 0.5
-    bar = color_bar(figure, axes, ScalarMappable(BoundaryNorm(edges, len(CATEGORIES)), shades))
-    bar.set_ticks(range(len(CATEGORIES)), labels=[name.replace(" ", "\n") for name in CATEGORIES])
+    axes.imshow(_painted(rows, kind, colors), interpolation_stage="rgba")
+    shades = ListedColormap(np.array(colors) / 255)
+    edges = np.arange(len(names) + 1) - 0.5
+    bar = color_bar(figure, axes, ScalarMappable(BoundaryNorm(edges, len(names)), shades))
+    bar.set_ticks(range(len(names)), labels=[name.replace(" ", "\n") for name in names])
     bar.ax.tick_params(length=0)
 
 
@@ -331,8 +333,7 @@ def _north(axes: Axes, degrees: float) -> None:
     )  # fmt: skip
 
 
-def legend_handles(entries: Sequence[tuple[str, Any]]) -> list[Any]:
-    """Return the keys of a legend: names with their colours."""
+def _handles(entries: Sequence[tuple[str, Any]]) -> list[Any]:
     from matplotlib.patches import Patch
 
     return [Patch(facecolor=shade, edgecolor=FAINT, linewidth=0.4, label=name) for name, shade in entries]
