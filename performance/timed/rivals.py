@@ -16,7 +16,8 @@ with the driver rivals/pyslam.cpp and pySLAM's own flags; this needs g++ and hea
 
     apt install g++ libtbb-dev libeigen3-dev libopencv-dev pybind11-dev
 
-`--keep FOLDER` keeps our run of these frames and the rivals' maps: `semstab-bench maps FOLDER/run FOLDER/*.npz`.
+`--keep FOLDER` keeps our runs of these frames, by the rules mean and votes, and the rivals' maps, for
+`semstab-bench maps FOLDER/mean FOLDER/*.npz`.
 
 Any other rival is a program that you have built. Nothing of another project is part of semstab. A rival is called as
 PROGRAM WORDS IN OUT. All numbers are little-endian:
@@ -150,10 +151,11 @@ def read_map(path: Path, voxel_size: float) -> dict[str, Any]:
 
 
 def keep_maps(folder: Path, maps: dict[str, Path], frames: Sequence[semstab.Frame], voxel_size: float, K: int) -> None:
-    """Write FOLDER/run, our run of the frames, and FOLDER/NAME.npz of each rival, for `semstab-bench maps`."""
+    """Write FOLDER/mean and FOLDER/votes, our runs by these rules, and FOLDER/NAME.npz of each rival."""
     names = [f"class {k}" for k in range(K)]
-    result = semstab.fuse(map(scan, frames), voxel_size=voxel_size, classes=names, check=None)
-    result.save(folder / "run")
+    for rule in ("mean", "votes"):
+        result = semstab.fuse(map(scan, frames), voxel_size=voxel_size, classes=names, check=None, rule=rule)
+        result.save(folder / rule)
     for name, path in maps.items():
         data = path.read_bytes()
         (n,) = np.frombuffer(data, "<i8", 1)
