@@ -11,7 +11,7 @@ import numpy as np
 
 from semstab.core.files import only_writer
 from semstab.core.types import Float64, Int64
-from semstab.data.georeference import Georeference
+from semstab.data.georeference import INSTALL, Georeference
 from semstab.engine.folder import load_result, model_of
 from semstab.errors import ConfigError, DataError, MissingDependencyError
 from semstab.exports.voxels import Chosen, Voxels
@@ -179,7 +179,7 @@ def _epsg(crs: str) -> int | None:
         from pyproj import CRS
         from pyproj.exceptions import CRSError
     except ImportError as error:
-        raise MissingDependencyError(f"reference systems need pyproj ({error})") from error
+        raise MissingDependencyError(f"reference systems need pyproj; {INSTALL}") from error
     try:
         number: int | None = CRS.from_user_input(crs).to_epsg()
     except CRSError:

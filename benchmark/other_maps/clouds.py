@@ -16,6 +16,7 @@ from semstab.core.files import parse_json
 from semstab.core.types import Float64, UInt8
 from semstab.datasets.files.surfaces import open_las
 from semstab.errors import ConfigError, DataError, SemstabError, summarize_error
+from semstab.exports.clouds import with_lazrs
 
 FIELDS = (
     "class", "label", "labels", "class_id", "label_id", "semantic", "semantic_label", "semantic_id", "semantics",
@@ -235,6 +236,7 @@ def _of_ours(names: Mapping[int, str], voxel_size: float, where: str) -> Stated:
 
 def _read_las(path: Path) -> Content:
     """Read a LAS or LAZ cloud: its dimensions, and the classes that an export of semstab names."""
+    with_lazrs(path)
     with open_las(path) as reader:
         header, cloud = reader.header, reader.read()
         columns = {name: np.asarray(cloud[name]) for name in cloud.point_format.dimension_names if name not in "XYZ"}
