@@ -14,7 +14,7 @@ from semstab.data.topdown import top_down
 from semstab.exports.places import degrees_of, geojson, places_table
 from semstab.other_maps.agreement import ONLY_OTHER, ONLY_RUN, OTHER, SAME, Place, Voxelwise
 from semstab.other_maps.placing import centers
-from semstab.other_maps.tables import MOST_PLACES, short, tables
+from semstab.other_maps.tables import short, tables
 from semstab.report.figures.located import Located
 from semstab.report.figures.maps import draw_kinds, framed, locate, map_panels, number_places
 from semstab.report.figures.style import LETTERS, Figure, mark_panel
@@ -30,7 +30,7 @@ RECORDING = "recording.rrd"
 FIGURES = "figures"
 
 MOST_NUMBERED = 9
-"""The most places that have their number in a picture."""
+"""The most places that are named in a picture and in the viewer."""
 
 KINDS = {SAME: "same class", OTHER: "other class", ONLY_RUN: "run only", ONLY_OTHER: "map only"}
 LEGEND = "grey: same class, orange: other class, blue: run only, purple: map only"
@@ -61,7 +61,7 @@ def write(comparison: MapComparison, out: Path) -> list[Path]:
     }
     places = {
         own.name: [
-            (f"{place.number} {place.ours} / {place.theirs}", place.centre) for place in own.places[:MOST_PLACES]
+            (f"{place.number} {place.ours} / {place.theirs}", place.centre) for place in own.places[:MOST_NUMBERED]
         ]
         for own in comparison.agreements
     }
