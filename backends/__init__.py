@@ -112,6 +112,11 @@ def by_own_rule(name: str) -> str:
     return name.partition(BY_RULE)[0]
 
 
+def is_builtin(name: str) -> bool:
+    """Return whether semstab has this backend itself; others come from plug-ins and files."""
+    return by_own_rule(name) in REGISTRY.builtin
+
+
 def _load(name: str) -> Any:
     """Return the class of a backend, or of the one that runs rules for it."""
     own, by, _ = name.partition(BY_RULE)

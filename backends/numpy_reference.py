@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+import math
 import time
 from collections import defaultdict
 from typing import Any, NamedTuple
@@ -29,6 +30,9 @@ from semstab.data.voxels import Extent, VoxelTable, index_columns
 
 ONE_IN, MOST = 16, 10_000
 """One voxel in `ONE_IN` is in the sample; one in twice as many, and so on, where the map has more than `MOST` allow."""
+
+MOST_OF_ALL = 1_000_000
+"""The most voxels of a map that the reference fuses as a whole."""
 
 ODD = np.array([-0x61C8864680B583EB, -0x3D4D51C2D82B14B1, 0x165667B19E3779F9])
 """The factors, one an axis, that mix an index's bits (odd numbers of Steele and Vigna's splitmix and of xxHash)."""
@@ -149,25 +153,46 @@ class NumpyReference(NumpyHistory):
 class NumpySample(NumpyHistory):
     """The reference on one in `one_in` of the voxels, drawn at random by their index, through all frames.
 
-    It fuses by the `rule`, with `rule_options`, where these are given. Each sample holds those of the next thinner one,
-    so that it can become thinner while the map grows: a defect in a share p of the voxels is found with probability
-    1 - (1 - p)^n, and n = MOST voxels find 0.05 % of them in 99 of 100.
+    A `whole` one starts with all voxels, and keeps them as long as that takes less time than the fusion that it checks,
+    and there are at most MOST_OF_ALL. It fuses by the `rule`, with `rule_options`, where these are given.
+
+    Each sample holds those of the next thinner one, so that it can become thinner while the map grows: a defect in a
+    share p of the voxels is found with probability 1 - (1 - p)^n, and n = MOST voxels find 0.05 % of them in 99 of 100.
     """
 
-    def __init__(self, voxel_size: float, num_classes: int, within: Extent | None = None, **rule: Any) -> None:
+    def __init__(
+        self, voxel_size: float, num_classes: int, within: Extent | None = None, *, whole: bool = False, **rule: Any
+    ) -> None:
         super().__init__(voxel_size, num_classes, within)
-        self.one_in, self._left = ONE_IN, 0
+        self.one_in, self._left = 1 if whole else ONE_IN, 0
+        self._ahead: float | None = None  # seconds of fusion less those of the reference; None before the second frame
         self._by_rule = NumpyRules(voxel_size, num_classes, **rule) if rule else None
 
-    def integrate(self, frame: Frame) -> None:
-        """Append the frame's observations of the sample; make the sample thinner where it has become too large."""
+    def integrate(self, frame: Frame, allowed: float = math.inf) -> None:
+        """Append the frame's observations of the sample; make the sample thinner if it is too large, or too slow.
+
+        `allowed` are the seconds that the backend took for the frame. The first frame, in which code is loaded, does
+        not count.
+        """
+        started = time.perf_counter()
         _, seen = self.append(frame)
         if self._by_rule is not None:
             self._by_rule.add(frame, seen, time.perf_counter())
-        while len(self._row) - self._left > MOST:
-            self.one_in *= 2
-            index = np.frombuffer(b"".join(self._row), dtype=np.int64).reshape(-1, 3)
-            self._left = int(np.count_nonzero(~in_sample(index.T, self.one_in)))
+        while len(self._row) - self._left > (MOST if self.one_in >= ONE_IN else MOST_OF_ALL):
+            self._thin()
+        if self._ahead is None:
+            self._ahead = 0.0
+        elif self.one_in < ONE_IN:
+            self._ahead += allowed - (time.perf_counter() - started)
+            if self._ahead < 0:
+                self._thin()
+                self._ahead = 0.0
+
+    def _thin(self) -> None:
+        """Leave every second voxel of the sample out."""
+        self.one_in *= 2
+        index = np.frombuffer(b"".join(self._row), dtype=np.int64).reshape(-1, 3)
+        self._left = int(np.count_nonzero(~in_sample(index.T, self.one_in)))
 
     def table(self) -> VoxelTable:
         """Return the map of the sample so far."""

@@ -23,6 +23,7 @@ if TYPE_CHECKING:
     from semstab.exports.relabel import relabel
     from semstab.gating.gate import GateConfig, gate
     from semstab.online import FusedResult, TemporalStability, fuse
+    from semstab.other_maps import compare_maps
     from semstab.report.saved_run import load
     from semstab.statistics.acceptance import AcceptanceThresholds
 
@@ -47,6 +48,7 @@ __all__ = [
     "VoxelTable",
     "backends",
     "compare",
+    "compare_maps",
     "datasets",
     "engine",
     "export",
@@ -69,7 +71,8 @@ _HOMES = {
     "ConfigError": "errors", "DataError": "errors", "Events": "data.events", "Frame": "data.frames",
     "GateConfig": "gating.gate", "Intrinsics": "data.frames", "LabelSpace": "data.labels",
     "MissingDependencyError": "errors", "Result": "data.records", "SemstabError": "errors", "VoxelTable": "data.voxels",
-    "FusedResult": "online", "TemporalStability": "online", "compare": "compare_runs", "fuse": "online",
+    "FusedResult": "online", "TemporalStability": "online", "compare": "compare_runs", "compare_maps": "other_maps",
+    "fuse": "online",
     "export": "exports", "gate": "gating.gate", "load": "report.saved_run",
     "load_config": "configure", "load_result": "engine.folder", "load_study": "configure", "relabel": "exports.relabel",
     "run": "api", "run_study": "api",

@@ -61,3 +61,30 @@ def test_a_sample_that_becomes_too_large_is_made_thinner_and_stays_exact(most, m
     np.testing.assert_array_equal(found.index, expected.index)
     np.testing.assert_array_equal(found.evidence[:], expected.evidence[:])
     np.testing.assert_array_equal(found.op, expected.op)
+
+
+@pytest.mark.parametrize(("allowed", "one_in"), [(60.0, 1), (0.0, 16)])
+def test_all_voxels_are_fused_as_long_as_that_takes_less_time_than_the_backend(allowed, one_in) -> None:
+    """A reference that is too slow becomes thinner, down to the usual sample and no further; it stays exact."""
+    whole, sample = NumpyReference(0.05, K), NumpySample(0.05, K, whole=True)
+    for frame in frames(2, 8):
+        whole.integrate(frame)
+        sample.integrate(frame, allowed)
+    assert sample.one_in == one_in
+    found, expected = sample.table(), whole.table()
+    expected = expected.rows(in_sample(expected.index.T, one_in))
+    np.testing.assert_array_equal(found.index, expected.index)
+    np.testing.assert_array_equal(found.drift_sum, expected.drift_sum)
+    np.testing.assert_array_equal(found.evidence[:], expected.evidence[:])
+
+
+def test_a_map_that_is_too_large_is_not_fused_as_a_whole(monkeypatch) -> None:
+    whole, sample = NumpyReference(0.05, K), NumpySample(0.05, K, whole=True)
+    for frame in frames(1, 12):
+        whole.integrate(frame)
+    most = len(whole.table()) // 3
+    monkeypatch.setattr(numpy_reference, "MOST_OF_ALL", most)
+    for frame in frames(1, 12):
+        sample.integrate(frame, 60.0)
+    assert sample.one_in == 4
+    assert 0 < len(sample.table()) <= most

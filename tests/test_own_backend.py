@@ -46,8 +46,50 @@ def run(folder: Path, *words: str, code: int = 0):
 
 def test_it_is_called_by_the_name_of_its_class_and_checked(folder) -> None:
     said = run(folder, "--backend", "fusion.py:Mine", "--check", "numpy").stdout
-    assert "checked Mine against numpy on 60 voxels: equal" in said
+    assert "checked Mine against numpy on all 60 voxels: equal" in said
     assert load_result(folder / "out").backend == "Mine"
+
+
+SLEEPS = """
+    def integrate(self, frame):
+        import time
+
+        time.sleep(0.2)
+        return super().integrate(frame)
+"""
+
+
+def test_all_voxels_are_compared_where_that_takes_less_than_the_fusion(folder) -> None:
+    """Its sample would be 1 in 16 of them."""
+    (folder / "fusion.py").write_text(ALIKE + SLEEPS, encoding="utf-8")
+    said = " ".join(run(folder, "--backend", "fusion.py:Mine").stdout.split())
+    assert "checked Mine against numpy on all 60 voxels: equal" in said
+
+
+def test_a_single_wrong_voxel_is_found_without_naming_a_check(folder) -> None:
+    (folder / "fusion.py").write_text(ALIKE + SLEEPS + ONE_WRONG, encoding="utf-8")
+    said = " ".join(run(folder, "--backend", "fusion.py:Mine", code=3).stdout.split())
+    assert "Mine and numpy DISAGREE" in said
+
+
+ONE_WRONG = """
+    def table(self):
+        table = super().table()
+        drift = table.drift_sum.copy()
+        drift[7] += 0.01
+        return replace(table, drift_sum=drift)
+"""
+
+
+def test_a_fast_one_is_checked_on_a_sample_with_its_bound(folder, monkeypatch) -> None:
+    """The screen says how many wrong voxels the sample may have missed: of n at random none is wrong."""
+    monkeypatch.setattr("semstab.backends.numpy_reference.MOST_OF_ALL", 30)
+    said = " ".join(run(folder, "--backend", "fusion.py:Mine").stdout.split())
+    found = re.search(r"numpy on (\d+) voxels drawn at random, 1 in \d+: equal; at most ([\d.]+) % of all voxels", said)
+    assert found, said
+    n, percent = int(found[1]), float(found[2])
+    assert 0 < n <= 30
+    assert (1 - percent / 100) ** n == pytest.approx(0.05, abs=0.01)
 
 
 def test_conform_takes_it_by_its_file(folder) -> None:

@@ -20,7 +20,7 @@ from typer.core import TyperCommand, TyperGroup
 from semstab import __version__
 from semstab.cli.dataset_commands import check, convert, predict
 from semstab.cli.options import say
-from semstab.cli.result_commands import calibrate, compare, conform, export, gate, leaderboard, relabel
+from semstab.cli.result_commands import calibrate, compare, conform, export, gate, leaderboard, maps, relabel
 from semstab.cli.run_commands import benchmark, filters, run, study
 from semstab.cli.show_commands import list_, show, view
 from semstab.core.process import configure_process
@@ -226,6 +226,7 @@ COMMANDS: Mapping[Callable[..., None], tuple[str, str]] = {
     leaderboard: ("leaderboard results", "leaderboard results --out site"),
     calibrate: ("calibrate judged --out thresholds.yaml", "calibrate judged --precision 0.9 --out thresholds.yaml"),
     export: ("export new --to map.ply", "export new --to voxels.csv --min-op 3"),
+    maps: ("maps new map.ply", "maps new map.ply other.parquet --out beside"),
     relabel: ("relabel new --out fused", "relabel new --out steady --category stable"),
     conform: ("conform './fuse'", "conform './fuse' --only pinhole"),
     show: ("show new overview --out overview.tex", "show old new --out glance"),

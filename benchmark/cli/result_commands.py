@@ -1,4 +1,4 @@
-"""Define the commands over finished runs: compare, gate, leaderboard, calibrate, export, relabel; and conform."""
+"""Define the commands over finished runs: compare, gate, leaderboard, calibrate, export, maps, relabel; and conform."""
 
 from __future__ import annotations
 
@@ -224,6 +224,47 @@ def export(
         join=join, task_format=task_format, most=most, code=code or (),
     ):  # fmt: skip
         print_lines([f"{file.path}: {file.content}", *(f"  {note}" for note in file.notes)], quiet=quiet)
+
+
+def maps(
+    run: Run,
+    others: Annotated[list[Path], typer.Argument(
+        metavar="OTHER...", help="Labelled clouds, meshes or voxel maps: .ply, .las, .laz, .npz, .parquet.")],
+    out: Annotated[Path | None, typer.Option(
+        "--out", "-o", help="Folder for tables, places (CSV, GeoJSON), pictures and a recording.")] = None,
+    scene: Scene = None,
+    model: Model = None,
+    backend: Backend = None,
+    field: Annotated[str | None, typer.Option(
+        metavar="NAME", help="The field that holds the class; 'colour' for colours.")] = None,
+    classes: Annotated[str | None, typer.Option(
+        metavar="FILE", help="Names of ids: YAML with ID: NAME, a taxonomy file, or the name of one.")] = None,
+    colours: Annotated[Path | None, typer.Option(
+        metavar="FILE", help="Colours of classes: YAML with NAME: [r, g, b], a taxonomy file, or CSV.")] = None,
+    unit: Annotated[str, typer.Option(metavar="m|cm|mm", help="Unit of the coordinates.")] = "m",
+    axes: Annotated[str | None, typer.Option(
+        metavar="X,Y,Z", help="The file's axes that become x, y, z, as x,-z,y.")] = None,
+    shift: Annotated[str | None, typer.Option(
+        metavar="X,Y,Z", help="Metres that are added after that, as 0.05,0.05,0.05.")] = None,
+    frame: Annotated[str | None, typer.Option(
+        metavar="scene|projection", help="The system of the coordinates, if the file does not say it.")] = None,
+    verbose: Verbose = False,
+    quiet: Quiet = False,
+) -> None:  # fmt: skip
+    """Compare the maps of other programs with the fused map: coverage, equal labels, accuracy, where they differ."""
+    from semstab.core.console import Console
+    from semstab.other_maps import compare_maps
+    from semstab.other_maps.tables import print_maps
+
+    with Console(stderr=True, quiet=quiet).status("comparing"):
+        comparison = compare_maps(
+            run, *others, scene=scene, model=model, backend=backend, field=field, classes=classes, colours=colours,
+            unit=unit, axes=axes, shift=shift, frame=frame, out=out,
+        )  # fmt: skip
+    if not quiet:
+        print_maps(comparison.agreements, comparison.run.name, Console(), verbose=verbose)
+    if out is not None:
+        print_lines([f"folder: {out}; viewer: semstab-bench view {out / 'recording.rrd'}"], quiet=quiet)
 
 
 def relabel(

@@ -192,12 +192,12 @@ def _clusters(index: Int32, label: Int64, loss: Float64, least: float) -> tuple[
 
     The second array (m,) counts the areas that improved alike.
     """
-    area, mass = _connected(index, label, loss, loss >= least)
-    _, others = _connected(index, label, -loss, loss <= -least)
+    area, mass = connected(index, label, loss, loss >= least)
+    _, others = connected(index, label, -loss, loss <= -least)
     return area, np.array([np.count_nonzero(others >= observed - 1e-9) for observed in mass], dtype=np.int64)
 
 
-def _connected(index: Int32, label: Int64, loss: Float64, where: Mask) -> tuple[Int64, Float64]:
+def connected(index: Int32, label: Int64, loss: Float64, where: Mask) -> tuple[Int64, Float64]:
     """Return the areas of voxels of one class that touch each other, and the loss that each sums up to."""
     from scipy.sparse import coo_array
     from scipy.sparse.csgraph import connected_components

@@ -179,7 +179,8 @@ class Config(Settings):
         [BackendConfig(name="numba")], min_length=1, description="the first fuses every unit, others the base units"
     )
     check: str | None = Field(
-        SAMPLE, description="sample: the numpy reference on some voxels; a backend that fuses all base units; null"
+        SAMPLE,
+        description="sample: the numpy reference on some voxels; a backend that fuses all base units; null",
     )
     tolerance: float = Field(1e-9, ge=0, description="largest difference at which two backends agree")
     taxonomy: str | None = Field(None, description="label space to fuse in; the dataset's own where not given")

@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import json
 import math
+import time
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import partial
@@ -12,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from semstab.backends import FusionBackend, create, takes_option
+from semstab.backends import FusionBackend, create, is_builtin, takes_option
 from semstab.backends.numpy_reference import NumpySample
 from semstab.config import Config
 from semstab.core.arrays import Rows
@@ -85,7 +86,9 @@ class LiveMap:
             if unit.compares_truth and truth_task(task) is not None:
                 live.truth = live.new_map(log=False, by_rule=False)
             if unit.sampled:
-                live.reference = NumpySample(config.voxel_size, K, work.within, **config.backends[0].ruled)
+                whole = not is_builtin(config.backends[0].name)
+                ruled = config.backends[0].ruled
+                live.reference = NumpySample(config.voxel_size, K, work.within, whole=whole, **ruled)
         if unit.assessed and work.measures_images:
             live.sampler = Sampler(K)
         return live
@@ -128,15 +131,17 @@ class LiveMap:
             points = int(np.count_nonzero(frame.valid)) if self.work.tile is None else 0
             return FrameReport(frame.index, points, voxels=0, new_voxels=0, drift_sum=0.0, seconds=0.0, map_voxels=0)
         self.background.drain()  # it would take the time of the map
+        started = time.perf_counter()
         with watch(f"fuse {self.name.backend}"):
             report = self.backend.integrate(frame)
+        seconds = time.perf_counter() - started
         if not isinstance(report, FrameReport):
             raise ConfigError(
                 f"backend '{self.name.backend}': integrate returned a {type(report).__name__}; it returns a"
                 " semstab.data.results.FrameReport (docs/tutorials/own-backend.md)"
             )
         if self.reference is not None:
-            self.background.submit(partial(self._integrate_reference, self.reference, frame, watch))
+            self.background.submit(partial(self._integrate_reference, self.reference, frame, seconds, watch))
         if frame.scores is not None and self.work.unit.image_space:
             with watch("reduced scores"):
                 self.hard = self.hard or self.new_map(log=False)
@@ -148,9 +153,9 @@ class LiveMap:
         return report
 
     @staticmethod
-    def _integrate_reference(reference: NumpySample, frame: Frame, watch: Stopwatch) -> None:
+    def _integrate_reference(reference: NumpySample, frame: Frame, seconds: float, watch: Stopwatch) -> None:
         with watch("reference"):
-            reference.integrate(frame)
+            reference.integrate(frame, seconds)
 
     def sample(self, prepared: Decoded, watch: Stopwatch) -> None:
         """Keep a sample of what the frame observes."""

@@ -9,8 +9,8 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
-from semstab.backends import expected_bytes, is_pointwise
-from semstab.backends.numpy_reference import ONE_IN
+from semstab.backends import expected_bytes, is_builtin, is_pointwise
+from semstab.backends.numpy_reference import MOST_OF_ALL, ONE_IN
 from semstab.config import Config
 from semstab.core.arrays import evenly
 from semstab.core.prefetch import default_threads, prefetch
@@ -47,7 +47,7 @@ class MapMemory:
         soft: Of scores, which are fused as labels as well.
         logged: Whether every observation is kept.
         compared: Whether the ground truth is fused, too.
-        sampled: Whether the reference fuses a sample of the voxels.
+        sampled: Whether the reference fuses a sample of the voxels, or, to check a backend from outside, all of them.
     """
 
     backend: str
@@ -62,7 +62,10 @@ class MapMemory:
         n, seen = int(voxels), int(observations)
         total = expected_bytes(self.backend, n, seen, self.K, soft=self.soft)
         total += (self.compared + self.soft) * expected_bytes(self.backend, n, seen, self.K)
-        return total + self.sampled * expected_bytes("numpy", n // ONE_IN, 0, self.K)
+        if is_builtin(self.backend):
+            return total + self.sampled * expected_bytes("numpy", n // ONE_IN, 0, self.K)
+        whole = min(n, MOST_OF_ALL)
+        return total + self.sampled * expected_bytes("numpy", whole, seen * whole // max(n, 1), self.K, soft=self.soft)
 
     def tables(self, voxels: float, observations: float) -> float:
         """Return the bytes of its tables and of its log."""

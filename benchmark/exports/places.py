@@ -48,11 +48,11 @@ def write_places(chosen: Chosen, record: Record, file: Path, most: int) -> tuple
     part, names = chosen.first, frame_names(record)
     points = part.in_file(np.array([place.centre for place in places]))
     rows = [_row(place, point.tolist(), part, names) for place, point in zip(places, points, strict=True)]
-    degrees = None if part.georeference is None else _degrees(points, part.georeference, file)
+    degrees = None if part.georeference is None else degrees_of(points, part.georeference, file)
     if file.suffix.lower() == GEOJSON:
-        write_json(file, _geojson(rows, points.tolist(), degrees, part))
+        write_json(file, geojson(rows, points.tolist(), degrees, part))
     else:
-        write_text(file, _table(rows, degrees))
+        write_text(file, places_table(rows, degrees))
     return len(places), part
 
 
@@ -68,7 +68,7 @@ def _row(place: Place, point: Sequence[float], part: Voxels, names: Mapping[int,
     }  # fmt: skip
 
 
-def _degrees(points: Any, georeference: Georeference, file: Path) -> list[tuple[float, float]]:
+def degrees_of(points: Any, georeference: Georeference, file: Path) -> list[tuple[float, float]]:
     """Return longitude and latitude in WGS 84 of points (n, 3) in the projection."""
     try:
         from pyproj import Transformer
@@ -79,7 +79,7 @@ def _degrees(points: Any, georeference: Georeference, file: Path) -> list[tuple[
     return [(round(float(x), 8), round(float(y), 8)) for x, y in zip(lon, lat, strict=True)]
 
 
-def _geojson(
+def geojson(
     rows: Sequence[Mapping[str, Any]],
     points: Sequence[Sequence[float]],
     degrees: Sequence[tuple[float, float]] | None,
@@ -98,7 +98,7 @@ def _geojson(
     }  # fmt: skip
 
 
-def _table(rows: Sequence[Mapping[str, Any]], degrees: Sequence[tuple[float, float]] | None) -> str:
+def places_table(rows: Sequence[Mapping[str, Any]], degrees: Sequence[tuple[float, float]] | None) -> str:
     """Return CSV, lists joined by '; ', in which a spreadsheet sees no formula."""
     text = io.StringIO()
     writer = csv.writer(text, lineterminator="\n")

@@ -27,6 +27,11 @@ and in the recording of a comparison
 
 - `change/RUN/agreement`, `.../truth`: VoxelGridMap: the loss or gain of each voxel that changed
 - `change/RUN/.../same`, `.../locations`: Points3D: the other voxels; the locations that got worse, with their numbers
+
+and in the recording of other programs' maps
+
+- `maps/NAME/difference`, `.../map`, `.../run`: VoxelGridMap: where the maps differ, and the classes of both
+- `maps/NAME/difference/places`: Points3D: the largest places where they differ
 """
 
 from semstab.recording.layout import record_changes

@@ -16,6 +16,9 @@ with the driver rivals/pyslam.cpp and pySLAM's own flags; this needs g++ and hea
 
     apt install g++ libtbb-dev libeigen3-dev libopencv-dev pybind11-dev
 
+`--keep FOLDER` keeps our runs of these frames, by the rules mean and votes, and the rivals' maps, for
+`semstab-bench maps FOLDER/mean FOLDER/*.npz`.
+
 Any other rival is a program that you have built. Nothing of another project is part of semstab. A rival is called as
 PROGRAM WORDS IN OUT. All numbers are little-endian:
 
@@ -147,6 +150,20 @@ def read_map(path: Path, voxel_size: float) -> dict[str, Any]:
     return {"voxel": voxel, "label": labels[first], "ties": ties[first] if len(ties) else None}
 
 
+def keep_maps(folder: Path, maps: dict[str, Path], frames: Sequence[semstab.Frame], voxel_size: float, K: int) -> None:
+    """Write FOLDER/mean and FOLDER/votes, our runs by these rules, and FOLDER/NAME.npz of each rival."""
+    names = [f"class {k}" for k in range(K)]
+    for rule in ("mean", "votes"):
+        result = semstab.fuse(map(scan, frames), voxel_size=voxel_size, classes=names, check=None, rule=rule)
+        result.save(folder / rule)
+    for name, path in maps.items():
+        data = path.read_bytes()
+        (n,) = np.frombuffer(data, "<i8", 1)
+        points = np.frombuffer(data, "<f8", 3 * n, 8).reshape(n, 3)
+        label = np.frombuffer(data, "<i4", n, 8 + 24 * n)
+        np.savez(folder / f"{name.replace(', ', '-')}.npz", points=points, label=label, classes=names)
+
+
 def compared(ours: dict[str, Any], theirs: dict[str, Any]) -> dict[str, Any]:
     """Voxels that one of two maps has, and how many labels differ in those of both."""
     _, a, b = np.intersect1d(ours["voxel"], theirs["voxel"], assume_unique=True, return_indices=True)
@@ -220,6 +237,7 @@ def main(
     rounds: int = 1,
     one: Literal["open3d", "points", "images"] | None = None,
     out: Path | None = None,
+    keep: Path | None = None,
 ) -> Any:
     if one and out:  # in a process of its own
         fuse(one, out, size, frames, classes, voxel_size)
@@ -241,6 +259,8 @@ def main(
         works |= {name: partial(run, shlex.split(words), [given, maps[name]]) for name, words in rivals.items()}
         reports = measuring.in_turns(works, rounds, warm=0)
         found = {name: read_map(path, voxel_size) for name, path in maps.items() if path.exists()}
+        if keep:
+            keep_maps(keep, {name: maps[name] for name in rivals}, seen(size, frames, classes), voxel_size, classes)
     print(f"{frames} frames of {size}, K = {classes}, {voxel_size:g} m, one core")
     print(*(f"{name}: {which}" for name, which in commits.items()), sep="\n", end="\n\n")
     table = measuring.Table(

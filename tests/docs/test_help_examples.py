@@ -61,6 +61,7 @@ def folder(tmp_path_factory):
     for name in ("old", "new"):
         bench("--data", "flight", "--out", name, cwd=folder)
     bench("--data", "flight", "--out", "judged", "--statistics", cwd=folder)
+    bench("export", "new", "--to", "map.ply", "--to", "other.parquet", cwd=folder)
     return folder
 
 

@@ -53,7 +53,7 @@ def draw_stability(above: FromAbove, georeference: Georeference | None = None) -
     table, rows, located = above.table, above.rows, Located.of(above, georeference)
     shown = [measure for measure in measures() if measure.panel]
     figure, (kind, *panels) = map_panels(rows, 1 + len(shown))
-    _draw_categories(figure, kind, rows, categories(table))
+    draw_kinds(figure, kind, rows, categories(table), CATEGORY_COLORS, CATEGORIES)
     for axes, measure in zip(panels, shown, strict=True):
         values = np.where(table.op > 1, measure.of(table), np.nan)
         _draw_measure(figure, axes, rows, values, measure.range, best_first=measure.better == "lower")
@@ -215,16 +215,18 @@ def _colored(labels: Int64, colors: Colors) -> Image:
     return image
 
 
-def _draw_categories(figure: Figure, axes: Axes, rows: Int64, category: UInt8) -> None:
-    """Draw the categories with their names on a colour bar."""
+def draw_kinds(
+    figure: Figure, axes: Axes, rows: Int64, kind: npt.NDArray[Any], colors: Colors, names: Sequence[str]
+) -> None:
+    """Draw the kind (n,) of each voxel, as its category, with the names of the kinds on a colour bar."""
     from matplotlib.cm import ScalarMappable
     from matplotlib.colors import BoundaryNorm, ListedColormap
 
-    axes.imshow(_painted(rows, category, CATEGORY_COLORS), interpolation_stage="rgba")
-    shades = ListedColormap(np.array(CATEGORY_COLORS) / 255)
-    edges = np.arange(len(CATEGORIES) + 1) - 0.5
-    bar = color_bar(figure, axes, ScalarMappable(BoundaryNorm(edges, len(CATEGORIES)), shades))
-    bar.set_ticks(range(len(CATEGORIES)), labels=[name.replace(" ", "\n") for name in CATEGORIES])
+    axes.imshow(_painted(rows, kind, colors), interpolation_stage="rgba")
+    shades = ListedColormap(np.array(colors) / 255)
+    edges = np.arange(len(names) + 1) - 0.5
+    bar = color_bar(figure, axes, ScalarMappable(BoundaryNorm(edges, len(names)), shades))
+    bar.set_ticks(range(len(names)), labels=[name.replace(" ", "\n") for name in names])
     bar.ax.tick_params(length=0)
 
 
@@ -402,7 +404,7 @@ def draw_changes(
         mark_panel(own, letter, f"{panel.title}, {view.partition(',')[0]}")
         framed(own)
         locate(own, located, rows.shape, named=own is axes[0])
-        _number(own, panel, located, rows.shape)
+        number_places(own, panel.numbers, panel.centres, panel.links, located, rows.shape)
     return figure
 
 
@@ -421,11 +423,18 @@ def _draw(figure: Figure, axes: Axes, panel: Panel, rows: Int64) -> None:
     last.set_horizontalalignment("right")
 
 
-def _number(axes: Axes, panel: Panel, located: Located, cells: tuple[int, ...]) -> None:
-    """Draw the numbers of the areas at their centres, in a picture of so many rows and columns of cells."""
+def number_places(
+    axes: Axes,
+    numbers: Sequence[int],
+    centres: Sequence[tuple[float, float, float]],
+    links: Sequence[str],
+    located: Located,
+    cells: tuple[int, ...],
+) -> None:
+    """Draw the numbers of places at their centres, in a picture of so many rows and columns of cells."""
     from matplotlib.patheffects import withStroke
 
-    for number, centre, link in zip(panel.numbers, panel.centres, panel.links, strict=True):
+    for number, centre, link in zip(numbers, centres, links, strict=True):
         x, y = located.share(centre)
         if not (0 <= x <= 1 and 0 <= y <= 1):
             continue

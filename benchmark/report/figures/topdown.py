@@ -50,11 +50,15 @@ def _tops(table: VoxelTable, up: npt.ArrayLike, factor: int) -> VoxelTable:
 
 def best_view(table: VoxelTable, up: npt.ArrayLike) -> tuple[Mask, Float64, str]:
     """Return a mask (n,) of the voxels to show, the axis (3,) towards the viewer, and the name of that view."""
+    return best_view_of(table.centers, table.voxel_size, up)
+
+
+def best_view_of(centers: Float64, voxel_size: float, up: npt.ArrayLike) -> tuple[Mask, Float64, str]:
+    """Return the same of voxels with these centres (n, 3)."""
     right, ahead, up_axis = level_axes(up)
-    every = np.ones(len(table), dtype=np.bool_)
-    centers = table.centers
-    column, count = _numbered(_columns(centers, up_axis, table.voxel_size))
-    areas = [count, *(_numbered(_columns(centers, axis, table.voxel_size))[1] for axis in (right, ahead))]
+    every = np.ones(len(centers), dtype=np.bool_)
+    column, count = _numbered(_columns(centers, up_axis, voxel_size))
+    areas = [count, *(_numbered(_columns(centers, axis, voxel_size))[1] for axis in (right, ahead))]
     if max(areas[1:]) > SLENDER * areas[0]:
         side = right if areas[1] > areas[2] else ahead
         upright = max((-side, side), key=lambda axis: float(level_axes(axis)[1] @ up_axis))
@@ -66,7 +70,7 @@ def best_view(table: VoxelTable, up: npt.ArrayLike) -> tuple[Mask, Float64, str]
     np.maximum.at(top, column, heights)
     np.minimum.at(bottom, column, heights)
     covered_columns = (top > cut) & (bottom < high - 0.5 * (high - low))
-    if np.mean(covered_columns) <= LIDDED or high - low < 4 * table.voxel_size:
+    if np.mean(covered_columns) <= LIDDED or high - low < 4 * voxel_size:
         return every, up_axis, "from above"
     return heights <= cut, up_axis, f"cut open at {cut:.2g} m"
 

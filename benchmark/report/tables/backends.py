@@ -8,7 +8,7 @@ from semstab.config import BACKENDS
 from semstab.data.measures import measures
 from semstab.data.records import Record, Result
 from semstab.data.results import Agreement
-from semstab.data.statistics import CorrectnessStatistics
+from semstab.data.statistics import CONFIDENCE, CorrectnessStatistics
 from semstab.metrics.summary import macro_mean
 from semstab.report.means import Pooled, pooled
 from semstab.report.tables.stability import SBD_OVER, of_measures, settings
@@ -167,6 +167,17 @@ def agreement(result: Result) -> list[Table]:
 def _backend_agreement_row(row: Agreement, names: Iterable[str]) -> Row:
     largest = (row.difference(name).max for name in names)
     return row.scene, row.model, sum(row.only_in), *largest, "agree" if row.agrees else "disagree"
+
+
+def largest_share(voxels: int, confidence: float = CONFIDENCE) -> float:
+    """Return the largest share of wrong voxels of which, at this confidence, some would be among so many at random.
+
+    With the share p all are right with probability (1 - p)^n: the upper end of Clopper and Pearson (1934) for none.
+
+    >>> round(100 * largest_share(1595), 2)
+    0.19
+    """
+    return float(1 - (1 - confidence) ** (1 / voxels))
 
 
 def one_in(rows: Sequence[Agreement]) -> str:

@@ -8,14 +8,16 @@ from pathlib import Path
 
 from rich.console import Console
 
+from semstab.backends import is_builtin
 from semstab.data.records import Result
 from semstab.data.results import Agreement
+from semstab.data.statistics import CONFIDENCE
 from semstab.engine.executors import InProcess
 from semstab.metrics import macro_mean
 from semstab.report.filter_study import filter_studies
 from semstab.report.narrative import warnings
 from semstab.report.tables import tables
-from semstab.report.tables.backends import one_in
+from semstab.report.tables.backends import largest_share, one_in
 from semstab.report.tables.table import to_terminal
 from semstab.report.terminal.filters import print_filter_study
 from semstab.report.terminal.layout import WIDTH, wrapped
@@ -102,8 +104,16 @@ def _check(pair: tuple[str, str], rows: Sequence[Agreement]) -> str:
     if not voxels and not bad:
         return f"{checked} was not checked against {reference}: no voxel was drawn{share}"
     drawn = f" drawn at random{share}" if share else ""
-    if not bad:
+    if not bad and is_builtin(checked):
         return f"checked {checked} against {reference} on {voxels:,} voxels{drawn}: equal"
+    if not bad and not share:
+        return f"checked {checked} against {reference} on all {voxels:,} voxels: equal"
+    if not bad:
+        most = f"{100 * largest_share(voxels):.2g}".removeprefix("0")
+        return (
+            f"checked {checked} against {reference} on {voxels:,} voxels{drawn}: equal; at most {most} % of all voxels"
+            f" are wrong, with {CONFIDENCE:.0%}"
+        )
     row = bad[0]
     only = f"; {sum(row.only_in):,} voxels in one only" if any(row.only_in) else ""
     return (
