@@ -19,7 +19,7 @@ of the LiDAR's points, read by `semantickitti_images`; things that move are mask
 'background' is wrong everywhere.
 Networks: scripts/street_nets.py; fourteen of four families, and eight variants that are worse by construction.
 
-results/streets.csv has a row for each network on each street, in each condition:
+results/streets.csv has a row for each network on each street, in each condition; others than `main` have alpha and VSS:
     accuracy, miou          of the labels of single frames at the LiDAR's pixels; mIoU over the classes of the truth
     alpha, _low, _high      agreement of two views of a spot beyond chance, with its 95 % interval
     meaning                 alpha by the distance between Cityscapes' categories
@@ -53,6 +53,7 @@ import cv2
 import numpy as np
 
 import semstab
+from semstab.backends import create
 from semstab.backends.shared.association import back_project, voxel_index
 from semstab.core.files import atomic_path
 from semstab.data.measures import entropy, sbd, vss
@@ -62,6 +63,7 @@ from semstab.statistics.accumulate import sums_of_spots
 from semstab.statistics.agreement import psa
 from semstab.statistics.cluster_sums import value
 from semstab.statistics.observations import SpotObservations
+from semstab.statistics.sampler import Sampler
 from semstab.task import open_scenes, read, tasks_of, truth_task
 
 ROOT = Path(__file__).parents[1]
@@ -167,14 +169,13 @@ def file_name(network: str) -> str:
 
 # --- Run and measure --------------------------------------------------------------------------------------------------
 
-CONDITIONS: dict[str, list[str]] = {
-    "main": ["--voxel-size", "0.2", "--video-measures", "depth"],
-    "voxels of 0.1 m": ["--voxel-size", "0.1"],
-    "voxels of 0.4 m": ["--voxel-size", "0.4"],
-    "every second frame": ["--voxel-size", "0.2", "--frames", "::2"],
-    "things that move kept": ["--voxel-size", "0.2", "--option", "moving=keep"],
+CONDITIONS: dict[str, tuple[float, str, str]] = {
+    "voxels of 0.1 m": (0.1, "mask", "::1"),
+    "voxels of 0.4 m": (0.4, "mask", "::1"),
+    "every second frame": (0.2, "mask", "::2"),
+    "things that move kept": (0.2, "keep", "::1"),
 }
-"""What a run's command says; all but the first without the variants."""
+"""Other choices: voxel size in metres, whether things that move are masked, and frames."""
 
 SIGNS = ("disagreement", "entropy", "border", "softmax")
 """Signs that the label of a pixel is wrong: 1 - PSA and the entropy of its voxel, how near the next border of its own
@@ -187,35 +188,51 @@ def run(work: Path, results: Path) -> None:
     Raises:
         StudyError: If a command fails.
     """
-    about = _about(work)
-    rows: list[dict[str, Any]] = []
-    commands = {}
-    for condition, words in CONDITIONS.items():
-        models = [name for name in about if condition == "main" or not about[name]["of"]]
-        out = work / "runs" / condition.replace(" ", "-")
-        command = [
-            "run", "--dataset", "semantickitti_images", "--data", str(work / "data"), "--taxonomy", "cityscapes",
-            "--option", f"labels_root={work / 'labels'}", *words, "--no-truth", "--rerun", "off", "--out", str(out),
-        ]  # fmt: skip
-        command += [word for model in models for word in ("--model", model)]
-        done = subprocess.run([sys.executable, "-m", "semstab", *command, "--quiet"], check=False)
-        if done.returncode not in (0, 1):
-            raise StudyError(f"exit code {done.returncode} of semstab-bench {shlex.join(command)}")
-        commands[condition] = shlex.join(["semstab-bench", *command]).replace(str(work), "WORK")
-        records = semstab.load_result(out).select()
-        for record in records:
-            rows.append({"condition": condition, **_row(record, about[record.unit.model])})
-        print(f"{condition}: {len(records)} units", flush=True)
-        if condition == "main":
-            numbers, classes = _against_truth(out, records, work)
-            rows = [row | numbers[row["street"], row["network"]] for row in rows]
-            rows += _halves(records, about)
+    about, out = _about(work), work / "runs/main"
+    command = [
+        "run", "--dataset", "semantickitti_images", "--data", str(work / "data"), "--taxonomy", "cityscapes",
+        "--option", f"labels_root={work / 'labels'}", "--voxel-size", "0.2", "--video-measures", "depth", "--no-truth",
+        "--rerun", "off", "--out", str(out), *(word for model in about for word in ("--model", model)),
+    ]  # fmt: skip
+    done = subprocess.run([sys.executable, "-m", "semstab", *command, "--quiet"], check=False)
+    if done.returncode not in (0, 1):
+        raise StudyError(f"exit code {done.returncode} of semstab-bench {shlex.join(command)}")
+    records = semstab.load_result(out).select()
+    numbers, classes = _against_truth(out, records, work)
+    rows = [
+        {"condition": "main", **_row(r, about[r.unit.model]), **numbers[r.unit.scene, r.unit.model]} for r in records
+    ]
+    rows += _halves(records, about)
+    rows += _under_other_choices(out, about)
     accuracy = {(row["street"], row["network"]): row["accuracy"] for row in rows if row["condition"] == "main"}
     for row in rows:
         row["accuracy"] = accuracy[row["street"], row["network"]]
     _write(results / "streets.csv", rows)
     _write(results / "streets-classes.csv", classes)
-    _describe(results / "streets.json", commands, about, work)
+    _describe(results / "streets.json", shlex.join(["semstab-bench", *command]).replace(str(work), "WORK"), about, work)
+
+
+def _under_other_choices(out: Path, about: Mapping[str, dict[str, Any]]) -> Iterator[dict[str, Any]]:
+    """Yield rows with alpha and VSS in each of CONDITIONS, of the networks without the variants."""
+    config = semstab.load_config(out / "config.yaml")
+    for condition, (voxel_size, moving, frames) in CONDITIONS.items():
+        options = {**config.dataset.options, "moving": moving}
+        own = config.model_copy(update={"dataset": config.dataset.model_copy(update={"options": options})})
+        stride = int(frames.rpartition(":")[2])
+        for street, scene in open_scenes(own, out).items():
+            for task in tasks_of(scene, own):
+                if about[task.model]["of"]:
+                    continue
+                K = len(task.mapping.target.classes)
+                backend, sampler = create("numba", voxel_size=voxel_size, num_classes=K), Sampler(K)
+                for index in task.indices[::stride]:
+                    frame = read(task, index)
+                    backend.integrate(frame)
+                    sampler.add(frame)
+                of = {"street": street, "network": task.model, "family": about[task.model]["family"], "of": ""}
+                alpha = value(sums_of_spots(sampler.sample(task.mapping.target.classes)), "alpha")
+                yield {"condition": condition, **of, "alpha": alpha, "vss": _means(backend.table(), 3)["vss"]}
+        print(condition, flush=True)
 
 
 def _about(work: Path) -> dict[str, dict[str, Any]]:
@@ -373,7 +390,7 @@ def _text(value: object) -> str:
     return str(value) if not isinstance(value, float) else "" if math.isnan(value) else f"{value:.6g}"
 
 
-def _describe(path: Path, commands: Mapping[str, str], about: Mapping[str, Any], work: Path) -> None:
+def _describe(path: Path, command: str, about: Mapping[str, Any], work: Path) -> None:
     """Write versions, commands and digests of what was read."""
     packages = ("semstab", "numpy", "numba", "opencv-python-headless", "scipy", "torch", "ai-edge-litert")
     folders = {
@@ -385,7 +402,7 @@ def _describe(path: Path, commands: Mapping[str, str], about: Mapping[str, Any],
     content = {
         "schema": 1,
         "versions": {"python": platform.python_version()} | {name: metadata.version(name) for name in packages},
-        "commands": commands,
+        "command": command,
         "sha256": folders,
     }
     with atomic_path(path) as temporary:
