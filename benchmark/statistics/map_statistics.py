@@ -62,6 +62,7 @@ from semstab.statistics.frame_disagreement import LoneDisagreement, by_frame, lo
 from semstab.statistics.geometry import losses
 from semstab.statistics.groupings import groupings
 from semstab.statistics.intervals import confidence_intervals, estimate, headline_specs, scope_of, spec_of
+from semstab.statistics.moving import moved_spots
 from semstab.statistics.observations import SpotObservations
 from semstab.statistics.ranges import range_agreement
 from semstab.statistics.sample import MapSample
@@ -210,9 +211,10 @@ def analyse(
         lone = lone_disagreement(spots)
         outlying = outlying_frames(lone, len(spots.views), name=frame_name)
     agreement_of_spots = None if spots is None else spot_agreement(spots, sums, table, scope, critical, limits)
+    moved = None if spots is None else moved_spots(spots, sums, headline.alpha, scope, frame_name)
     stability = verdict(
         name or "model", headline=headline, spots=agreement_of_spots, flips=flips, voxels=repeats, share=repeated.share,
-        limits=limits,
+        limits=limits, moved=moved,
     )  # fmt: skip
     summary = MapStatistics(
         schema=SCHEMA, name=name, seed=seed, K=table.K, voxel_size=table.voxel_size,
@@ -231,6 +233,7 @@ def analyse(
         outlying_frames=outlying,
         ranges=None if spots is None else range_agreement(spots, scope, limits),
         groupings=None if spots is None else groupings(spots, sums, scope, limits),
+        moved=moved,
     )  # fmt: skip
     return Analysis(summary, whole, sums, sample, shares, drawn, lone)
 
