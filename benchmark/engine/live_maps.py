@@ -87,7 +87,7 @@ class LiveMap:
             if unit.sampled:
                 live.reference = NumpySample(config.voxel_size, K, work.within, **config.backends[0].ruled)
         if unit.assessed and work.measures_images:
-            live.sampler = Sampler(K)
+            live.sampler = Sampler(K, moving=config.moving == "tell" and scene.surface is None)
         return live
 
     @property

@@ -19,7 +19,7 @@ import numpy as np
 import numpy.typing as npt
 
 from semstab.core.arrays import Rows
-from semstab.core.types import Float64, Int64, UInt16
+from semstab.core.types import Float64, Int64, Mask, UInt16
 from semstab.data.frames import Frame
 from semstab.data.labels import fixed
 from semstab.statistics.observations import COLUMNS, TYPES, VIEW, SpotObservations, Views
@@ -376,6 +376,16 @@ class Sampler:
             distances=distances,
             votes=self._votes(),
         )
+
+    def moving_pixels(self, votes: SpotVotes, frame: Frame) -> Mask:
+        """Return the pixels (H, W) of a frame whose surface moved, by the depth of views and the votes of a sample.
+
+        Raises:
+            ValueError: If no depth of views is kept.
+        """
+        if self._memory is None:
+            raise ValueError("no depth of views is kept; make the sampler with moving=True")
+        return self._memory.moving_pixels(frame, self._sigma, votes.misplaced)
 
     def _votes(self) -> SpotVotes | None:
         """Return what views say of the spots; None without depth of views."""

@@ -8,6 +8,7 @@ by more than errors of depth and poses explain. A nearer surface hides the spot,
 from __future__ import annotations
 
 import dataclasses
+import itertools
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -17,6 +18,7 @@ import numpy as np
 import numpy.typing as npt
 
 from semstab.core.types import Float64, Int64, Mask, UInt16
+from semstab.data.frames import Frame
 
 MOST_KEPT = 256
 """Most views whose depth is kept; of more views, every second, fourth, ... one is."""
@@ -98,7 +100,8 @@ class KeptDepth:
 
         stride = max(1, round(math.sqrt(depth.size / BLOCKS)))
         near, far = np.empty((2, depth.shape[0] // stride, depth.shape[1] // stride), np.uint16)
-        blocks_of_image(depth, stride, near, far)
+        low, high = np.empty((2, depth.shape[1]), depth.dtype)
+        blocks_of_image(depth, stride, low, high, np.empty(depth.shape[1], np.bool_), near, far)
         return cls(view, T_wc, camera, False, float(stride), near, far)
 
     @classmethod
@@ -182,6 +185,51 @@ class DepthMemory:
         seen, hidden, through = counts.T.copy()
         return SpotVotes(seen, hidden, through, shares, ~fits, between, gap_of(sigma))
 
+    def moving_pixels(self, frame: Frame, sigma: float, misplaced: Mask) -> Mask:
+        """Return the pixels (H, W) of a frame whose surface moved: the kept views, but for misplaced ones, tell.
+
+        Places in blocks of pixels are asked; pixels next to such blocks move, too, if they go on at the same depth.
+        """
+        from semstab.statistics.loops.moving import SEEN, THROUGH
+
+        step = max(1, round(math.sqrt(frame.depth.size / BLOCKS)))
+        depth = frame.depth[step // 2 :: step, step // 2 :: step].astype(np.float64)
+        valid, K = (depth > 0) & (depth < np.inf), frame.intrinsics
+        row, column = (step // 2 + step * each for each in np.nonzero(valid))
+        z = depth[valid]
+        rays = np.stack([(column - K.cx) / K.fx, (row - K.cy) / K.fy, np.ones(len(z))], axis=1)
+        point = (rays * z[:, None]) @ frame.T_wc[:3, :3].T + frame.T_wc[:3, 3]
+        seen, through = np.zeros((2, len(z)), np.int64)
+        for each in self.kept:
+            if not misplaced[each.view]:
+                own = each.votes(point, sigma) & 3
+                seen += own == SEEN
+                through += own == THROUGH
+        moves = np.zeros(depth.shape, np.bool_)
+        moves[valid] = has_moved(through, seen + through)
+        small = _grown(moves, np.where(valid, depth, np.nan), gap_of(sigma))
+        whole = small.repeat(step, axis=0).repeat(step, axis=1)
+        bottom, right = (max(0, n - m) for n, m in zip(frame.depth.shape, whole.shape, strict=True))
+        whole = np.pad(whole, ((0, bottom), (0, right)), mode="edge")
+        return np.asarray(whole[: frame.depth.shape[0], : frame.depth.shape[1]], np.bool_)
+
+
+def _grown(moves: Mask, depth: Float64, gap: float) -> Mask:
+    """Return a mask (h, w) with the pixels next to it that have the same depth but for a gap, twice."""
+    for _ in range(AROUND):
+        padded, around = np.pad(moves, 1), np.pad(depth, 1, constant_values=np.nan)
+        grown = moves.copy()
+        for b, a in itertools.product(range(3), range(3)):
+            side = slice(b, b + depth.shape[0]), slice(a, a + depth.shape[1])
+            grown |= padded[side] & (np.abs(around[side] - depth) <= gap * depth)
+        moves = grown
+    return moves
+
+
+def has_moved(through: npt.NDArray[Any], votes: npt.NDArray[Any]) -> Mask:
+    """Return what moved: LEAST_THROUGH views see through it, and more than SHARE_THROUGH of all votes."""
+    return np.asarray((through >= LEAST_THROUGH) & (through > SHARE_THROUGH * votes), np.bool_)
+
 
 def gap_of(sigma: float) -> float:
     """Return how much farther than a spot a surface is at least, relative, that shows that a view sees through it."""
@@ -248,7 +296,7 @@ class SpotVotes:
     @property
     def moved(self) -> Mask:
         """(n,) spots that moved: LEAST_THROUGH views see through it, and more than SHARE_THROUGH of all."""
-        return np.asarray((self.through >= LEAST_THROUGH) & (self.through > SHARE_THROUGH * self.votes), np.bool_)
+        return has_moved(self.through, self.votes)
 
     @property
     def static(self) -> Mask:

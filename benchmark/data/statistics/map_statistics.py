@@ -148,6 +148,7 @@ class MapStatistics:
     ranges: RangeAgreement | None = None
     groupings: Groupings | None = None
     moved: MovedSpots | None = None
+    moving_untold: str = ""
 
     def __repr__(self) -> str:
         return f"<MapStatistics '{self.name}': {self.stated}>"
@@ -162,6 +163,18 @@ class MapStatistics:
     def static(self) -> MovedSpots | None:
         """The spots that moved, if some were found: the verdict is of the others then."""
         return self.moved if self.moved is not None and self.moved.are_found else None
+
+    @property
+    def decisive_alpha(self) -> Interval:
+        """The alpha that the verdict reads: of what stayed if movers were found, else of all spots."""
+        return self.headline.alpha if self.static is None else self.static.alpha
+
+    @property
+    def moving_lines(self) -> tuple[str, ...]:
+        """What moved, in sentences; empty if nothing did."""
+        if self.static is None:
+            return (self.moving_untold,) if self.moving_untold else ()
+        return (f"{self.static.text(self.headline.alpha.value)}; the verdict is of what stayed", self.static.of_classes)
 
     @property
     def agreeing(self) -> float:

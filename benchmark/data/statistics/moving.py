@@ -88,6 +88,13 @@ class MovedSpots:
         return f"{moved}; alpha of what stayed {short(self.alpha.value)}, of all {short(alpha)}"
 
     @property
+    def of_classes(self) -> str:
+        """'moved: 46 % of moving car, 55 % of human'."""
+        rows = [f"{100 * row.moved:.0f} % of {row.name}" for row in self.classes if row.moved >= LEAST_SHARE]
+        more = f" and {len(rows) - MOST_CLASSES} more classes" if len(rows) > MOST_CLASSES else ""
+        return f"moved: {', '.join(rows[:MOST_CLASSES])}{more}"
+
+    @property
     def of_poses(self) -> str:
         """'poses of frames a to b, d do not fit: 31 % of their spots are seen through'; '' if all fit."""
         if not self.misplaced:
@@ -108,6 +115,9 @@ class MovedSpots:
             f" {100 * share:.0f} % of {their} spots are seen through"
         )
 
+
+MOST_CLASSES = 4
+"""Most classes that are named in a sentence."""
 
 MOST_RUNS = 6
 """Most stretches of frames that are named in a sentence."""

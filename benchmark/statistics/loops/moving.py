@@ -30,25 +30,30 @@ def code_of(depth):
 
 
 @serial
-def blocks_of_image(depth, stride, near, far):
+def blocks_of_image(depth, stride, low, high, hole, near, far):
     """Write the codes of the nearest and the farthest depth in blocks of stride x stride pixels.
 
-    Blocks that the image's edge cuts are left out; a pixel without valid depth makes a hole.
+    Blocks that the image's edge cuts are left out; a pixel without valid depth makes a hole. low, high, hole (W,) are
+    room for the extremes of columns, so that rows are read one after the other.
     """
+    none, endless = depth.dtype.type(0.0), depth.dtype.type(np.inf)
     for row in range(near.shape[0]):
+        low[:], high[:], hole[:] = endless, none, False
+        for b in range(row * stride, (row + 1) * stride):
+            for a in range(near.shape[1] * stride):
+                d = depth[b, a]
+                low[a] = min(low[a], d if d > none else endless)
+                high[a] = max(high[a], d if d < endless else none)
+                hole[a] |= not (none < d < endless)
         for column in range(near.shape[1]):
-            low, high, hole = np.inf, 0.0, False
-            for b in range(row * stride, (row + 1) * stride):
-                for a in range(column * stride, (column + 1) * stride):
-                    d = np.float64(depth[b, a])
-                    if 0.0 < d < np.inf:
-                        low, high = min(low, d), max(high, d)
-                    else:
-                        hole = True
+            nearest, farthest, holes = endless, none, False
+            for a in range(column * stride, (column + 1) * stride):
+                nearest, farthest = min(nearest, low[a]), max(farthest, high[a])
+                holes |= hole[a]
             near[row, column] = far[row, column] = 0
-            if high > 0.0:
-                near[row, column], far[row, column] = code_of(low), code_of(high)
-            if hole:
+            if none < farthest and nearest < endless:
+                near[row, column], far[row, column] = code_of(np.float64(nearest)), code_of(np.float64(farthest))
+            if holes:
                 near[row, column] |= HOLE
 
 
