@@ -14,7 +14,6 @@ from semstab.statistics.accumulate import sums_of_spots
 from semstab.statistics.cluster_sums import ClusterSums, chance_of, value
 from semstab.statistics.intervals import estimate, scope_of
 from semstab.statistics.observations import SpotObservations
-from semstab.statistics.votes import SpotVotes
 
 
 def moved_spots(
@@ -41,7 +40,7 @@ def moved_spots(
     share, static = 0.0, alpha
     if moved.any():
         rest = sums_of_spots(static_spots(spots))
-        share, static = _disagreeing(sums, rest), estimate(rest, "alpha", scope=scope_of(rest, scope))
+        share, static = share_of_disagreement(sums, rest), estimate(rest, "alpha", scope=scope_of(rest, scope))
     return MovedSpots(
         spots=int(known.sum()),
         unknown=1 - float(known.sum() / asked.sum()),
@@ -52,7 +51,7 @@ def moved_spots(
         false_rate=votes.false_rate,
         false_share=votes.false_share,
         classes=_classes(spots, known, moved),
-        misplaced=_misplaced(spots, votes, frame_name),
+        misplaced=misplaced_frames(spots, frame_name),
     )
 
 
@@ -71,8 +70,8 @@ def moving_percent(spots: SpotObservations) -> dict[int, float]:
     return {frame: 100 * of_moved / n for frame, of_moved, n in shares if n}
 
 
-def _disagreeing(sums: ClusterSums, rest: ClusterSums) -> float:
-    """Return the share of all disagreement that is not at the rest of the spots."""
+def share_of_disagreement(sums: ClusterSums, rest: ClusterSums) -> float:
+    """Return the share of all disagreement that is not at the rest of the spots, by their sums; NaN without any."""
 
     def disagreement(of: ClusterSums) -> float:
         first = of.answers[0]
@@ -103,9 +102,10 @@ def _dominant(spots: SpotObservations) -> Int64:
     return own
 
 
-def _misplaced(
-    spots: SpotObservations, votes: SpotVotes, frame_name: Callable[[int], str]
-) -> tuple[MisplacedFrame, ...]:
+def misplaced_frames(spots: SpotObservations, frame_name: Callable[[int], str] = str) -> tuple[MisplacedFrame, ...]:
+    """Return the frames whose poses do not fit those of the others."""
+    if (votes := spots.votes) is None:
+        return ()
     frames: Int64 = spots.views.frame[votes.misplaced]
     shares: Float64 = votes.through_of_view[votes.misplaced]
     rows = zip(frames.tolist(), shares.tolist(), strict=True)

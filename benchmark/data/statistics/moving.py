@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 from semstab.data.statistics.intervals import Interval, short
@@ -96,24 +97,8 @@ class MovedSpots:
 
     @property
     def of_poses(self) -> str:
-        """'poses of frames a to b, d do not fit: 31 % of their spots are seen through'; '' if all fit."""
-        if not self.misplaced:
-            return ""
-        runs: list[list[MisplacedFrame]] = []
-        for each in sorted(self.misplaced, key=lambda own: own.frame):
-            if runs and each.frame == runs[-1][-1].frame + 1:
-                runs[-1].append(each)
-            else:
-                runs.append([each])
-        named = [run[0].name if len(run) == 1 else f"{run[0].name} to {run[-1].name}" for run in runs]
-        more = f" and {len(named) - MOST_RUNS} more" if len(named) > MOST_RUNS else ""
-        share = sum(each.through for each in self.misplaced) / len(self.misplaced)
-        pose, do, their = ("poses", "do", "their") if len(self.misplaced) > 1 else ("pose", "does", "its")
-        frames = "frames" if len(self.misplaced) > 1 else "frame"
-        return (
-            f"{pose} of {frames} {', '.join(named[:MOST_RUNS])}{more} {do} not fit:"
-            f" {100 * share:.0f} % of {their} spots are seen through"
-        )
+        """Which poses do not fit, see `poses_that_do_not_fit`."""
+        return poses_that_do_not_fit(self.misplaced)
 
 
 MOST_CLASSES = 4
@@ -121,3 +106,22 @@ MOST_CLASSES = 4
 
 MOST_RUNS = 6
 """Most stretches of frames that are named in a sentence."""
+
+
+def poses_that_do_not_fit(misplaced: Sequence[MisplacedFrame]) -> str:
+    """Return 'poses of frames a to b, d do not fit: 31 % of their spots are seen through'; '' if all fit."""
+    if not misplaced:
+        return ""
+    runs: list[list[MisplacedFrame]] = []
+    for each in sorted(misplaced, key=lambda own: own.frame):
+        if runs and each.frame == runs[-1][-1].frame + 1:
+            runs[-1].append(each)
+        else:
+            runs.append([each])
+    named = [run[0].name if len(run) == 1 else f"{run[0].name} to {run[-1].name}" for run in runs]
+    more = f" and {len(named) - MOST_RUNS} more" if len(named) > MOST_RUNS else ""
+    share = sum(each.through for each in misplaced) / len(misplaced)
+    listed = f"{', '.join(named[:MOST_RUNS])}{more}"
+    if len(misplaced) == 1:
+        return f"the pose of frame {listed} does not fit: {100 * share:.0f} % of its spots are seen through"
+    return f"poses of frames {listed} do not fit: {100 * share:.0f} % of their spots are seen through"
