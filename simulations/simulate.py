@@ -24,6 +24,7 @@ CASES = {
     "ranges": "ranges",
     "labellers": "labellers",
     "doctor": "doctor",
+    "moving": "moving",
 }
 
 if __name__ == "__main__":

@@ -513,3 +513,16 @@ def test_intrinsics_of_the_colour_image_are_recognised(tmp_path):
         Image.fromarray(np.zeros((*size[::-1], 3), np.uint8)).save(folder / f"color/{i:03d}.png")
     (checked,) = check(configure(folder))
     assert checked.verdict.mend == ("intrinsics_size: [125, 94]",)
+
+
+def test_frames_whose_poses_do_not_fit_the_others_are_named():
+    """Of 12 frames the poses of two are wrong by 40 cm along their view: what they show is farther, or nearer."""
+    wrong = [pose[2, 3] for pose in walk()[5:7]]
+
+    def told(pose):
+        return pose @ rigid(np.eye(3), (0, 0, -0.4)) if pose[2, 3] in wrong else pose
+
+    checked = of_memory(Room(told_pose=told))
+    (note,) = [text for text in checked.notes if "do not fit" in text]
+    assert note.startswith("poses of frames 5 to 6 do not fit: ")
+    assert not [text for text in of_memory(Room()).notes if "fit" in text]

@@ -125,7 +125,12 @@ def test_the_screen_has_the_numbers_of_the_record(run):
             (paper,) = (line for line in lines if "paper (OP>=3)" in line)
             found = re.search(r"VSS (\S+)\s+SBD (\S+)", paper)
             shown = dict(zip(("VSS (OP>=3)", "SBD (OP>=3)"), found.groups(), strict=True))
-            shown["alpha"] = re.search(r"alpha (-?\.\d+|-?\d\.\d+)", "\n".join(lines))[1]
+            text = " ".join(" ".join(lines).split())
+            if (static := record.statistics.static) is None:
+                shown["alpha"] = re.search(r"alpha (-?\.\d+|-?\d\.\d+)", text)[1]
+            else:
+                shown["alpha"] = re.search(r"what stayed \S+, of all (-?\.\d+|-?\d\.\d+);", text)[1]
+                assert agree(re.search(r"alpha \(static\) (-?\.\d+|-?\d\.\d+)", text)[1], static.alpha.value)
             flicker = re.search(r"flicker\s+(\S+) %", "\n".join(lines))
             shown["flicker, %"] = "-" if flicker is None else flicker[1]
         else:

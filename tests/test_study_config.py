@@ -61,7 +61,7 @@ def test_units_have_the_base_settings_as_a_run_of_their_own() -> None:
 CHANGED = {
     "voxel_size": 0.5, "pixel_stride": 2, "top_k": 2, "exclude": {"classes": ["road"]}, "statistics": True,
     "perturbation": {"depth_noise": 0.1}, "strata": [1, 2], "truth": False,
-    "frame_quality": True, "video_measures": "depth",
+    "frame_quality": True, "video_measures": "depth", "moving": "keep",
     "critical_classes": ["road"], "scope": "other scenes", "verdict": {"stable": 0.9},
 }  # fmt: skip
 """Another value of each setting that numbers follow from."""

@@ -39,8 +39,11 @@ from semstab.core.json_form import to_json
 from semstab.core.prefetch import prefetch
 from semstab.data.frames import Frame
 from semstab.data.labels import LabelSpace
+from semstab.data.statistics import poses_that_do_not_fit
 from semstab.datasets import Scene, open_dataset
 from semstab.errors import DataError
+from semstab.statistics import Sampler
+from semstab.statistics.moving import misplaced_frames
 from semstab.task import frame_indices, models_of, require_posed, selected
 
 SCHEMA = 2
@@ -194,12 +197,22 @@ def check_scene(scene: Scene, config: Config, told: Sequence[str] = ()) -> Scene
             *begun,
         ),
     )
-    if verdict.state == "unsound":
-        return checked
     stride = fused_stride(checked.size, config.pixel_stride)
     fused = [without_labels(inspection.views[position], stride) for position in inspection.fused]
+    if text := _poses_that_do_not_fit(scene, fused):
+        checked = dataclasses.replace(checked, notes=(*checked.notes, text))
+    if verdict.state == "unsound":
+        return checked
     checked = dataclasses.replace(checked, fused_stride=stride)
     return _with_coverage(checked, Coverage(sample), fused, config, inspection.too_far)
+
+
+def _poses_that_do_not_fit(scene: Scene, frames: Sequence[Frame]) -> str:
+    """Return which of some frames see through what the others see, all over the image; '' if none does."""
+    sampler = Sampler(1)
+    for frame in frames:
+        sampler.add(frame)
+    return poses_that_do_not_fit(misplaced_frames(sampler.sample(), scene.frame_name))
 
 
 def _check_scans(

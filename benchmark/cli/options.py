@@ -252,6 +252,9 @@ class Measurement:
     no_truth: Annotated[bool, typer.Option(
         "--no-truth", metavar="", help="Do not compare with the ground truth of the scene.",
         rich_help_panel=CHECKS)] = False
+    moving: Annotated[str | None, typer.Option(
+        "--moving", metavar="tell|keep", show_default="tell",
+        help="Tell which spots moved, and judge what stayed; or keep them.", rich_help_panel=SETTINGS)] = None
     video_measures: Annotated[str | None, typer.Option(
         "--video-measures", metavar="depth|dis", show_default="none",
         help="Also VC and TC as papers report them, by depth and pose, or by optical flow between images.")] = None
@@ -262,7 +265,7 @@ class Measurement:
         named = {
             "backends": backends, "scenes": source.scene, "models": source.model, "taxonomy": self.taxonomy,
             "distances": self.distances, "voxel_size": self.voxel_size, "pixel_stride": self.pixel_stride,
-            "top_k": self.top_k,
+            "top_k": self.top_k, "moving": self.moving,
             "check": self.check, "events": self.events, "statistics": self.statistics,
             "video_measures": self.video_measures, "scope": self.scope,
             "check_geometry": False if self.trust_geometry else None,

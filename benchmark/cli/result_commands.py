@@ -191,7 +191,8 @@ def export(
     run: Run,
     to: Annotated[list[Path], typer.Option(
         "--to", metavar="FILE",
-        help=".ply .las .laz .tif .glb .parquet .csv; places.csv, .geojson; classes: .yaml; tasks: --format.")],
+        help=".ply .las .laz .tif .glb .parquet .csv; places.csv, .geojson; classes: .yaml; masks: moving/;"
+             " tasks: --format.")],
     scene: Scene = None,
     model: Model = None,
     backend: Backend = None,

@@ -196,6 +196,9 @@ class Config(Settings):
     frames: FrameSelection = Field(FrameSelection(), description="frames that are fused; all by default")
     scene_frames: dict[str, FrameSelection] = Field({}, description="frames of single scenes, instead of `frames`")
     exclude: Exclusion = Field(Exclusion(), description="classes and pixels that are left out")
+    moving: Literal["tell", "keep"] = Field(
+        "tell", description="tell: spots that moved are found, and the verdict is of the others; keep: all count"
+    )
     perturbation: Perturbation | None = Field(None, description="noise in every unit; null for none")
     strata: list[int] = Field([1, 2, 5], min_length=1, description="upper OP edges of the persistence strata")
     sweeps: Sweeps = Field(Sweeps(), description="settings of which a study tries several values")

@@ -90,7 +90,7 @@ class LiveMap:
                 ruled = config.backends[0].ruled
                 live.reference = NumpySample(config.voxel_size, K, work.within, whole=whole, **ruled)
         if unit.assessed and work.measures_images:
-            live.sampler = Sampler(K)
+            live.sampler = Sampler(K, moving=config.moving == "tell" and scene.surface is None)
         return live
 
     @property

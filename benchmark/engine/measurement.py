@@ -197,11 +197,17 @@ def _left(live: LiveMap, table: VoxelTable, events: Events | None = None) -> tup
     return table.rows(keep), None if events is None else events.rows(keep)
 
 
+CAST = "what moved cannot be told: depth is cast at a surface, which has no movers in it"
+"""Why spots that moved are not found."""
+
+
 def analyse_sample(task: Task, config: Config, sample: MapSample, observations: SpotObservations | None) -> Analysis:
     """Return the statistics of a map; its true labels are right, and bound how far geometry lets labels agree."""
+    why = CAST if config.moving == "tell" and task.scene.surface is not None else ""
     return analyse(
         sample, observations, name=task.model, edges=config.strata, critical=config.critical_classes,
         scope=config.scope, limits=Limits(**config.verdict.model_dump()), frame_name=task.scene.frame_name,
+        moving_untold=why,
     )  # fmt: skip
 
 
@@ -398,7 +404,7 @@ def pictures_of_outlying(task: Task, config: Config, of_frames: OfFrames) -> dic
 
     A frame is held against those of the run before and after it, the first and the last one against the two nearest.
     """
-    excess = {k: own["lone_percent"] - own["lone_null_percent"] for k, own in of_frames.items() if own["outlying"]}
+    excess = {k: own["lone_percent"] - own["lone_null_percent"] for k, own in of_frames.items() if own.get("outlying")}
     outlying = sorted(excess, key=lambda frame: -excess[frame])
     pictures, posed = list[LonePicture](), task.scene.posed
     for frame in () if task.scene.of_scans else outlying[:PICTURED]:

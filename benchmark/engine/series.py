@@ -57,7 +57,7 @@ COLUMNS = (
 )
 """The first columns of the file, in order; drift in bits; an undefined number is an empty field."""
 
-OF_FRAMES = ("lone_percent", "lone_null_percent", "outlying")
+OF_FRAMES = ("lone_percent", "lone_null_percent", "outlying", "moving_percent")
 """The next ones, which follow from all frames (`semstab.statistics.frame_disagreement`); the last one is the name."""
 
 

@@ -19,6 +19,7 @@ from semstab.exports import join as joining
 from semstab.exports import voxels as tabular
 from semstab.exports.annotation import annotation_tasks
 from semstab.exports.coco import MOST, TaskFile, write_tasks
+from semstab.exports.moving import holds_masks, write_masks
 from semstab.exports.places import GEOJSON, holds_places, write_places
 from semstab.exports.relabel import task_of
 from semstab.exports.taxonomy import TAXONOMY, holds_taxonomy, write_taxonomy
@@ -94,7 +95,8 @@ def export(
     """Write a unit of the run in a folder to files, in the format that each one's suffix names (`SUFFIXES`).
 
     A .geojson file, or one that is called places.csv, gets the worst places instead: where frames disagree most. A
-    .yaml file gets a taxonomy: the finest groups of the unit's classes on which views agree.
+    .yaml file gets a taxonomy: the finest groups of the unit's classes on which views agree. A folder that is called
+    moving gets masks of what moves in each frame, as the option `masks` of datasets takes them.
 
     Args:
         run: Folder of the run, or FOLDER:MODEL.
@@ -151,12 +153,16 @@ def export(
             tasks = annotation_tasks(chosen(("op",)), task, most)
             named = task.mapping.target, task.scene.name, task.model
             return [_tasks_written(TaskFile(tasks, *named, file), task) for file in files]
+        if any(map(holds_masks, files)):
+            unit, _ = held.enter_context(task_of(run, record, result.manifest["inputs"], code))
         if classify is not None:
             return [_classified(chosen(joining.MEASURES), Path(classify), file, radius, settings) for file in files]
         usual = {".tif": maps.RASTER_MEASURES}
         return [
             _taxonomy_written(Path(run), record, file)
             if holds_taxonomy(file)
+            else _masks_written(unit, file)
+            if holds_masks(file)
             else _places_written(chosen(("op",)), record, file, most)
             if holds_places(file)
             else _written(chosen(usual.get(file.suffix.lower())), file, settings)
@@ -170,7 +176,7 @@ def _require_writable(files: Sequence[Path], inputs: Sequence[str | Path | None]
         require_output(file, inputs)
         if task_format is not None:
             coco.check(task_format, file)
-        elif file.suffix.lower() not in SUFFIXES:
+        elif not holds_masks(file) and file.suffix.lower() not in SUFFIXES:
             raise ConfigError(f"{file}: format '{file.suffix}' is not known; {nearest(file.suffix, SUFFIXES)}")
     for folder in {file.parent for file in files if file.parent.is_dir()}:
         remove_abandoned(folder)
@@ -204,6 +210,12 @@ def _taxonomy_written(run: Path, record: Record, file: Path) -> Exported:
     grouping = write_taxonomy(run, record, file)
     content = f"{grouping.groups} groups of classes, {grouping.level}: alpha {grouping.alpha.text()}"
     return Exported(file, content, ())
+
+
+def _masks_written(task: Task, folder: Path) -> Exported:
+    masks, share = write_masks(task, folder)
+    content = f"{masks} masks, {share:.1%} of the pixels with depth move"
+    return Exported(folder, content, (f"leave them out: --option masks={folder.resolve()}/{{name}}.png",))
 
 
 def _tasks_written(file: TaskFile, task: Task) -> Exported:

@@ -29,6 +29,7 @@ from semstab.statistics import MapSample, Sampler, SpotObservations, Views, anal
 from semstab.statistics.accumulate import sums_of_spots
 from semstab.statistics.cluster_sums import value
 from semstab.statistics.sampler import BUDGET
+from semstab.statistics.votes import SpotVotes
 
 MOST_VOXELS = 2_000_000
 
@@ -379,7 +380,8 @@ def _joined(a: SpotObservations, b: SpotObservations) -> SpotObservations:
     views = dataclasses.replace(views, frame=np.arange(len(views)))
     both = SpotObservations.stacked([a, later])
     point, drawn = np.concatenate([a.point, b.point]), np.concatenate([a.drawn, b.drawn])
+    votes = None if a.votes is None or b.votes is None else SpotVotes.joined([a.votes, b.votes])
     return dataclasses.replace(
         both, point=point, drawn=drawn, views=views, share=share, spacing=max(a.spacing, b.spacing),
-        frames=a.frames + b.frames,
+        frames=a.frames + b.frames, votes=votes,
     )  # fmt: skip

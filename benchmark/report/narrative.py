@@ -55,6 +55,8 @@ def warnings(result: Result) -> Iterator[str]:
                 f"{_name(run, result)}: {run.frames_empty} of {run.frames} frames have no pixel with both depth and"
                 " a label: semstab-bench check"
             )
+        if run.statistics is not None and run.statistics.moved is not None and run.statistics.moved.misplaced:
+            yield f"{_name(run, result)}: {run.statistics.moved.of_poses}; semstab-bench check names them, too"
         spots = None if run.statistics is None else run.statistics.spots
         if spots is not None and 2 * spots.views <= spots.frames:
             yield (

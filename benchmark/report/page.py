@@ -300,6 +300,7 @@ def _timeline(records: Sequence[Record], colors: Mapping[str, int]) -> Iterator[
     for columns, title, unit in (
         (("compensated_flicker_percent",), "Flicker", f"flicker, % of the {what}"),
         (("lone_percent", "lone_null_percent"), "Frames that stand alone", "% of the places, less null"),
+        (("moving_percent",), "What moved", "% of a frame's answers at spots that moved"),
     ):
         lines = []
         for name, own in series.items():

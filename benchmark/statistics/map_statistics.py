@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 
@@ -62,6 +62,7 @@ from semstab.statistics.frame_disagreement import LoneDisagreement, by_frame, lo
 from semstab.statistics.geometry import losses
 from semstab.statistics.groupings import groupings
 from semstab.statistics.intervals import confidence_intervals, estimate, headline_specs, scope_of, spec_of
+from semstab.statistics.moving import moved_spots, moving_percent
 from semstab.statistics.observations import SpotObservations
 from semstab.statistics.ranges import range_agreement
 from semstab.statistics.sample import MapSample
@@ -92,10 +93,16 @@ class Analysis:
     shares: Float64
     drawn: Columns
     lone: LoneDisagreement | None = None
+    moving: Mapping[int, float] = field(default_factory=dict)
 
     def of_frames(self) -> dict[int, dict[str, float]]:
-        """Return the numbers of each frame by its index, as the time series names them; see `LoneDisagreement`."""
-        return {} if self.lone is None else by_frame(self.lone, self.summary.outlying_frames)
+        """Return the numbers of each frame by its index, as the time series names them.
+
+        See `LoneDisagreement` and `moving_percent`.
+        """
+        alone = {} if self.lone is None else by_frame(self.lone, self.summary.outlying_frames)
+        moving = {frame: {"moving_percent": percent} for frame, percent in self.moving.items()}
+        return {frame: alone.get(frame, {}) | moving.get(frame, {}) for frame in alone.keys() | moving.keys()}
 
     def columns(self, table: VoxelTable, truth: VoxelTable | None = None) -> Columns:
         """Return one value per voxel (n,) by name for the map or any part of it, NaN where undefined.
@@ -161,6 +168,7 @@ def analyse(
     scope: Scope = THIS_SCENE,
     limits: Limits = LIMITS,
     frame_name: Callable[[int], str] = str,
+    moving_untold: str = "",
 ) -> Analysis:
     """Return all statistics of one map; the same seed gives the same numbers.
 
@@ -179,6 +187,7 @@ def analyse(
         scope: Scope of the headline and of alpha by class, where there are enough views for it.
         limits: Limits of the verdict.
         frame_name: Returns the name of a frame's file by its index.
+        moving_untold: Why it is not told which spots moved.
     """
     table, events = sample.table.measured(), sample.events
     truth = None if sample.truth is None else join_truth(table, sample.truth)
@@ -210,9 +219,10 @@ def analyse(
         lone = lone_disagreement(spots)
         outlying = outlying_frames(lone, len(spots.views), name=frame_name)
     agreement_of_spots = None if spots is None else spot_agreement(spots, sums, table, scope, critical, limits)
+    moved = None if spots is None else moved_spots(spots, sums, headline.alpha, scope, frame_name)
     stability = verdict(
         name or "model", headline=headline, spots=agreement_of_spots, flips=flips, voxels=repeats, share=repeated.share,
-        limits=limits,
+        limits=limits, moved=moved,
     )  # fmt: skip
     summary = MapStatistics(
         schema=SCHEMA, name=name, seed=seed, K=table.K, voxel_size=table.voxel_size,
@@ -231,8 +241,11 @@ def analyse(
         outlying_frames=outlying,
         ranges=None if spots is None else range_agreement(spots, scope, limits),
         groupings=None if spots is None else groupings(spots, sums, scope, limits),
+        moved=moved,
+        moving_untold=moving_untold,
     )  # fmt: skip
-    return Analysis(summary, whole, sums, sample, shares, drawn, lone)
+    moving = {} if spots is None else moving_percent(spots)
+    return Analysis(summary, whole, sums, sample, shares, drawn, lone, moving)
 
 
 def _means(locations: ClusterSums, sums: ClusterSums, scope: Scope) -> dict[str, Interval]:

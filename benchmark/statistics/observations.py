@@ -24,6 +24,7 @@ from semstab.data.measures import dominant, mean
 from semstab.data.voxels import index_columns
 from semstab.errors import DataError
 from semstab.statistics.cluster_sums.index import distinct_rows
+from semstab.statistics.votes import OF_SPOTS, SpotVotes
 
 # The views from which the frames of a sample were taken.
 
@@ -90,7 +91,7 @@ TYPES: Mapping[str, type[np.generic]] = {
 
 COLUMNS = tuple(TYPES)
 
-SCHEMA = 5
+SCHEMA = 6
 
 PARTS = 64
 """Parts of a coarse cell's edge in which the place of a spot is told in a log."""
@@ -121,6 +122,7 @@ class SpotObservations:
         classes: Names of the classes.
         frames: Number of frames, of which some may share a view.
         distances: (K, K) distances between the classes, symmetric, 0 on the diagonal; None if all are alike.
+        votes: How many views see each spot, or see through it; None if that was not asked.
     """
 
     spot: Int32
@@ -139,6 +141,7 @@ class SpotObservations:
     classes: tuple[str, ...] = ()
     frames: int = 0
     distances: Float64 | None = None
+    votes: SpotVotes | None = None
 
     def __len__(self) -> int:
         return len(self.spot)
@@ -175,6 +178,13 @@ class SpotObservations:
         left_out[order] = np.isin(dominant(log.table()), classes)
         return self.only(~left_out[self.spot])
 
+    @property
+    def moved(self) -> Mask:
+        """(m,) answers for spots that moved."""
+        if self.votes is None:
+            return np.zeros(len(self), np.bool_)
+        return np.asarray(self.votes.moved[self.spot], np.bool_)
+
     def only(self, rows: Any) -> SpotObservations:
         """Return some of the answers."""
         columns: dict[str, Any] = {name: getattr(self, name)[rows] for name in COLUMNS}
@@ -185,8 +195,9 @@ class SpotObservations:
         drawn = self.drawn < share
         number = np.cumsum(drawn, dtype=np.int32) - 1
         some = self.only(drawn[self.spot])
+        votes = None if self.votes is None else self.votes.take(drawn)
         return dataclasses.replace(
-            some, spot=number[some.spot], point=self.point[drawn], drawn=self.drawn[drawn], share=share
+            some, spot=number[some.spot], point=self.point[drawn], drawn=self.drawn[drawn], share=share, votes=votes
         )
 
     @classmethod
@@ -198,6 +209,10 @@ class SpotObservations:
     def observations(self) -> Events:
         """Return the log of spots: the class that a view gives each of them, by the first answers."""
         return self._first[0]
+
+    def of_log(self) -> Int64:
+        """Return the spot (n,) of each location of that log."""
+        return self._first[1]
 
     def logs(self) -> tuple[tuple[Events, Float64], ...]:
         """Return the logs of the three answers with (m,) squared distances, metres^2, 0 of the third ones."""
@@ -256,6 +271,9 @@ class SpotObservations:
             values = arrays.column(getattr(self, name)[order])
             columns[name] = pa.ListArray.from_arrays(arrays.column(ends), values)
         about: dict[str, Any] = {name: getattr(self, name) for name in ("spacing", "K", "share", "classes", "frames")}
+        if self.votes is not None:
+            columns |= {name: arrays.column(own) for name, own in self.votes.columns.items()}
+            about["votes"] = self.votes.of_views()
         if self.distances is not None:
             about["distances"] = self.distances.tolist()
         content = pa.table(columns)
@@ -292,6 +310,9 @@ class SpotObservations:
             }
             columns["spot"] = np.repeat(np.arange(len(answers), dtype=np.int32), answers)
             drawn = arrays.values_of(content.column("drawn")).astype(np.uint32)
+            if "votes" in about:
+                counts = {name: arrays.values_of(content.column(name)) for name in OF_SPOTS}
+                about["votes"] = SpotVotes.of(counts, about["votes"])
             read = cls(**columns, point=point.astype(np.float64), drawn=drawn, views=views, **about)
             read._require_sound()
             return read
@@ -302,6 +323,8 @@ class SpotObservations:
             raise DataError("a view that is not there")
         if len(self) and max(self.label.max(), self.neighbour.max(), self.beyond.max()) > self.K:
             raise DataError(f"a label above {self.K}")
+        if self.votes is not None and len(self.votes.misplaced) != len(self.views):
+            raise DataError("votes of other views")
         if not (np.isfinite(self.point).all() and 0 < self.spacing < np.inf):
             raise DataError("a spot without a place")
         if np.abs(self.point).max(initial=0.0) * PARTS / self.spacing > 2**31:
@@ -372,7 +395,7 @@ def same_spots(samples: Sequence[SpotObservations]) -> list[SpotObservations]:
         same.append(
             dataclasses.replace(
                 some, spot=number[some.spot], view=rank[some.view].astype(np.int32), views=views, spacing=spacing,
-                point=samples[0].point[firsts[0][common]], drawn=samples[0].drawn[firsts[0][common]],
+                point=samples[0].point[firsts[0][common]], drawn=samples[0].drawn[firsts[0][common]], votes=None,
             )
         )  # fmt: skip
     return same

@@ -19,10 +19,11 @@ import numpy as np
 import numpy.typing as npt
 
 from semstab.core.arrays import Rows
-from semstab.core.types import Float64, Int64, UInt16
+from semstab.core.types import Float64, Int64, Mask, UInt16
 from semstab.data.frames import Frame
 from semstab.data.labels import fixed
 from semstab.statistics.observations import COLUMNS, TYPES, VIEW, SpotObservations, Views
+from semstab.statistics.votes import DepthMemory, KeptDepth, SpotVotes, firm
 
 BUDGET = 1 << 19
 """Most answers (spot, view)."""
@@ -78,6 +79,10 @@ SPARSE, ALONE, DENSE = 0.3, 0.7, 0.1
 """Depth of an image is sparse, as from a LiDAR, if fewer than this share of its pixels have depth, and fewer than this
 share of these have one next to them; and share of the labels at pixels without depth from which on labels are read
 where a spot falls, not at the next pixel with depth."""
+
+HOLES = 3.0
+"""Distance of the pixels with depth, in pixels, up to which sparse depth of an image is of a camera, and has holes:
+whether a view sees through a spot is then told only where there are none."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -140,10 +145,12 @@ class Sampler:
     Args:
         num_classes: K, the number of classes.
         budget: Most answers of a sample.
+        moving: Whether to keep depth of views, from which follows which spots moved.
     """
 
-    def __init__(self, num_classes: int, budget: int = BUDGET) -> None:
+    def __init__(self, num_classes: int, budget: int = BUDGET, *, moving: bool = True) -> None:
         self.K, self.budget = num_classes, budget
+        self._memory = DepthMemory() if moving else None
         self._edge = math.nan
         self._low: Int64 = np.zeros(3, np.int64)
         self._columns: dict[str, npt.NDArray[Any]] = {}
@@ -160,6 +167,7 @@ class Sampler:
     def _clear(self) -> None:
         self._share, self._answers, self._spots = 1 << 32, 0, 0
         self._point, self._hash = np.empty((1 << 12, 3)), np.empty(1 << 12, np.uint32)
+        self._found, self._firm = np.empty(1 << 12, np.int32), np.ones(1 << 12, np.bool_)
         self._table = np.full(1 << 14, -1, np.int64)
         self._columns = {name: np.empty(1 << 14, dtype) for name, dtype in TYPES.items()}
 
@@ -179,9 +187,11 @@ class Sampler:
         if sparse is None:
             self._noise = _noise(frame)
             self._find(frame, T, seed)
+            self._remember(view, frame, T, None)
             self._take(view, *self._answers_of_image(frame, T, seed))
         else:
             self._find_in_points(sparse, T, seed)
+            self._remember(view, frame, T, sparse)
             self._take(view, *self._answers_of_points(frame, sparse, T, seed))
 
     def _view_of(self, frame: Frame, depth: float, sparse: Sparse | None) -> int | None:
@@ -239,8 +249,26 @@ class Sampler:
         if self._spots + MOST_NEW > len(self._hash):
             room = max(2 * len(self._hash), self._spots + MOST_NEW)
             self._point, self._hash = _longer(self._point, room), _longer(self._hash, room)
+            self._found, self._firm = _longer(self._found, room), _longer(self._firm, room)
         end = self._spots + MOST_NEW
         self._spots += find(self._table, self._point[self._spots : end], self._hash[self._spots : end])
+
+    def _remember(self, view: int, frame: Frame, T: Float64, sparse: Sparse | None) -> None:
+        """Keep depth of a view, and of the new spots which view found them and which lie at no edge of depth."""
+        if self._memory is None:
+            return
+        new = slice(self._known, self._spots)
+        self._found[new] = view
+        if sparse is None or not (sparse.around or sparse.spacing > HOLES):
+            self._firm[new] = firm(self._point[new], T, _camera(frame), fixed(frame.depth), self._noise)
+            if self._memory.wants(view):
+                self._memory.add(KeptDepth.of_image(view, T.copy(), _camera(frame), fixed(frame.depth)))
+            return
+        points, place = (sparse.u, sparse.v, sparse.w), (sparse.camera, sparse.around, sparse.spacing)
+        kept = KeptDepth.of_points(view, T.copy(), *place, sparse.grid.shape, points)
+        self._firm[new] = kept.firm(self._point[new])
+        if self._memory.wants(view):
+            self._memory.add(kept)
 
     def _rebuilt(self, size: int) -> Int64:
         """Return a table of the coarse cells of all spots."""
@@ -252,10 +280,14 @@ class Sampler:
 
     # --- Answers ------------------------------------------------------------------------------------------------------
 
+    @property
+    def _sigma(self) -> float:
+        """The standard deviation of how depth differs between views so far, relative; of a first one, its noise."""
+        return float(np.median(self._errors)) if self._errors else self._noise
+
     def _allowed(self) -> float:
         """Return the tolerance of depth, relative: it follows from the flight's own differences so far."""
-        sigma = float(np.median(self._errors)) if self._errors else self._noise
-        return min(max(SIGMAS * sigma, LEAST), MOST)
+        return min(max(SIGMAS * self._sigma, LEAST), MOST)
 
     def _learn(self, earlier: int, spot: npt.NDArray[np.int32], error: Float64) -> None:
         """Take how much a frame's depth differs at the spots that it did not find itself."""
@@ -322,7 +354,8 @@ class Sampler:
         for name, column in self._columns.items():
             column[: len(rows)] = number[column[rows]] if name == "spot" else column[rows]
         self._answers, n = len(rows), int(left.sum())
-        self._point[:n], self._hash[:n] = self._point[: self._spots][left], self._hash[: self._spots][left]
+        for own in (self._point, self._hash, self._found, self._firm):
+            own[:n] = own[: self._spots][left]
         self._spots = n
         self._table = self._rebuilt(len(self._table))
 
@@ -341,7 +374,25 @@ class Sampler:
             classes=classes,
             frames=self._frames,
             distances=distances,
+            votes=self._votes(),
         )
+
+    def moving_pixels(self, votes: SpotVotes, frame: Frame) -> Mask:
+        """Return the pixels (H, W) of a frame whose surface moved, by the depth of views and the votes of a sample.
+
+        Raises:
+            ValueError: If no depth of views is kept.
+        """
+        if self._memory is None:
+            raise ValueError("no depth of views is kept; make the sampler with moving=True")
+        return self._memory.moving_pixels(frame, self._sigma, votes.misplaced)
+
+    def _votes(self) -> SpotVotes | None:
+        """Return what views say of the spots; None without depth of views."""
+        if self._memory is None:
+            return None
+        n, views = self._spots, len(self._views)
+        return self._memory.votes_on(self._point[:n], self._found[:n], self._firm[:n], views, self._sigma)
 
 
 def _room(n: int) -> tuple[Any, ...]:

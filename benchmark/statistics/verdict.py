@@ -14,6 +14,7 @@ from semstab.data.statistics import (
     Interval,
     LabelledPairs,
     Level,
+    MovedSpots,
     SpotAgreement,
     StabilityVerdict,
     short,
@@ -123,11 +124,13 @@ def verdict(
     voxels: int,
     share: float,
     limits: Limits = LIMITS,
+    moved: MovedSpots | None = None,
 ) -> StabilityVerdict:
     """Return the most probable level of alpha, and the level if what the model leaves out counts as disagreeing.
 
     It is undecided where the interval of alpha holds both limits, whatever the probabilities are, and where no level
-    has DECIDED. The second level is that of all pairs of views of a spot: a pair of which one has no label disagrees.
+    has DECIDED. If movers were found, alpha is that of what stayed. The second level is that of all pairs of views of a
+    spot: a pair of which one has no label disagrees.
 
     Args:
         model: Its name.
@@ -137,11 +140,15 @@ def verdict(
         voxels: Voxels with OP >= 2.
         share: Their share of all voxels.
         limits: Limits of the levels.
+        moved: Spots that moved.
     """
     support = f"{voxels} locations seen twice or more, {share:.0%} of the map"
     if reason := _missing(spots, voxels):
         return StabilityVerdict("no verdict", math.nan, f"{model}: no verdict, {reason}; {support}")
     assert spots is not None
+    of_all_spots, static = headline.alpha, moved if moved is not None and moved.are_found else None
+    if static is not None:
+        headline = dataclasses.replace(headline, alpha=static.alpha)
     level, probability = _level(headline, spots, limits)
     of_all, probability_of_all = _level(headline, spots, limits, spots.pairs)
     silent = spots.labelled < limits.labelled
@@ -149,8 +156,13 @@ def verdict(
     if of_all != level:
         both = dataclasses.replace(both, of_all=of_all, probability_of_all=probability_of_all)
     wrong = headline.wrong_of_consistent_op3
-    same = spots.agreeing(headline.alpha.value)
-    parts = [_alpha(headline.alpha, spots), f"two views see the same class at {same:.0%} of the spots"]
+    same = spots.agreeing(of_all_spots.value)
+    parts = [
+        _alpha(headline.alpha, spots, "alpha" if static is None else "alpha (static)"),
+        f"two views see the same class at {same:.0%} of the spots",
+    ]
+    if static is not None:
+        parts.append(f"alpha of all spots {of_all_spots.value:.2f}, of which {static.moved:.1%} moved")
     if level == "uninformative":
         parts.insert(0, f"{spots.largest_share:.0%} of the observations are {spots.largest_class}")
     if not math.isnan(wrong.low):
@@ -206,13 +218,13 @@ def _for(basis: Interval) -> str:
     return f"for these frames alone ({reason})"
 
 
-def _alpha(alpha: Interval, spots: SpotAgreement) -> str:
+def _alpha(alpha: Interval, spots: SpotAgreement, name: str = "alpha") -> str:
     """Return 'alpha 0.71 (0.69 to 0.73), probably unstable: car (98%)'."""
     chance = ", no better than chance" if alpha.value < 0 else ""
     unstable = [row for row in spots.critical_classes[:3] if row.unstable >= PROBABLE]
     named = ", ".join(f"{row.name} ({row.unstable:.0%})" for row in unstable)
     classes = f", probably unstable: {named}" if named else ""
-    return f"alpha {alpha.value:.2f} ({alpha.low:.2f} to {alpha.high:.2f}){chance}{classes}"
+    return f"{name} {alpha.value:.2f} ({alpha.low:.2f} to {alpha.high:.2f}){chance}{classes}"
 
 
 def _flips(flips: Flipping) -> list[str]:

@@ -31,6 +31,7 @@ from semstab.data.statistics.map_statistics import (
     StabilityVerdict,
     StratumStatistics,
 )
+from semstab.data.statistics.moving import MisplacedFrame, MovedClass, MovedSpots, poses_that_do_not_fit
 
 __all__ = [
     "CONFIDENCE",
@@ -60,6 +61,9 @@ __all__ = [
     "MapStatistics",
     "Meaning",
     "Merge",
+    "MisplacedFrame",
+    "MovedClass",
+    "MovedSpots",
     "MovingClasses",
     "OutlyingFrames",
     "Quadrants",
@@ -71,5 +75,6 @@ __all__ = [
     "StabilityVerdict",
     "StratumStatistics",
     "metres",
+    "poses_that_do_not_fit",
     "short",
 ]

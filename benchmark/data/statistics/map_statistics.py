@@ -13,6 +13,7 @@ from semstab.data.statistics.correctness import CorrectnessStatistics, Losses
 from semstab.data.statistics.drift import DriftStatistics, Flipping, OutlyingFrames
 from semstab.data.statistics.groupings import Groupings
 from semstab.data.statistics.intervals import Interval, short
+from semstab.data.statistics.moving import MovedSpots
 
 Level = Literal[
     "stable", "usable", "unstable", "undecided", "uninformative", "misleading", "no verdict",
@@ -146,6 +147,8 @@ class MapStatistics:
     outlying_frames: OutlyingFrames | None = None
     ranges: RangeAgreement | None = None
     groupings: Groupings | None = None
+    moved: MovedSpots | None = None
+    moving_untold: str = ""
 
     def __repr__(self) -> str:
         return f"<MapStatistics '{self.name}': {self.stated}>"
@@ -153,7 +156,25 @@ class MapStatistics:
     @property
     def stated(self) -> str:
         """The verdict and the number that it rests on: 'stable (p .98), alpha .93 (.92 to .95)'."""
-        return f"{self.verdict}, alpha {self.headline.alpha.text()}"
+        static = "" if self.static is None else f", alpha (static) {self.static.alpha.text()}"
+        return f"{self.verdict}, alpha {self.headline.alpha.text()}{static}"
+
+    @property
+    def static(self) -> MovedSpots | None:
+        """The spots that moved, if some were found: the verdict is of the others then."""
+        return self.moved if self.moved is not None and self.moved.are_found else None
+
+    @property
+    def decisive_alpha(self) -> Interval:
+        """The alpha that the verdict reads: of what stayed if movers were found, else of all spots."""
+        return self.headline.alpha if self.static is None else self.static.alpha
+
+    @property
+    def moving_lines(self) -> tuple[str, ...]:
+        """What moved, in sentences; empty if nothing did."""
+        if self.static is None:
+            return (self.moving_untold,) if self.moving_untold else ()
+        return (f"{self.static.text(self.headline.alpha.value)}; the verdict is of what stayed", self.static.of_classes)
 
     @property
     def agreeing(self) -> float:

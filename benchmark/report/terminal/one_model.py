@@ -45,11 +45,12 @@ def _verdict(run: UnitSummary) -> Iterator[str]:
     """Yield the level, the number that it rests on, and the meaning of that number."""
     statistics = run.statistics
     assert statistics is not None
-    level, alpha = statistics.verdict.level.upper(), statistics.headline.alpha
+    level, alpha = statistics.verdict.level.upper(), statistics.decisive_alpha
+    name = "alpha" if statistics.static is None else "alpha (static)"
     if statistics.verdict.level == "no verdict":
         yield from wrapped(statistics.verdict.line)
         return
-    yield f"  {level} {statistics.verdict.stated}".rstrip() + f"    alpha {short(alpha.value)}{_interval(alpha)}"
+    yield f"  {level} {statistics.verdict.stated}".rstrip() + f"    {name} {short(alpha.value)}{_interval(alpha)}"
     told = wrong_text(statistics)
     if statistics.verdict.level == "misleading":
         yield from textwrap.wrap(told, WIDTH, initial_indent="  ", subsequent_indent="  ")
@@ -65,6 +66,8 @@ def _verdict(run: UnitSummary) -> Iterator[str]:
         yield f"  {percent(silent)} of the locations have no label in most frames: such a map is usable at most"
     if statistics.verdict.level == "undecided":
         yield from wrapped(f"{why_undecided(alpha)}: more frames decide it")
+    for text in statistics.moving_lines:
+        yield from wrapped(text)
     yield f"  two views see the same class at {percent(statistics.agreeing)} of the spots"
     if told and statistics.verdict.level != "misleading":
         yield f"  {told}"

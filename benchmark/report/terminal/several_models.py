@@ -91,7 +91,7 @@ def several_models(result: Result, records: Sequence[Record], width: int) -> Ite
         merged = "" if statistics.groupings is None else statistics.groupings.text
         meaning = statistics.spots.meaning if statistics.spots is not None else None
         texts = (statistics.verdict.difference, ranges, merged, "" if meaning is None else meaning.text)
-        for text in filter(None, texts):
+        for text in filter(None, (*statistics.moving_lines, *texts)):
             yield from wrapped(f"{record.unit.model}: {text}")
     yield ""
 

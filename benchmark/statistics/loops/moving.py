@@ -1,0 +1,201 @@
+"""Compiled passes that tell whether views see spots, have them hidden, or see through them.
+
+The depth of a view is kept in blocks of pixels: the nearest and the farthest depth of each, as codes of a logarithm.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from semstab.core.compiled import serial
+from semstab.statistics.loops.spots import in_sensor, inverse
+
+STEP, LOWEST = 0.0006, -7.0
+"""Step of a code in the logarithm of depth, and the logarithm, of metres, of code 1: from a millimetre to 300 km."""
+
+HOLE, LARGEST = 0x8000, 0x7FFF
+"""The bit of the nearest depth of a block that has a pixel without depth; and the largest code, 0 being no depth."""
+
+UNKNOWN, SEEN, HIDDEN, THROUGH = 0, 1, 2, 3
+"""Votes of a view on a spot: it does not tell, shows the surface there, a nearer one, or only what lies behind."""
+
+SIDES = 3
+"""Parts of an image's side; a vote is stored as its kind plus 4 times the number of the part in which the spot is."""
+
+
+@serial
+def code_of(depth):
+    """Return the code of a depth in metres."""
+    return min(max(np.int64((np.log(depth) - LOWEST) / STEP + 0.5), np.int64(0)) + 1, LARGEST)
+
+
+@serial
+def blocks_of_image(depth, stride, low, high, hole, near, far):
+    """Write the codes of the nearest and the farthest depth in blocks of stride x stride pixels.
+
+    Blocks that the image's edge cuts are left out; a pixel without valid depth makes a hole. low, high, hole (W,) are
+    room for the extremes of columns, so that rows are read one after the other.
+    """
+    none, endless = depth.dtype.type(0.0), depth.dtype.type(np.inf)
+    for row in range(near.shape[0]):
+        low[:], high[:], hole[:] = endless, none, False
+        for b in range(row * stride, (row + 1) * stride):
+            for a in range(near.shape[1] * stride):
+                d = depth[b, a]
+                low[a] = min(low[a], d if d > none else endless)
+                high[a] = max(high[a], d if d < endless else none)
+                hole[a] |= not (none < d < endless)
+        for column in range(near.shape[1]):
+            nearest, farthest, holes = endless, none, False
+            for a in range(column * stride, (column + 1) * stride):
+                nearest, farthest = min(nearest, low[a]), max(farthest, high[a])
+                holes |= hole[a]
+            near[row, column] = far[row, column] = 0
+            if none < farthest and nearest < endless:
+                near[row, column], far[row, column] = code_of(np.float64(nearest)), code_of(np.float64(farthest))
+            if holes:
+                near[row, column] |= HOLE
+
+
+@serial
+def on_one_surface(point, T, camera, depth, reach, most, firm):
+    """Write for each point (n, 3) of an image's surface whether the pixels around it are of one surface.
+
+    Inverse depth of the pixels up to `reach` to each side differs by at most `most`, relative. A pixel at an edge of
+    depth often has a depth between both surfaces, at which there is nothing.
+    """
+    fx, fy, cx, cy = camera
+    for i in range(len(point)):
+        right, down, z = in_sensor(point[i, 0], point[i, 1], point[i, 2], T)
+        column, row = np.int64(np.floor(right / z * fx + cx + 0.5)), np.int64(np.floor(down / z * fy + cy + 0.5))
+        low, high = np.inf, 0.0
+        for b in range(row - reach, row + reach + 1):
+            for a in range(column - reach, column + reach + 1):
+                there = inverse(depth, b, a)
+                low, high = min(low, there), max(high, there)
+        firm[i] = low > 0.0 and high - low <= most * low
+
+
+@serial
+def blocks_of_points(u, v, w, stride, near, far):
+    """Write the codes of the nearest and the farthest of the points, by image coordinates and inverse depth, in blocks.
+
+    A block without points is a hole.
+    """
+    near[:], far[:] = HOLE, 0
+    for i in range(len(w)):
+        row, column = np.int64(np.floor((v[i] + 0.5) / stride)), np.int64(np.floor((u[i] + 0.5) / stride))
+        if not w[i] > 0.0 or row < 0 or column < 0 or row >= near.shape[0] or column >= near.shape[1]:
+            continue
+        code = code_of(1.0 / w[i])
+        if near[row, column] == HOLE or code < near[row, column]:
+            near[row, column] = code
+        far[row, column] = max(far[row, column], code)
+
+
+@serial
+def block_of(point, i, T, camera, around, stride, shape):
+    """Return the row and the column of the block that a point falls into, and its depth; -1 if it is outside.
+
+    `around` says that columns close a circle, as those of a scan, whose depth is the distance.
+    """
+    fx, fy, cx, cy = camera
+    rows, columns = shape
+    right, down, z = in_sensor(point[i, 0], point[i, 1], point[i, 2], T)
+    distance = np.sqrt(right * right + down * down + z * z) if around else z
+    if not distance > 1e-9:
+        return np.int64(-1), np.int64(-1), distance
+    if around:
+        u, v = (np.arctan2(down, right) + np.pi) * fx, (np.arcsin(z / distance) + 0.5 * np.pi) * fy
+    else:
+        u, v = right / z * fx + cx, down / z * fy + cy
+    if not (-0.5 <= u < (columns + 1) * stride and -0.5 <= v < rows * stride):
+        return np.int64(-1), np.int64(-1), distance
+    row, column = np.int64(np.floor((v + 0.5) / stride)), np.int64(np.floor((u + 0.5) / stride))
+    if around and column >= columns:
+        column -= columns
+    if row >= rows or column >= columns:
+        return np.int64(-1), np.int64(-1), distance
+    return row, column, distance
+
+
+@serial
+def vote(point, T, camera, around, stride, near, far, reach, gap, near_by, votes):
+    """Write the vote of a view on each point (n, 3), by the blocks of its depth.
+
+    A view sees through a point if all depth in the blocks up to `reach` from the point's own is farther by more than
+    `gap`, in codes, and known in its own block and the 8 around it. It sees a point if depth in its own block is on
+    both sides of it, but for `near_by` codes.
+    """
+    rows, columns = near.shape
+    for i in range(len(point)):
+        votes[i] = UNKNOWN
+        row, column, distance = block_of(point, i, T, camera, around, stride, near.shape)
+        if row < 0 or far[row, column] == 0:
+            continue
+        here = code_of(distance)
+        part = np.uint8(4 * (SIDES * (SIDES * row // rows) + SIDES * column // columns))
+        if here > far[row, column] + gap:
+            votes[i] = HIDDEN + part
+        elif here >= np.int64(near[row, column] & LARGEST) - near_by:
+            votes[i] = SEEN + part
+        elif is_farther(near, row, column, around, reach, here + gap):
+            votes[i] = THROUGH + part
+
+
+@serial
+def in_blocks_of_one_surface(point, T, camera, around, stride, near, far, most, firm):
+    """Write for each point (n, 3) whether depth in its block and the 8 around it differs by at most `most` codes."""
+    rows, columns = near.shape
+    for i in range(len(point)):
+        row, column, _ = block_of(point, i, T, camera, around, stride, near.shape)
+        low, high = np.int64(LARGEST), np.int64(0)
+        for b in range(row - 1, row + 2):
+            for aside in range(column - 1, column + 2):
+                a = (aside + columns) % columns if around else aside
+                if row >= 0 and 0 <= b < rows and 0 <= a < columns and far[b, a]:
+                    low, high = min(low, np.int64(near[b, a] & LARGEST)), max(high, np.int64(far[b, a]))
+        firm[i] = high > 0 and high - low <= most
+
+
+@serial
+def is_farther(near, row, column, around, reach, code):
+    """Return whether depth in the blocks up to `reach` from one is farther than a code, and known in the next ones."""
+    rows, columns = near.shape
+    for b in range(row - reach, row + reach + 1):
+        for aside in range(column - reach, column + reach + 1):
+            is_next = abs(b - row) <= 1 and abs(aside - column) <= 1
+            a = (aside + columns) % columns if around else aside
+            if b < 0 or a < 0 or b >= rows or a >= columns:
+                if is_next:
+                    return False
+                continue
+            there = near[b, a]
+            if there & HOLE and is_next:
+                return False
+            there &= LARGEST
+            if 0 < there <= code:
+                return False
+    return True
+
+
+@serial
+def tally(votes, counted, counts, between):
+    """Count the votes (V, n) of the views that count, in their order: seen, hidden, through (n, 3) of each spot.
+
+    `between` (2,) counts the votes whose neighbours in time, among those that see the spot or see through it, both see
+    it, and those of them that see through it: a thing that is there before and after has not moved.
+    """
+    for i in range(votes.shape[1]):
+        before, last = UNKNOWN, UNKNOWN
+        for k in range(votes.shape[0]):
+            own = np.int64(votes[k, i] & 3)
+            if own == UNKNOWN or not counted[k]:
+                continue
+            counts[i, own - 1] += 1
+            if own == HIDDEN:
+                continue
+            if before == SEEN and own == SEEN and last != UNKNOWN:
+                between[0] += 1
+                between[1] += last == THROUGH
+            before, last = last, own

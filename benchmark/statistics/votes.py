@@ -1,0 +1,425 @@
+"""Which spots moved: views that see the surface at a spot, and views that see through it.
+
+The depth of up to MOST_KEPT views is kept, coarsely, so that each spot is looked up in views before it was found and
+after it. A view sees through a spot if all that it shows there, some pixels around included, is farther than the spot
+by more than errors of depth and poses explain. A nearer surface hides the spot, which says nothing.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import itertools
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from semstab.core.types import Float64, Int64, Mask, UInt16
+from semstab.data.frames import Frame
+
+MOST_KEPT = 256
+"""Most views whose depth is kept; of more views, every second, fourth, ... one is."""
+
+BLOCKS = 20_000
+"""Blocks of pixels, about, of a view's depth."""
+
+POINTS = 3.0
+"""Distances of the points of sparse depth along the edge of a block."""
+
+GAP, GAP_SIGMAS = 0.01, 5.0
+"""A surface is farther than a spot if it is by more than GAP, relative, and by more than so many standard deviations of
+how depth differs between views."""
+
+AROUND = 2
+"""Blocks to each side of a spot that a view must show farther away to see through it: errors of poses and of edges of
+depth move things sidewards in an image. Holes count as near in the next blocks."""
+
+REACH = 0.25
+"""Blocks to each side, a pixel at least, in which a spot's surface must be smooth where it was found."""
+
+EDGE_OF_POINTS = 0.05
+"""Sparse depth in the blocks around a spot differs by at most this, relative."""
+
+EDGE, EDGE_SIGMAS = 0.05, 6.0
+"""Inverse depth of the pixels around a spot differs by EDGE, relative, and so many standard deviations of noise, at
+most: else the spot is at an edge of depth, or seen at a grazing angle, and it is not told whether it moved."""
+
+NEAR_BY, NEAR_BY_SIGMAS = 0.003, 3.0
+"""A view sees a spot if depth there differs by at most this, relative, and by so many standard deviations."""
+
+LEAST_THROUGH, SHARE_THROUGH = 2, 1 / 3
+"""A spot moved if so many views see through it, and more than this share of those that see it or see through it."""
+
+LEAST_VOTES = 2
+"""Views that see a spot or see through it, below which it is unknown whether it moved."""
+
+OF_SPOTS = ("seen", "hidden", "through")
+"""Votes on each spot, by name."""
+
+CONTRADICTS, MANY = 0.04, 50
+"""Two views contradict each other if one sees through more than this share of the spots, MANY or more, of the other."""
+
+MISPLACED, SPREAD = 0.1, 0.05
+"""A frame of a group that contradicts a larger one is misplaced if more than MISPLACED of its spots are seen through,
+and if it shows another surface at more than SPREAD of them in a third of its image."""
+
+MOST_OF_PAIRS = 1 << 13
+"""Spots, about, by which each two views are held against each other."""
+
+
+@dataclass(frozen=True, eq=False)
+class KeptDepth:
+    """The depth of a view in blocks of pixels.
+
+    Attributes:
+        view: Its number.
+        T_wc: (4, 4) its pose.
+        camera: Focal lengths and principal point in pixels; of a scan, pixels in a radian.
+        around: Whether columns close a circle.
+        stride: Edge of a block in pixels.
+        near, far: (rows, columns) uint16 codes of the nearest and the farthest depth.
+    """
+
+    view: int
+    T_wc: Float64
+    camera: tuple[float, float, float, float]
+    around: bool
+    stride: float
+    near: UInt16
+    far: UInt16
+
+    @classmethod
+    def of_image(
+        cls, view: int, T_wc: Float64, camera: tuple[float, float, float, float], depth: npt.NDArray[Any]
+    ) -> KeptDepth:
+        """Keep dense depth (H, W)."""
+        from semstab.statistics.loops.moving import blocks_of_image
+
+        stride = max(1, round(math.sqrt(depth.size / BLOCKS)))
+        near, far = np.empty((2, depth.shape[0] // stride, depth.shape[1] // stride), np.uint16)
+        low, high = np.empty((2, depth.shape[1]), depth.dtype)
+        blocks_of_image(depth, stride, low, high, np.empty(depth.shape[1], np.bool_), near, far)
+        return cls(view, T_wc, camera, False, float(stride), near, far)
+
+    @classmethod
+    def of_points(
+        cls,
+        view: int,
+        T_wc: Float64,
+        camera: tuple[float, float, float, float],
+        around: bool,
+        spacing: float,
+        shape: tuple[int, int],
+        points: tuple[Float64, Float64, Float64],
+    ) -> KeptDepth:
+        """Keep sparse depth: points by image coordinates and inverse depth, `spacing` pixels apart, of an image."""
+        from semstab.statistics.loops.moving import blocks_of_points
+
+        stride = max(POINTS * spacing, 1.0)
+        columns = max(1, round(shape[1] / stride)) if around else math.ceil(shape[1] / stride)
+        stride = shape[1] / columns if around else stride
+        near, far = np.empty((2, math.ceil(shape[0] / stride), columns), np.uint16)
+        blocks_of_points(*points, stride, near, far)
+        return cls(view, T_wc, camera, around, stride, near, far)
+
+    def firm(self, point: Float64) -> Mask:
+        """Return which points (n, 3) lie in blocks that show one surface."""
+        from semstab.statistics.loops.moving import STEP, in_blocks_of_one_surface
+
+        firm, most = np.empty(len(point), np.bool_), math.ceil(math.log1p(EDGE_OF_POINTS) / STEP)
+        place = self.T_wc, self.camera, self.around, self.stride
+        in_blocks_of_one_surface(point, *place, self.near, self.far, most, firm)
+        return firm
+
+    def votes(self, point: Float64, sigma: float) -> npt.NDArray[np.uint8]:
+        """Return the vote (n,) on points (n, 3); depth of a surface differs by `sigma`, relative, between views."""
+        from semstab.statistics.loops.moving import STEP, vote
+
+        votes = np.empty(len(point), np.uint8)
+        gap, near_by = (math.ceil(math.log1p(each(sigma)) / STEP) for each in (gap_of, near_by_of))
+        vote(point, self.T_wc, self.camera, self.around, self.stride, self.near, self.far, AROUND, gap, near_by, votes)
+        return votes
+
+
+class DepthMemory:
+    """The depth of some of the views of a flight, evenly over it."""
+
+    def __init__(self) -> None:
+        self.kept: list[KeptDepth] = []
+        self._step = 1
+
+    def wants(self, view: int) -> bool:
+        """Return whether the depth of a view is to be kept: it is new, and one of every so many."""
+        return view % self._step == 0 and (not self.kept or view > self.kept[-1].view)
+
+    def add(self, depth: KeptDepth) -> None:
+        """Keep the depth of a view; of more than MOST_KEPT every second one is dropped."""
+        self.kept.append(depth)
+        while len(self.kept) > MOST_KEPT:
+            self._step *= 2
+            self.kept = [each for each in self.kept if each.view % self._step == 0]
+
+    def votes_on(self, point: Float64, found: npt.NDArray[np.int32], firm: Mask, views: int, sigma: float) -> SpotVotes:
+        """Return what the kept views say of spots.
+
+        Args:
+            point: (n, 3) spots in metres.
+            found: (n,) the view that found each spot.
+            firm: (n,) spots that lie at no edge of depth; the others have no votes.
+            views: Number of views.
+            sigma: Standard deviation of how depth differs between views, relative.
+        """
+        from semstab.statistics.loops.moving import tally
+
+        votes = np.zeros((len(self.kept), len(point)), np.uint8)
+        for own, each in zip(votes, self.kept, strict=True):
+            own[firm] = each.votes(point[firm], sigma)
+        kept = np.array([each.view for each in self.kept], np.int64)
+        fits, shares = _fitting(votes, kept, found, views)
+        counts, between = np.zeros((len(point), 3), np.uint16), np.zeros(2, np.int64)
+        tally(votes, fits[kept], counts, between)
+        counts[~fits[found]] = 0
+        seen, hidden, through = counts.T.copy()
+        return SpotVotes(seen, hidden, through, shares, ~fits, between, gap_of(sigma))
+
+    def moving_pixels(self, frame: Frame, sigma: float, misplaced: Mask) -> Mask:
+        """Return the pixels (H, W) of a frame whose surface moved: the kept views, but for misplaced ones, tell.
+
+        Places in blocks of pixels are asked; pixels next to such blocks move, too, if they go on at the same depth.
+        """
+        from semstab.statistics.loops.moving import SEEN, THROUGH
+
+        step = max(1, round(math.sqrt(frame.depth.size / BLOCKS)))
+        depth = frame.depth[step // 2 :: step, step // 2 :: step].astype(np.float64)
+        valid, K = (depth > 0) & (depth < np.inf), frame.intrinsics
+        row, column = (step // 2 + step * each for each in np.nonzero(valid))
+        z = depth[valid]
+        rays = np.stack([(column - K.cx) / K.fx, (row - K.cy) / K.fy, np.ones(len(z))], axis=1)
+        point = (rays * z[:, None]) @ frame.T_wc[:3, :3].T + frame.T_wc[:3, 3]
+        seen, through = np.zeros((2, len(z)), np.int64)
+        for each in self.kept:
+            if not misplaced[each.view]:
+                own = each.votes(point, sigma) & 3
+                seen += own == SEEN
+                through += own == THROUGH
+        moves = np.zeros(depth.shape, np.bool_)
+        moves[valid] = has_moved(through, seen + through)
+        small = _grown(moves, np.where(valid, depth, np.nan), gap_of(sigma))
+        whole = small.repeat(step, axis=0).repeat(step, axis=1)
+        bottom, right = (max(0, n - m) for n, m in zip(frame.depth.shape, whole.shape, strict=True))
+        whole = np.pad(whole, ((0, bottom), (0, right)), mode="edge")
+        return np.asarray(whole[: frame.depth.shape[0], : frame.depth.shape[1]], np.bool_)
+
+
+def _grown(moves: Mask, depth: Float64, gap: float) -> Mask:
+    """Return a mask (h, w) with the pixels next to it that have the same depth but for a gap, twice."""
+    for _ in range(AROUND):
+        padded, around = np.pad(moves, 1), np.pad(depth, 1, constant_values=np.nan)
+        grown = moves.copy()
+        for b, a in itertools.product(range(3), range(3)):
+            side = slice(b, b + depth.shape[0]), slice(a, a + depth.shape[1])
+            grown |= padded[side] & (np.abs(around[side] - depth) <= gap * depth)
+        moves = grown
+    return moves
+
+
+def has_moved(through: npt.NDArray[Any], votes: npt.NDArray[Any]) -> Mask:
+    """Return what moved: LEAST_THROUGH views see through it, and more than SHARE_THROUGH of all votes."""
+    return np.asarray((through >= LEAST_THROUGH) & (through > SHARE_THROUGH * votes), np.bool_)
+
+
+def gap_of(sigma: float) -> float:
+    """Return how much farther than a spot a surface is at least, relative, that shows that a view sees through it."""
+    return max(GAP, GAP_SIGMAS * sigma)
+
+
+def near_by_of(sigma: float) -> float:
+    """Return how much nearer or farther than a spot, relative, a surface is at most that is the spot's."""
+    return max(NEAR_BY, NEAR_BY_SIGMAS * sigma)
+
+
+@dataclass(frozen=True, eq=False)
+class SpotVotes:
+    """How many views see each spot, have it hidden, or see through it, and which frames do not fit the others.
+
+    Attributes:
+        seen, hidden, through: (n,) uint16 views of each spot, without those that are misplaced; 0 of a spot that was
+            found in one of these.
+        through_of_view: (V,) share of the spots of other views that a view sees through, of those that it sees or sees
+            through; NaN of views whose depth was not kept.
+        misplaced: (V,) views that see through many spots all over the image.
+        between: (2,) votes before and after which a view sees the spot, and those of them that see through it.
+        gap: By how much farther than a spot a surface is, relative, that shows that a view sees through it.
+    """
+
+    seen: UInt16
+    hidden: UInt16
+    through: UInt16
+    through_of_view: Float64
+    misplaced: Mask
+    between: Int64
+    gap: float
+
+    @property
+    def columns(self) -> dict[str, UInt16]:
+        """(n,) the votes on each spot by name."""
+        return {name: getattr(self, name) for name in OF_SPOTS}
+
+    def of_views(self) -> dict[str, Any]:
+        """Return what is known of views, for JSON."""
+        shares = [None if math.isnan(share) else share for share in self.through_of_view.tolist()]
+        lists = {"misplaced": np.flatnonzero(self.misplaced).tolist(), "between": self.between.tolist()}
+        return {"through_of_view": shares, **lists, "gap": self.gap}
+
+    @classmethod
+    def of(cls, columns: Mapping[str, npt.NDArray[Any]], of_views: Mapping[str, Any]) -> SpotVotes:
+        """Build votes from columns (n,) by name, and what `of_views` returned.
+
+        Raises:
+            IndexError: If a misplaced view is not there.
+        """
+        shares = np.array([math.nan if share is None else share for share in of_views["through_of_view"]], np.float64)
+        misplaced = np.zeros(len(shares), np.bool_)
+        misplaced[np.array(of_views["misplaced"], np.int64)] = True
+        between = np.array(of_views["between"], np.int64).reshape(2)
+        seen, hidden, through = (columns[name].astype(np.uint16) for name in OF_SPOTS)
+        return cls(seen, hidden, through, shares, misplaced, between, float(of_views["gap"]))
+
+    @property
+    def votes(self) -> Int64:
+        """(n,) views that see a spot or see through it."""
+        return self.seen.astype(np.int64) + self.through
+
+    @property
+    def moved(self) -> Mask:
+        """(n,) spots that moved: LEAST_THROUGH views see through it, and more than SHARE_THROUGH of all."""
+        return has_moved(self.through, self.votes)
+
+    @property
+    def static(self) -> Mask:
+        """(n,) spots that did not move: enough views tell, and at most SHARE_THROUGH of them see through it."""
+        return np.asarray((self.votes >= LEAST_VOTES) & (self.through <= SHARE_THROUGH * self.votes), np.bool_)
+
+    @property
+    def known(self) -> Mask:
+        """(n,) spots of which it is known whether they moved."""
+        return self.moved | self.static
+
+    @property
+    def false_rate(self) -> float:
+        """Share of the votes on what stayed that see through it, from votes between two that see the spot."""
+        return float((self.between[1] + 0.5) / (self.between[0] + 1))
+
+    @property
+    def false_share(self) -> float:
+        """Share of the known spots that errors alone call moved, if they meet views independently.
+
+        Of n votes, r see through the spot with the probability b(r; n, q), where q is `false_rate`.
+        """
+        from scipy.stats import binom
+
+        n, count = np.unique(self.votes[self.known], return_counts=True)
+        if not len(n):
+            return math.nan
+        least = np.maximum(LEAST_THROUGH, np.floor(SHARE_THROUGH * n + 1e-9) + 1)
+        return float(binom.sf(least - 1, n, self.false_rate) @ count / count.sum())
+
+    def take(self, rows: Any) -> SpotVotes:
+        """Return the votes on some of the spots."""
+        return dataclasses.replace(self, seen=self.seen[rows], hidden=self.hidden[rows], through=self.through[rows])
+
+    @classmethod
+    def joined(cls, parts: Sequence[SpotVotes]) -> SpotVotes:
+        """Return the votes of several parts, each on its own spots by its own views, one after the other."""
+        names = (*OF_SPOTS, "through_of_view", "misplaced")
+        columns: dict[str, Any] = {name: np.concatenate([getattr(part, name) for part in parts]) for name in names}
+        between = np.sum([part.between for part in parts], axis=0)
+        return cls(**columns, between=between, gap=max(part.gap for part in parts))
+
+
+def firm(
+    point: Float64, T_wc: Float64, camera: tuple[float, float, float, float], depth: npt.NDArray[Any], noise: float
+) -> Mask:
+    """Return which points (n, 3) that an image (H, W) shows lie at no edge of its depth; `noise` is relative."""
+    from semstab.statistics.loops.moving import on_one_surface
+
+    firm = np.empty(len(point), np.bool_)
+    reach = max(1, round(REACH * math.sqrt(depth.size / BLOCKS)))
+    on_one_surface(point, T_wc, camera, depth, reach, EDGE + EDGE_SIGMAS * noise, firm)
+    return firm
+
+
+# Poses that do not fit.
+
+
+def _fitting(
+    votes: npt.NDArray[np.uint8], kept: Int64, found: npt.NDArray[np.int32], views: int
+) -> tuple[Mask, Float64]:
+    """Return which views (V,) fit the others, and the share (V,) of their spots that each sees through.
+
+    Views that fit one another are a group, of which each fits another one at least. Groups that contradict a larger one
+    are misplaced, but for views that see through little of what the others see, or in few parts of the image alone: a
+    large thing that moves is there.
+    """
+    from semstab.statistics.loops.moving import HIDDEN, SEEN, SIDES, THROUGH
+
+    parts, (trusted, against) = SIDES * SIDES, _trusted(votes)
+    seen, through = np.zeros((2, votes.shape[1]), np.int32)
+    for own in votes[trusted]:
+        seen += own & 3 == SEEN
+        through += own & 3 == THROUGH
+    usual = (seen >= np.maximum(through, LEAST_VOTES)) & np.isin(found, kept[~trusted], invert=True)
+    counts = np.zeros((len(kept), parts, 4), np.int64)
+    for k, own in enumerate(votes):
+        others = own[usual & (found != kept[k])]
+        counts[k] = np.bincount(others, minlength=4 * parts).reshape(parts, 4)
+    away, seen_there = counts[..., THROUGH], counts[..., SEEN]
+    shares, fits = np.full(views, np.nan), np.ones(views, np.bool_)
+    with np.errstate(invalid="ignore"):
+        shares[kept] = np.fmax(away.sum(axis=1) / (away + seen_there).sum(axis=1), against)
+    spread = _is_spread(away + counts[..., HIDDEN], counts[..., 1:].sum(axis=2))
+    fits[kept] = trusted | ~(spread & (shares[kept] > MISPLACED))
+    return fits, shares
+
+
+def _trusted(votes: npt.NDArray[np.uint8]) -> tuple[Mask, Float64]:
+    """Return which views (k,) are in a group that contradicts no larger one, by their votes (k, n).
+
+    With it, the share (k,) of the spots of these views and of each view that one sees and the other sees through.
+    """
+    from scipy.sparse.csgraph import connected_components
+
+    away, told = _of_pairs(votes)
+    enough = told >= MANY
+    contradicts = enough & (away > CONTRADICTS * told)
+    _, group = connected_components(enough & ~contradicts, directed=False)
+    trusted = np.zeros(len(votes), np.bool_)
+    for each in np.argsort(-np.bincount(group, minlength=1), kind="stable"):
+        own = group == each
+        against = contradicts[own][:, trusted]
+        if 2 * np.count_nonzero(against) <= np.count_nonzero(enough[own][:, trusted]):
+            trusted |= own
+    with np.errstate(invalid="ignore"):
+        return trusted, away[:, trusted].sum(axis=1) / told[:, trusted].sum(axis=1)
+
+
+def _of_pairs(votes: npt.NDArray[np.uint8]) -> tuple[Int64, Int64]:
+    """Return of how many spots, of some, that one of two views sees the other sees through (k, k), and tells at all."""
+    from semstab.statistics.loops.moving import SEEN, THROUGH
+
+    some = votes[:, :: max(1, votes.shape[1] // MOST_OF_PAIRS)] & 3
+    seen, through = ((some == kind).astype(np.float32) for kind in (SEEN, THROUGH))
+    away = through @ seen.T
+    away += away.T
+    return away.astype(np.int64), (away + 2 * (seen @ seen.T)).astype(np.int64)
+
+
+def _is_spread(other: Int64, told: Int64) -> Mask:
+    """Return which views (n,) show another surface than that of the spots in a third of the image, by counts (n, p)."""
+    total = told.sum(axis=1)
+    counts = told >= np.maximum(MANY, total[:, None]) / (10 * other.shape[1])
+    spread = (other > SPREAD * told) & counts
+    return np.asarray((total >= MANY) & (3 * spread.sum(axis=1) >= counts.sum(axis=1)), np.bool_)

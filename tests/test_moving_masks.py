@@ -1,0 +1,74 @@
+"""Masks of what moves, which a dataset leaves out."""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+import pytest
+
+import semstab
+from semstab.errors import ConfigError
+
+CITY = {
+    "dataset": {"name": "city", "options": {"width": 256, "height": 144, "frames": 40}}, "scenes": ["scene0"],
+    "models": ["gt"], "check": None, "voxel_size": 1.0,
+}  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory):  # type: ignore[no-untyped-def]
+    folder = tmp_path_factory.mktemp("moving")
+    semstab.run(CITY, out=folder / "run")
+    return folder / "run"
+
+
+def test_masks_have_the_moving_things_and_little_else(run) -> None:  # type: ignore[no-untyped-def]
+    (written,) = semstab.export(run, run.parent / "moving")
+    files = sorted(written.path.glob("*.png"))
+    assert len(files) == 40
+    assert "40 masks" in written.content
+    config = semstab.load_config(CITY)
+    scene = semstab.task.open_scenes(config)["scene0"]
+    names = scene.label_space("gt").classes
+    moving = [scene.label_space("gt").ids[names.index(name)] for name in ("moving car", "human")]
+    masked = right = cars = found = 0
+    for file in files[5:-5]:  # the first and the last frames share their places with few others
+        truth = np.isin(scene.frame(int(file.stem), "gt").labels, moving)
+        mask = cv2.imread(str(file), cv2.IMREAD_UNCHANGED) == 0
+        beside = cv2.dilate(truth.astype(np.uint8), np.ones((7, 7), np.uint8)) > 0
+        masked, right = masked + mask.sum(), right + (mask & beside).sum()
+        cars, found = cars + truth.sum(), found + (mask & truth).sum()
+    assert right > 0.9 * masked
+    assert found > 0.5 * cars
+
+
+def test_the_run_tells_what_moved_and_its_series_has_it(run) -> None:  # type: ignore[no-untyped-def]
+    (record,) = semstab.load_result(run).select()
+    moved = record.statistics.moved
+    assert moved.are_found
+    assert {row.name for row in moved.classes[:2]} == {"moving car", "human"}
+    assert all(row.moved < 0.02 for row in moved.classes[2:])
+    assert not moved.misplaced
+    header, *rows = (run / "frames").glob("*.csv").__next__().read_text().splitlines()
+    at = header.split(",").index("moving_percent")
+    assert max(float(row.split(",")[at]) for row in rows) > 0.5
+
+
+def test_kept_movers_are_told_nowhere(tmp_path) -> None:  # type: ignore[no-untyped-def]
+    result = semstab.run(CITY | {"moving": "keep"}, out=tmp_path / "run")
+    (record,) = result.select()
+    assert record.statistics.moved is None
+    assert record.statistics.static is None
+
+
+def test_of_depth_cast_at_a_mesh_no_masks_are_written(tmp_path) -> None:  # type: ignore[no-untyped-def]
+    from pathlib import Path
+    from unittest import mock
+
+    from semstab.exports.moving import write_masks
+
+    task = mock.Mock()
+    task.scene.of_scans, task.scene.name, task.scene.surface = False, "field", Path("odm_mesh.ply")
+    with pytest.raises(ConfigError, match=r"depth is cast at odm_mesh\.ply"):
+        write_masks(task, tmp_path / "moving")
+    assert not (tmp_path / "moving").exists()

@@ -1,0 +1,159 @@
+"""Spots that moved: views see through them, before and after."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Iterator
+
+import numpy as np
+import pytest
+
+from semstab.data.frames import Frame, Intrinsics
+from semstab.statistics import Sampler, SpotObservations
+from semstab.statistics.moving import moving_percent, static_spots
+from semstab.statistics.votes import MOST_KEPT, SpotVotes
+
+H, W, FOCAL, HEIGHT = 120, 160, 120.0, 20.0
+CAMERA = Intrinsics(FOCAL, FOCAL, (W - 1) / 2, (H - 1) / 2)
+FLOOR, PARKED, DRIVING = 0, 1, 2
+FRAMES = 24
+
+
+def box_at(frame: int) -> tuple[float, float]:
+    """The box drives 3 m a frame, and is 4 m long."""
+    return -30.0 + 3.0 * frame, 2.0
+
+
+def frames(
+    *, noise: float = 0.0, shift: float = 0.0, shifted: range = range(0), drives: bool = True
+) -> Iterator[Frame]:
+    """A camera looks down on a floor with two boxes, 3 m high, of which one drives; some poses are wrong."""
+    rng = np.random.default_rng(3)
+    u, v = np.meshgrid((np.arange(W) - CAMERA.cx) / FOCAL, (np.arange(H) - CAMERA.cy) / FOCAL)
+    for k in range(FRAMES):
+        x, y = 0.4 * k - 5.0, 0.0
+        depth, labels = np.full((H, W), HEIGHT), np.full((H, W), FLOOR, np.uint8)
+        for own, (left, top) in ((PARKED, (-3.0, -5.0)), (DRIVING, box_at(k) if drives else (-50.0, 0.0))):
+            top_of_box = HEIGHT - 3.0
+            px, py = x + u * top_of_box, y + v * top_of_box
+            inside = (left <= px) & (px < left + 4.0) & (top <= py) & (py < top + 4.0)
+            depth[inside], labels[inside] = top_of_box, own
+        pose = np.eye(4)
+        pose[:3, 3] = x, y, shift * (k in shifted)
+        noisy = depth * (1 + noise * rng.standard_normal((H, W)))
+        yield Frame(k, noisy.astype(np.float32), CAMERA, pose, labels=labels)
+
+
+def sampled(some: Iterator[Frame], *, moving: bool = True) -> SpotObservations:
+    sampler = Sampler(3, moving=moving)
+    for frame in some:
+        sampler.add(frame)
+    return sampler.sample()
+
+
+def classes(spots: SpotObservations) -> np.ndarray:
+    """The class of each spot, which is the same in all views; -1 for one without answers."""
+    own = np.full(len(spots.point), -1)
+    own[spots.spot] = spots.label
+    return own
+
+
+@pytest.mark.parametrize("noise", [0.0, 0.005])
+def test_what_drives_has_moved_and_what_stands_has_not(noise: float) -> None:
+    spots = sampled(frames(noise=noise))
+    own, votes = classes(spots), spots.votes
+    assert votes is not None
+    assert votes.moved[own == DRIVING].mean() > 0.7
+    assert not votes.moved[own == PARKED].any()
+    assert votes.static[own == PARKED].mean() > 0.7
+    assert votes.moved[own == FLOOR].mean() < 0.005
+    assert votes.static[own == FLOOR].mean() > 0.7
+    assert not (votes.moved & votes.static).any()
+
+
+def test_nothing_moved_where_all_stands() -> None:
+    spots = sampled(frames(noise=0.01, drives=False))
+    assert spots.votes is not None
+    assert spots.votes.moved.mean() < 0.001
+    assert not spots.votes.misplaced.any()
+    assert spots.votes.false_rate < 0.01
+    assert spots.votes.false_share < 0.005
+    assert max(moving_percent(spots).values()) < 0.1
+
+
+def test_views_before_a_spot_was_found_see_through_it() -> None:
+    """A box arrives in the last frames and stays: all views that see through it are earlier ones."""
+    late = []
+    for frame in frames(drives=False):
+        assert frame.labels is not None
+        depth, labels = frame.depth.copy(), frame.labels.copy()
+        if frame.index >= FRAMES - 8:
+            u, v = np.meshgrid((np.arange(W) - CAMERA.cx) / FOCAL, (np.arange(H) - CAMERA.cy) / FOCAL)
+            px, py = frame.T_wc[0, 3] + u * (HEIGHT - 3), v * (HEIGHT - 3)
+            inside = (np.abs(px - 2.0) < 2.0) & (np.abs(py - 4.0) < 2.0)
+            depth[inside], labels[inside] = HEIGHT - 3.0, DRIVING
+        late.append(dataclasses.replace(frame, depth=depth, labels=labels))
+    spots = sampled(iter(late))
+    assert spots.votes is not None
+    assert spots.votes.moved[classes(spots) == DRIVING].mean() > 0.7
+
+
+def test_frames_with_wrong_poses_are_named_and_do_not_look_like_movers() -> None:
+    wrong = range(10, 13)
+    spots = sampled(frames(shift=-1.5, shifted=wrong, drives=False))
+    votes = spots.votes
+    assert votes is not None
+    assert spots.views.frame[votes.misplaced].tolist() == list(wrong)
+    assert not spots.moved.any()
+    assert (votes.through_of_view[10:13] > 0.1).all()
+    assert (np.delete(votes.through_of_view, wrong) < 0.1).all()
+
+
+def test_votes_change_neither_spots_nor_answers() -> None:
+    with_votes, without = sampled(frames()), sampled(frames(), moving=False)
+    assert without.votes is None
+    assert not without.moved.any()
+    for name in ("spot", "view", "label", "near", "point", "drawn"):
+        np.testing.assert_array_equal(getattr(with_votes, name), getattr(without, name))
+
+
+def test_votes_are_kept_in_files_and_go_with_their_spots(tmp_path) -> None:  # type: ignore[no-untyped-def]
+    spots = sampled(frames(shift=-1.5, shifted=range(10, 12)))
+    spots.save(tmp_path / "spots.parquet")
+    read = SpotObservations.load(tmp_path / "spots.parquet")
+    assert spots.votes is not None
+    assert read.votes is not None
+    for name, own in vars(spots.votes).items():
+        np.testing.assert_array_equal(getattr(read.votes, name), own)
+    half = spots.within(1 << 31)
+    assert half.votes is not None
+    assert 0 < len(half.point) < len(spots.point)
+    np.testing.assert_array_equal(half.votes.through, spots.votes.through[spots.drawn < 1 << 31])
+    static = static_spots(spots)
+    assert 0 < len(static) < len(spots)
+    assert not static.moved.any()
+
+
+def test_of_long_flights_every_so_many_views_are_kept() -> None:
+    from semstab.statistics.votes import DepthMemory, KeptDepth
+
+    memory, depth = DepthMemory(), np.ones((4, 4), np.float32)
+    for view in range(5 * MOST_KEPT):
+        if memory.wants(view):
+            memory.add(KeptDepth.of_image(view, np.eye(4), (1.0, 1.0, 0.0, 0.0), depth))
+    kept = [each.view for each in memory.kept]
+    assert MOST_KEPT / 2 < len(kept) <= MOST_KEPT
+    assert set(np.diff(kept)) == {8}
+    assert kept[0] == 0
+
+
+def test_two_views_and_a_third_of_the_votes_decide() -> None:
+    seen, through = np.array([0, 0, 1, 3, 4, 9, 1], np.uint16), np.array([0, 2, 1, 2, 2, 1, 0], np.uint16)
+    none = np.zeros(0)
+    votes = SpotVotes(seen, 0 * seen, through, none, none > 0, np.array([1000, 3]), 0.01)
+    assert votes.moved.tolist() == [False, True, False, True, False, False, False]
+    assert votes.static.tolist() == [False, False, False, False, True, True, False]
+    # votes 2 of 2, 2 of 5, 3 of 6 and 4 of 10 with a rate of 3.5 in 1001
+    q = 3.5 / 1001
+    expected = np.mean([q**2, 10 * q**2 * (1 - q) ** 3 + 10 * q**3, 20 * q**3, 210 * q**4])
+    assert votes.false_share == pytest.approx(expected, rel=0.05)
