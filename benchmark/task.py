@@ -13,6 +13,7 @@ import numpy as np
 from semstab.config import Config, Exclusion, Part, Perturbation, as_range, nearest
 from semstab.core.types import Mask
 from semstab.data.distances import distances_of
+from semstab.data.features import OF_FEATURES
 from semstab.data.frames import Frame
 from semstab.data.labels import LabelMapping, LabelSpace
 from semstab.data.results import UnitName
@@ -100,7 +101,8 @@ def tasks_of(scene: Scene, config: Config, others: Sequence[str] = ()) -> Iterat
     indices = as_range(frames.indices)
     for model in names:
         source = scene.label_space(model)
-        target = source if config.taxonomy is None else LabelSpace.load(config.taxonomy)
+        keeps = config.taxonomy is None or source == OF_FEATURES  # which has no classes to map
+        target = source if keeps else LabelSpace.load(str(config.taxonomy))
         mapping = source.mapping_to(target)
         distances_of(target, config.distances)  # a file that cannot be used is named before any frame is read
         predicted = [*dict.fromkeys((*source.classes, *target.classes))]

@@ -5,15 +5,19 @@ from __future__ import annotations
 import dataclasses
 import itertools
 import logging
+import shutil
 
 import numpy as np
 import pytest
-from room_scene import CAMERA, CLASSES, render, rigid, turn, walk
+from command_line import bench, error_of
+from room_scene import CAMERA, CLASSES, Room, opened, render, rigid, turn, walk, write
 from simulated_events import grid, spots_at
 
 import semstab
+from semstab.core.files import write_image
 from semstab.data.features import Features
 from semstab.errors import DataError
+from semstab.online.metric import TemporalStability
 from semstab.statistics import Sampler
 from semstab.statistics.accumulate import sums_of_spots
 from semstab.statistics.cluster_sums import value
@@ -270,3 +274,168 @@ def test_frames_have_features_of_one_number_of_components():
     sampler = sampled([dataclasses.replace(one, features=of_classes(one.labels))])
     with pytest.raises(DataError, match="frame 1, features: features have 9 components, 5 in the frames before"):
         sampler.add(dataclasses.replace(other, features=of_classes(other.labels, 9)))
+
+
+# --- The program's own frames, folders and predictors -----------------------------------------------------------------
+
+
+def test_a_metric_takes_features_and_adds_up_over_processes():
+    metric, halves = TemporalStability(K), [TemporalStability(K), TemporalStability(K)]
+    for i, frame in enumerate(flight(12)):
+        features = np.moveaxis(of_classes(frame.labels), -1, 0)
+        for each in (metric, halves[i % 2]):
+            each.update(frame.labels, frame.depth, CAMERA, frame.T_wc, features=features)
+    numbers = metric.compute()
+    assert numbers["feature_alpha"] == pytest.approx(alpha_of_features(metric.states()[""].features))
+    assert numbers["feature_alpha"] > 0.3
+    summary = metric.by_sequence()[""]
+    assert summary.feature_alpha_low < summary.feature_alpha < summary.feature_alpha_high
+    halves[0].merge_state(halves[1])
+    assert halves[0].compute()["feature_alpha"] == pytest.approx(numbers["feature_alpha"], abs=0.08)
+    alone = TemporalStability(2)
+    for frame in flight(4):
+        alone.update(None, frame.depth, CAMERA, frame.T_wc, features=np.moveaxis(of_classes(frame.labels), -1, 0))
+    assert 0.3 < alone.compute()["feature_alpha"] < 1
+
+
+def test_a_metric_names_features_of_another_batch():
+    (frame,) = flight(1)
+    with pytest.raises(DataError, match=r"features of shape \(2, 8, 9, 12\) for 1 frames"):
+        TemporalStability(K).update(frame.labels, frame.depth, CAMERA, frame.T_wc, features=np.ones((2, 8, 9, 12)))
+
+
+def test_fused_frames_have_alpha_of_features():
+    frames = [
+        {
+            "depth": f.depth, "intrinsics": CAMERA, "T_wc": f.T_wc, "features": of_classes(f.labels)[4::8, 4::8]
+        }
+        for f in flight(12)
+    ]  # fmt: skip
+    result = semstab.fuse(frames, voxel_size=0.2)
+    statistics = result.record().statistics
+    assert statistics.features.alone
+    assert result.summary.feature_alpha == statistics.features.alpha.value
+    assert np.isnan(
+        [result.summary.alpha, result.summary.vss_op3, result.summary.sbd_op3, result.summary.flicker]
+    ).all()
+    assert statistics.verdict.level == "no verdict"
+    assert "features and no labels" in statistics.verdict.line
+
+
+def written(folder, **features):
+    """A posed folder of a room with labels of 'net', and features by model: functions of a frame's labels."""
+    room = Room(poses=walk(12))
+    write(folder, room)
+    for model, make in features.items():
+        (folder / "features" / model).mkdir(parents=True)
+        for i in range(len(room)):
+            made = make(room.frame(i, "net").labels)
+            if isinstance(made, dict):
+                np.savez(folder / f"features/{model}/{i:03d}.npz", **made)
+            else:
+                np.save(folder / f"features/{model}/{i:03d}.npy", made)
+    return folder
+
+
+def coarse(labels):
+    return of_classes(labels)[4::8, 4::8].astype(np.float16)
+
+
+def test_a_folder_has_features_with_and_without_labels(tmp_path):
+    written(tmp_path / "room", net=coarse, clip=coarse)
+    scene = opened(tmp_path / "room")
+    assert scene.models == ("net", "clip")
+    assert scene.frame(3, "net").features.vectors.dtype == np.float16
+    assert scene.frame(3, "clip").features.first == (3.5, 3.5)
+    done = bench("room", "--voxel-size", "0.2", "-o", "run", cwd=tmp_path).stdout
+    assert "clip: features: alpha" in done
+    result = semstab.load_result(tmp_path / "run")
+    net, clip = (result.record(model=model).statistics for model in ("net", "clip"))
+    assert net.features.alpha == clip.features.alpha
+    assert not net.features.alone
+    assert clip.features.alone
+    assert net.headline.alpha.value > 0.5
+    bench("room", "--voxel-size", "0.2", "-o", "plain", "--model", "net", cwd=tmp_path)
+    alone = bench("room", "--voxel-size", "0.2", "-o", "alone", "--model", "clip", cwd=tmp_path).stdout
+    assert "FEATURES    alpha" in alone
+    assert "VSS, SBD, entropy, flicker, classes and a verdict have no number" in " ".join(alone.split())
+
+
+def test_labels_have_the_same_numbers_with_features_and_without(tmp_path):
+    written(tmp_path / "room", net=coarse)
+    bench("room", "--voxel-size", "0.2", "-o", "with", cwd=tmp_path)
+    shutil.rmtree(tmp_path / "room" / "features")
+    bench("room", "--voxel-size", "0.2", "-o", "without", cwd=tmp_path)
+    one, other = (semstab.load_result(tmp_path / name).record() for name in ("with", "without"))
+    assert one.summary.table == other.summary.table
+    assert dataclasses.replace(one.statistics, features=None) == other.statistics
+
+
+def test_a_stated_grid_is_read(tmp_path):
+    stated = {"first": np.array([7.5, 3.5]), "step": np.array([8.0, 8.0])}
+    written(tmp_path / "room", clip=lambda labels: {"features": coarse(labels), **stated})
+    features = opened(tmp_path / "room").frame(0, "clip").features
+    assert (features.first, features.step) == ((7.5, 3.5), (8.0, 8.0))
+
+
+@pytest.mark.parametrize(
+    ("content", "line"),
+    [
+        (np.full((9, 12, 5), np.nan), "cell (0, 0) is not finite"),
+        (np.ones((9, 12)), "features must be float (h, w, D)"),
+        (np.ones((9, 12, 7)), "features have 7 components, 5 in the frames before"),
+    ],
+)
+def test_a_bad_file_is_one_line(tmp_path, content, line):
+    written(tmp_path / "room", clip=coarse)
+    np.save(tmp_path / "room/features/clip/005.npy", content)
+    error = error_of("room", "--voxel-size", "0.2", "-o", "run", "--model", "clip", cwd=tmp_path)
+    assert line in error
+    assert "005.npy" in error
+
+
+def test_a_frame_without_features_is_missing(tmp_path):
+    written(tmp_path / "room", net=coarse)
+    (tmp_path / "room/features/net/005.npy").unlink()
+    assert "features/net/005" in error_of("room", "--voxel-size", "0.2", "-o", "run", cwd=tmp_path)
+
+
+NETWORK = """
+import numpy as np
+
+class net:
+    gives_features = True
+    {classes}
+    def predict(self, image):
+        patches = image[4::8, 4::8].astype(np.float32) + 1
+        {answer}
+"""
+
+
+@pytest.mark.parametrize("alone", [True, False])
+def test_a_network_of_a_file_gives_features(tmp_path, alone):
+    written(tmp_path / "room")
+    (tmp_path / "room/color").mkdir()
+    for i, T in enumerate(walk(12)):
+        _, labels = render(T)
+        write_image(tmp_path / f"room/color/{i:03d}.png", np.stack([40 * labels, 200 - 40 * labels, labels], axis=-1))
+    answer = "return patches" if alone else "return dict(features=patches, labels=image[..., 0].astype(np.uint8))"
+    classes = "" if alone else f"classes = {list(CLASSES)}"
+    (tmp_path / "net.py").write_text(NETWORK.format(classes=classes, answer=answer))
+    words = "room", "--voxel-size", "0.2", "-o", "run", "--predict", "net.py:net"
+    bench(*words, cwd=tmp_path)
+    statistics = semstab.load_result(tmp_path / "run").record().statistics
+    assert statistics.features.alone == alone
+    assert statistics.features.alpha.value > 0.6
+    assert np.load(tmp_path / "run/predictions/room/features/net/000.npy").shape == (9, 12, 3)
+
+
+def test_a_network_that_says_that_it_has_features_gives_them(tmp_path):
+    written(tmp_path / "room")
+    (tmp_path / "room/color").mkdir()
+    for i in range(12):
+        write_image(tmp_path / f"room/color/{i:03d}.png", np.zeros((72, 96, 3), np.uint8))
+    text = NETWORK.format(classes=f"classes = {list(CLASSES)}", answer="return image[..., 0] * 0")
+    (tmp_path / "net.py").write_text(text)
+    error = error_of("room", "--voxel-size", "0.2", "-o", "run", "--predict", "net.py:net", cwd=tmp_path)
+    assert "gives_features = True let it give a dict with features and labels" in error

@@ -27,6 +27,7 @@ from semstab.config import (
 )
 from semstab.core.code import Code, is_code
 from semstab.data.distances import distances_of
+from semstab.data.features import OF_FEATURES
 from semstab.data.labels import LabelSpace
 from semstab.data.measures import measures
 from semstab.data.records import REGIONS, Variation
@@ -241,10 +242,13 @@ def _base_units(config: Config, scenes: Mapping[str, Scene]) -> Iterator[Unit]:
             one = settings.model_copy(update={"models": [task.model]})
             if config.truth and scene.ground_truth and task.model != GROUND_TRUTH and truth_task(task) is None:
                 space, target = scene.label_space(GROUND_TRUTH), task.mapping.target
-                logger.warning(
-                    "%s: labels are not compared with the ground truth, as %s has classes that %s has not;"
-                    " list them under its ignored, or among members", name, space.name, target.name,
-                )  # fmt: skip
+                if target == OF_FEATURES:
+                    logger.info("%s: features of %s are not compared with the ground truth", name, task.model)
+                else:
+                    logger.warning(
+                        "%s: labels are not compared with the ground truth, as %s has classes that %s has not;"
+                        " list them under its ignored, or among members", name, space.name, target.name,
+                    )  # fmt: skip
             sampled = _is_sampled(config, config.backends[0])
             if config.video_measures == "dis" and scene.missing(task.indices[0], color=True):
                 raise ConfigError(f"{name}: there are no images for optical flow; use --video-measures depth")

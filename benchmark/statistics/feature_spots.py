@@ -11,17 +11,20 @@ import functools
 import itertools
 import logging
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
+from semstab.core.files import atomic_path
 from semstab.core.types import Float64, Int32, Int64, Mask, UInt32
 from semstab.data.events import Events
 from semstab.data.features import Features
 from semstab.data.frames import Frame
 from semstab.errors import DataError
-from semstab.statistics.observations import SpotObservations
+from semstab.statistics.cluster_sums import distinct_rows
+from semstab.statistics.observations import PARTS, SpotObservations
 
 logger = logging.getLogger("semstab")
 
@@ -153,6 +156,18 @@ class FeatureObservations:
         alone = dataclasses.replace(spots, **answers, K=1, classes=("surface",), distances=None)
         return cls(alone, vectors, one_in)
 
+    def save(self, path: Path) -> None:
+        """Write an .npz, atomically; `load` reads it with the sample of the same frames."""
+        with atomic_path(path) as temporary, temporary.open("wb") as file:
+            np.savez(file, spot=self.spots.spot, view=self.spots.view, vectors=self.vectors, one_in=self.one_in)
+
+    @classmethod
+    def load(cls, path: Path, spots: SpotObservations) -> FeatureObservations:
+        """Read a file that `save` wrote, of the frames of a sample."""
+        with np.load(path) as content:
+            answers = content["spot"], content["view"], content["vectors"]
+            return cls.of(*answers, spots, int(content["one_in"]))
+
     def __len__(self) -> int:
         """Return the number of observations: spots and views."""
         return len(self.log)
@@ -170,9 +185,10 @@ class FeatureObservations:
     @functools.cached_property
     def _order(self) -> tuple[Int64, Int64]:
         """The answers in order of observations, and (m + 1,) the first one of each observation."""
-        _, of_voxel, _ = self.spots._first
-        number = np.full(len(self.spots.point), -1, np.int64)
-        number[of_voxel] = np.arange(len(of_voxel))
+        spots, seen = self.spots, np.unique(self.spots.spot)
+        place = np.floor(spots.point[seen] * (PARTS / spots.spacing)).astype(np.int64)
+        number = np.zeros(len(spots.point), np.int64)
+        number[seen] = distinct_rows(place)[1]  # as the log numbers its voxels
         key = number[self.spots.spot] * max(len(self.spots.views), 1) + self.spots.view
         order = np.argsort(key, kind="stable")
         first = np.flatnonzero(np.diff(key[order], prepend=-1))
@@ -202,6 +218,11 @@ class FeatureObservations:
             following = int(np.searchsorted(bounds, cuts[-1], side="right"))
             cuts.append(int(bounds[max(last, following)]))
         return [slice(a, b) for a, b in itertools.pairwise(cuts)]
+
+    def within(self, share: int) -> FeatureObservations:
+        """Return the answers for the spots of a smaller share of the coarse cells."""
+        kept = self.spots.drawn[self.spots.spot] < share
+        return dataclasses.replace(self, spots=self.spots.within(share), vectors=self.vectors[kept])
 
     def only(self, answers: Mask) -> FeatureObservations:
         """Return some of the answers (a,)."""

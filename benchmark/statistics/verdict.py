@@ -73,6 +73,7 @@ ACTED_ON, LEAST_FLIPS = ("stable", "usable"), 0.001
 
 NO_SPOTS = "no spots were sampled; give the observations of a `Sampler`"
 TOO_FEW_VOXELS = "its map has too few locations to act on; use smaller voxels, or frames that overlap more"
+FEATURES_ALONE = "it gives features and no labels; VSS, SBD, entropy, flicker and classes have no number"
 EMPTY = "no spot was sampled: no pixel has both depth and a label that counts; see exclude, masks and the depth range"
 STILL = "all frames show one view: the camera stood still, or moved by less than a sampled pixel shows (pixel_stride)"
 
@@ -123,6 +124,7 @@ def verdict(
     voxels: int,
     share: float,
     limits: Limits = LIMITS,
+    labels: bool = True,
 ) -> StabilityVerdict:
     """Return the most probable level of alpha, and the level if what the model leaves out counts as disagreeing.
 
@@ -137,9 +139,10 @@ def verdict(
         voxels: Voxels with OP >= 2.
         share: Their share of all voxels.
         limits: Limits of the levels.
+        labels: Whether the model gives labels; without them there is no verdict.
     """
     support = f"{voxels} locations seen twice or more, {share:.0%} of the map"
-    if reason := _missing(spots, voxels):
+    if reason := _missing(spots, voxels) if labels else FEATURES_ALONE:
         return StabilityVerdict("no verdict", math.nan, f"{model}: no verdict, {reason}; {support}")
     assert spots is not None
     level, probability = _level(headline, spots, limits)

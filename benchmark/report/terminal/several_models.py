@@ -42,6 +42,8 @@ def row_of(record: Record, begin: str = "") -> list[str]:
     if statistics is not None:
         level, alpha = str(statistics.verdict), statistics.headline.alpha.text()
         agree = 100 * statistics.agreeing
+        if statistics.features is not None and statistics.features.alone:
+            level, alpha, agree = "features", "-", math.nan
     recurrent = run.table.recurrent
     means = {m: recurrent[m] if recurrent.voxels >= ENOUGH else math.nan for m in headlines()}
     shown = [short(value, digits=m.digits[0]) for m, value in means.items()]
@@ -90,7 +92,8 @@ def several_models(result: Result, records: Sequence[Record], width: int) -> Ite
         ranges = "" if statistics.told_ranges is None else statistics.told_ranges.text
         merged = "" if statistics.groupings is None else statistics.groupings.text
         meaning = statistics.spots.meaning if statistics.spots is not None else None
-        texts = (statistics.verdict.difference, ranges, merged, "" if meaning is None else meaning.text)
+        features = "" if statistics.features is None else statistics.features.text
+        texts = (statistics.verdict.difference, ranges, merged, "" if meaning is None else meaning.text, features)
         for text in filter(None, texts):
             yield from wrapped(f"{record.unit.model}: {text}")
     yield ""
