@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 
 from semstab.config import Config, Exclusion, Part, Perturbation, as_range, nearest
-from semstab.core.types import Mask
+from semstab.core.types import Float64, Mask
 from semstab.data.distances import distances_of
 from semstab.data.features import OF_FEATURES
 from semstab.data.frames import Frame
@@ -54,6 +54,14 @@ class Task:
     def digest(self) -> str:
         """Return a hash of the input behind it."""
         return self.scene.digest([*self.indices], self.model)
+
+
+def class_distances(task: Task, config: Config) -> Float64 | None:
+    """Return distances (K, K) between the classes of a run: those of the settings, else of the model's own names."""
+    target = task.mapping.target
+    given = distances_of(target, config.distances)
+    own = task.scene.label_space(task.model)
+    return task.scene.distances(task.model) if given is None and own == target else given
 
 
 def open_scenes(config: Config, run_folder: Path | None = None, *, posed: bool = True) -> dict[str, Scene]:

@@ -117,9 +117,9 @@ def _unit(vectors: npt.NDArray[Any]) -> npt.NDArray[np.floating[Any]]:
     if not (length > 0).all():
         row, column = np.argwhere(~(length > 0))[0]
         raise DataError(f"features: the vector of cell ({column}, {row}) has no length")
-    half, unit = vectors.dtype == np.float16, vectors
+    half = vectors.dtype == np.float16
     if np.abs(length - 1).max() > (_UNIT if half else 1e-6):
-        unit = single / length[..., None].astype(np.float32)
-    unit = unit.astype(np.float16 if half else np.float32, copy=False).view()
+        single = single / length[..., None].astype(np.float32)
+    unit: npt.NDArray[np.floating[Any]] = single.astype(np.float16) if half else single.view()
     unit.setflags(write=False)
     return unit

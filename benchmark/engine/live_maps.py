@@ -20,7 +20,6 @@ from semstab.core.background import Background
 from semstab.core.prefetch import Fetched
 from semstab.core.process import Stopwatch
 from semstab.core.types import Float64, Int32
-from semstab.data.distances import distances_of
 from semstab.data.features import OF_FEATURES
 from semstab.data.frames import Frame
 from semstab.data.results import FrameReport, UnitName
@@ -38,7 +37,7 @@ from semstab.pixels.scans import pictured
 from semstab.statistics import Sampler
 from semstab.statistics.feature_spots import FeatureObservations
 from semstab.statistics.observations import SpotObservations
-from semstab.task import Task, prepare, truth_task
+from semstab.task import Task, class_distances, prepare, truth_task
 
 WARM_UP_STRIDE = 8
 """A backend is warmed up with every n-th pixel of each axis of the first frame."""
@@ -180,7 +179,7 @@ class LiveMap:
         if self.sampler is None:
             return None
         space = self.task.mapping.target
-        sample = self.sampler.sample(space.classes, distances_of(space, self.config.distances))
+        sample = self.sampler.sample(space.classes, class_distances(self.task, self.config))
         return sample.without(self.left_out)
 
     def sampled_features(self) -> FeatureObservations | None:

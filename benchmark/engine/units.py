@@ -26,7 +26,6 @@ from semstab.config import (
     Sweeps,
 )
 from semstab.core.code import Code, is_code
-from semstab.data.distances import distances_of
 from semstab.data.features import OF_FEATURES
 from semstab.data.labels import LabelSpace
 from semstab.data.measures import measures
@@ -35,7 +34,7 @@ from semstab.data.results import UnitName
 from semstab.data.statistics import CONFIDENCE
 from semstab.datasets import GROUND_TRUTH, Scene
 from semstab.errors import ConfigError, DataError
-from semstab.task import Task, applies, frame_indices, open_scenes, selected, tasks_of, truth_task
+from semstab.task import Task, applies, class_distances, frame_indices, open_scenes, selected, tasks_of, truth_task
 
 logger = logging.getLogger("semstab")
 
@@ -375,7 +374,7 @@ def identity(config: Config, task: Task) -> str:
         "frames": [*task.indices],
         "taxonomy": [mapping.target.name, mapping.target.classes, mapping.source.ids, mapping.rows],
     }
-    if (distances := distances_of(mapping.target, config.distances)) is not None:
+    if (distances := class_distances(task, config)) is not None:
         content["distances"] = distances.tolist()
     truth = truth_task(task) if config.truth else None
     compared = {} if truth is None else {"truth": truth.mapping.rows}

@@ -73,13 +73,14 @@ class Sequence:
         classes: The number of classes by the largest label, or by the scores.
         timestamps: (n,) seconds, where all frames have one and they ascend.
         of_scans: Whether one of them is a scan.
-        of_features: Whether all of them have features and no labels, which are of class 0 then.
+        has_features: Whether all of them have features.
+        of_features: Whether they have no labels, too, which are of class 0 then.
     """
 
     def __init__(self, frames: Iterable[Frame | Mapping[str, Any]]) -> None:
         self._folder = ScratchFolder()
         self.count, self.classes, self.of_scans = 0, 0, False
-        self.of_features = True
+        self.of_features = self.has_features = True
         self.has_truth, times, digest = True, list[float | None](), hashlib.blake2b(digest_size=16)
         for given in frames:
             frame, truth = as_frame(given, self.count)
@@ -91,6 +92,7 @@ class Sequence:
             if frame.features is not None:
                 digest.update(np.ascontiguousarray(frame.features.vectors).data)
                 digest.update(repr((frame.features.first, frame.features.step)).encode())
+            self.has_features = self.has_features and frame.features is not None
             self.of_features = self.of_features and frame.features is not None and _classes(frame) <= 1
             digest.update(repr((frame.intrinsics, frame.timestamp)).encode())
             self.classes = max(self.classes, _classes(frame), 0 if truth is None else _classes(truth))
@@ -168,6 +170,7 @@ class FramesScene(Scene):
         self._sequence = sequence
         self.name, self.models, self.ground_truth = options.scene, (options.model,), sequence.has_truth
         self.of_scans = sequence.of_scans
+        self.with_features = (options.model,) if sequence.has_features else ()
         classes = options.classes or tuple(f"class {k}" for k in range(max(2, sequence.classes)))
         if sequence.of_features:
             self._space = OF_FEATURES

@@ -208,6 +208,10 @@ class PredictedScene(Scene):
         self._dataset = dataset
         self._producers: dict[str, Producer] = {}
         self._digests: dict[int, bytes] = {}
+        self.with_features = tuple(
+            name for name, each in dataset.predictors.items()
+            if each.model != STORED and not each.filters and dataset.model(name).gives_features
+        )  # fmt: skip
 
     def __len__(self) -> int:
         """Return the number of frames."""

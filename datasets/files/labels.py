@@ -298,6 +298,7 @@ class LabelMaps:
             for name, filled in matching_folders(base, template, "model", scene=entry.below_root).items()
         }
         self._features = {name: source for name, source in features.items() if source.first is not None}
+        self.with_features = tuple(self._features)
         labels |= {name: source for name, source in self._features.items() if name not in (*labels, *regions)}
         self.models = tuple(name for name in labels if name != GROUND_TRUTH)
         self.ground_truth = GROUND_TRUTH in labels

@@ -106,6 +106,7 @@ class FileScene(Scene):
         self._folders = folders or Folders()
         self._maps = LabelMaps(options, entry, frames, self._folders, label_folders or {}, truth)
         self.models = self._maps.models
+        self.with_features = self._maps.with_features
         self.ground_truth = self._maps.ground_truth
         self.regions = self._maps.regions
         self.unread = self._maps.unread

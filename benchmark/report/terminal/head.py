@@ -22,8 +22,8 @@ def head_lines(name: str, result: Result, runs: Sequence[UnitSummary], width: in
     views = min((each.views for each in spots if each is not None and each.views < each.frames), default=None)
     seen = "" if views is None else f" of {views} distinct views"
     chosen = " (chosen)" if any(advice.chosen for advice in result.advice.values()) else ""
-    classes = " and ".join(map(str, sorted({run.table.K for run in runs})))
-    of = "features" if all(run.taxonomy == OF_FEATURES.name for run in runs) else f"{classes} classes"
+    numbers = {run.table.K for run in runs if run.taxonomy != OF_FEATURES.name}
+    of = f"{' and '.join(map(str, sorted(numbers)))} classes" if numbers else "features"
     what = f"{counts} frames{seen}, {of}, {_metres(first.table.voxel_size)} voxels{chosen}"
     beside = "    ".join(filter(None, (_geometry(result), _scope(runs))))
     line = f"{name}    {what}    {beside}".rstrip()
