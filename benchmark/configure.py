@@ -199,7 +199,8 @@ def with_vocabularies(config: Config, files: Sequence[Path]) -> Config:
     options = {"dataset": config.dataset.model_dump(mode="json"), "vocabularies": [str(file) for file in files]}
     models = config.models
     if models is not None:
-        models = [*models, *(f"{model}@{name}" for model in models for name in vocabularies if model != GROUND_TRUTH)]
+        over = [(model, name) for model in models for name, own in vocabularies.items() if own.is_for(model)]
+        models = [*models, *(f"{model}@{name}" for model, name in over if model != GROUND_TRUTH)]
     dataset = DatasetConfig(name=VOCABULARIES, options=options)
     return config.model_copy(update={"dataset": dataset, "models": models})
 

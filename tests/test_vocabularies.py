@@ -184,3 +184,25 @@ def test_two_vocabularies_have_two_names(tmp_path):
         named([one, other])
     with pytest.raises((ConfigError, DataError)):
         named([tmp_path / "none.yaml"])
+
+
+def test_a_text_encoder_makes_embeddings(tmp_path):
+    torch = pytest.importorskip("torch")
+    from model_folders import tiny
+    from transformers import AutoTokenizer, CLIPModel
+
+    path = tmp_path / "words.yaml"
+    encoder = {"checkpoint": str(tiny("clip")), "templates": ["a {}.", "a photo of a {}."]}
+    names = ["road", {"name": "tree", "synonyms": ["bush"]}]
+    path.write_text(yaml.safe_dump({"names": names, "encoder": encoder}))
+    words = Vocabulary.load(path)
+    clip, tokenizer = CLIPModel.from_pretrained(tiny("clip")).eval(), AutoTokenizer.from_pretrained(tiny("clip"))
+    for row, word in zip(words.embeddings, ("road", "tree", "bush"), strict=True):
+        with torch.inference_mode():
+            parts = []
+            for sentence in (f"a {word}.", f"a photo of a {word}."):
+                found = clip.get_text_features(**tokenizer([sentence], return_tensors="pt")).pooler_output[0]
+                parts.append(found / found.norm())
+            mean = torch.stack(parts).mean(dim=0)
+        assert row == pytest.approx((mean / mean.norm()).numpy(), abs=1e-5)
+    assert words.of.tolist() == [0, 1, 1]

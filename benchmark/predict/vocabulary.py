@@ -60,6 +60,7 @@ class VocabularySettings(Settings):
     encoder: EncoderSettings | None = Field(None, description="a text encoder that makes the embeddings")
     normalise: bool = Field(True, description="bring embeddings to unit length; false for a classifier's weights")
     threshold: float | None = Field(None, description="cosine below which a cell has no label; none by default")
+    models: list[str] | None = Field(None, description="models whose features it is for; all by default")
 
     @field_validator("names", mode="before")
     @classmethod
@@ -89,6 +90,7 @@ class Vocabulary:
         of: (n,) the class of each of them.
         threshold: Product of embedding and feature below which a cell has no label; None for none.
         where: Its file, for messages.
+        models: Models whose features it is for; None for all.
     """
 
     space: LabelSpace
@@ -96,6 +98,7 @@ class Vocabulary:
     of: Int64
     threshold: float | None
     where: str
+    models: tuple[str, ...] | None = None
 
     @classmethod
     def load(cls, path: Path) -> Vocabulary:
@@ -129,7 +132,12 @@ class Vocabulary:
             raise DataError(f"{path}: the embedding of '{word}' has no length or is not finite")
         if settings.normalise:
             embeddings = (embeddings / length[:, None]).astype(np.float32)
-        return cls(space, embeddings, of.astype(np.int64), settings.threshold, str(path))
+        models = None if settings.models is None else tuple(settings.models)
+        return cls(space, embeddings, of.astype(np.int64), settings.threshold, str(path), models)
+
+    def is_for(self, model: str) -> bool:
+        """Return whether it is for the features of a model."""
+        return self.models is None or model in self.models
 
     @functools.cached_property
     def digest(self) -> str:

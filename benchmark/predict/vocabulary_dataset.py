@@ -84,6 +84,7 @@ class VocabularyScene(Scene):
             f"{model}@{name}": (model, vocabulary)
             for model in inner.with_features
             for name, vocabulary in vocabularies.items()
+            if vocabulary.is_for(model)
         }
         if not self._sources:
             raise ConfigError(
