@@ -15,7 +15,7 @@ from simulated_events import grid, spots_at
 
 import semstab
 from semstab.core.files import write_image
-from semstab.data.features import Features
+from semstab.data.features import FeatureColours, Features
 from semstab.errors import DataError
 from semstab.online.metric import TemporalStability
 from semstab.statistics import Sampler
@@ -439,3 +439,34 @@ def test_a_network_that_says_that_it_has_features_gives_them(tmp_path):
     (tmp_path / "net.py").write_text(text)
     error = error_of("room", "--voxel-size", "0.2", "-o", "run", "--predict", "net.py:net", cwd=tmp_path)
     assert "gives_features = True let it give a dict with features and labels" in error
+
+
+def test_features_alone_are_not_compared_as_labels(tmp_path):
+    written(tmp_path / "room", clip=coarse)
+    bench("room", "--voxel-size", "0.2", "-o", "run", "--model", "clip", cwd=tmp_path)
+    line = error_of("compare", "run", "run", cwd=tmp_path)
+    assert "clip gives features and no labels, and what is compared is of labels" in line
+    assert "clip gives features" in error_of("gate", "run", "--rule", "alpha > .8", cwd=tmp_path)
+
+
+def test_tiles_have_the_features_of_the_whole_map(tmp_path):
+    written(tmp_path / "room", clip=coarse)
+    words = "run", "room", "--voxel-size", "0.1", "--model", "clip", "--rerun", "off"
+    bench(*words, "-o", "whole", cwd=tmp_path)
+    bench(*words, "-o", "tiles", "--tile-size", "16", cwd=tmp_path)
+    whole, tiles = (semstab.load_result(tmp_path / name).record().statistics for name in ("whole", "tiles"))
+    assert whole.features == tiles.features
+
+
+def test_colours_tell_features_apart():
+    rng = np.random.default_rng(0)
+    cells = np.eye(6)[rng.integers(0, 3, (20, 20))] + 0.01 * rng.normal(size=(20, 20, 6))
+    features = Features.over(cells, (40, 40))
+    colours = FeatureColours.of(features)(features).astype(int)
+    assert colours.shape == (20, 20, 3)
+    kind = cells.argmax(axis=2)
+    means = np.array([colours[kind == k].mean(axis=0) for k in range(3)])
+    apart = np.linalg.norm(means[:, None] - means[None], axis=2)[~np.eye(3, dtype=bool)]
+    assert apart.min() > 80
+    two = Features.over(cells[..., :2] + 0.1, (40, 40))
+    assert FeatureColours.of(two)(two).shape == (20, 20, 3)

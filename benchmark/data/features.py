@@ -99,6 +99,41 @@ class Features:
         return shown
 
 
+@dataclass(frozen=True, eq=False)
+class FeatureColours:
+    """Features as colours: their first three principal components, as they are in one frame, are red, green and blue.
+
+    Attributes:
+        mean: (D,) mean vector.
+        axes: (D, 3) principal components, the third 0 of features with two.
+        low, high: (3,) their 1st and 99th percentiles, which are black and full colour.
+    """
+
+    mean: npt.NDArray[np.float32]
+    axes: npt.NDArray[np.float32]
+    low: npt.NDArray[np.float32]
+    high: npt.NDArray[np.float32]
+
+    @classmethod
+    def of(cls, features: Features) -> FeatureColours:
+        """Return the colours by which a frame's features differ most."""
+        vectors = features.vectors.reshape(-1, features.D).astype(np.float32)
+        mean = vectors.mean(axis=0)
+        _, axes = np.linalg.eigh(np.cov(vectors - mean, rowvar=False))
+        axes = np.column_stack([axes[:, ::-1][:, :3], np.zeros((features.D, 3))])[:, :3].astype(np.float32)
+        low, high = np.percentile((vectors - mean) @ axes, [1, 99], axis=0).astype(np.float32)
+        return cls(mean, axes, low, np.maximum(high, low + np.float32(1e-6)))
+
+    def fit(self, features: Features) -> bool:
+        """Return whether features have the number of components that these colours are of."""
+        return len(self.mean) == features.D
+
+    def __call__(self, features: Features) -> npt.NDArray[np.uint8]:
+        """Return colours (h, w, 3) of the cells."""
+        parts = (features.vectors.astype(np.float32) - self.mean) @ self.axes
+        return np.asarray(255 * np.clip((parts - self.low) / (self.high - self.low), 0, 1), np.uint8)
+
+
 _UNIT = 2e-3
 """Largest difference of a length from 1 in half precision for vectors that are taken as they are."""
 
