@@ -19,7 +19,7 @@ from semstab.data.georeference import Georeference
 from semstab.data.measures import SBD, VSS, dominant, headlines, measures
 from semstab.data.records import OVERVIEW, Failure, Record, Result
 from semstab.data.results import slug
-from semstab.data.statistics import CONFIDENCE, Estimate, MapStatistics, short
+from semstab.data.statistics import CONFIDENCE, Correlogram, Estimate, MapStatistics, short
 from semstab.data.topdown import EMPTY
 from semstab.metrics import CATEGORIES, CATEGORY_COLORS, NOT_ASSESSED, categories, macro_mean
 from semstab.metrics.image_space import mean_over_scenes
@@ -381,16 +381,19 @@ def _groupings(records: Sequence[Record]) -> Iterator[dict[str, str]]:
 
 def _distance(records: Sequence[Record], colors: Mapping[str, int]) -> Iterator[dict[str, str]]:
     """Yield charts of agreement by the distance of two observations."""
-    of_labels = [(record, record.statistics and record.statistics.correlogram) for record in records]
-    found = [(record, record.statistics and record.statistics.features) for record in records]
-    of_features = [(record, own and own.correlogram) for record, own in found]
+    kinds: dict[str, list[tuple[Record, Correlogram | None]]] = {"": [], ", features": []}
+    for record in records:
+        statistics = record.statistics
+        features = None if statistics is None else statistics.features
+        kinds[""].append((record, None if statistics is None else statistics.correlogram))
+        kinds[", features"].append((record, None if features is None else features.correlogram))
     for (axis, title, unit), (of, correlograms) in itertools.product(
         (
             ("time", "In time", "frames apart"),
             ("angle", "In angle", "degrees between the views"),
             ("baseline", "In space", "metres between the cameras"),
         ),
-        (("", of_labels), (", features", of_features)),
+        kinds.items(),
     ):
         lines = []
         for record, correlogram in correlograms:

@@ -5,9 +5,9 @@ from __future__ import annotations
 from collections.abc import Iterator
 
 from semstab.data.records import Record, Result
-from semstab.data.statistics import FeatureAgreement
+from semstab.data.statistics import FeatureAgreement, FeaturePlace
 from semstab.report.tables.statistics import INTERVALS, SCENE, assessed_records
-from semstab.report.tables.table import Column, Group, Table
+from semstab.report.tables.table import Column, Group, Row, Table
 from semstab.statistics.agreement import ALPHA
 
 
@@ -49,14 +49,7 @@ def feature_places(result: Result) -> list[Table]:
     """Return the places where features of two views differ most."""
     groups = []
     for name, rows in _with_features(result):
-        places = tuple(
-            (
-                record.unit.scene, *(f"{x:.2f}" for x in place.centre), place.spots, place.cosine, 100 * place.share,
-                ", ".join(map(str, place.frames)),
-            )
-            for record, own in rows
-            for place in own.places
-        )  # fmt: skip
+        places = tuple(_row(record, place) for record, own in rows for place in own.places)
         groups += [Group(name, places)] if places else []
     if not groups:
         return []
@@ -71,3 +64,10 @@ def feature_places(result: Result) -> list[Table]:
         " the frames that see most of it."
     )
     return [Table("feature_places", "Worst places of features", caption, columns, tuple(groups))]
+
+
+def _row(record: Record, place: FeaturePlace) -> Row:
+    """Return a row of `feature_places`."""
+    x, y, z = (f"{value:.2f}" for value in place.centre)
+    frames = ", ".join(map(str, place.frames))
+    return record.unit.scene, x, y, z, place.spots, place.cosine, 100 * place.share, frames
