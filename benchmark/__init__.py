@@ -12,6 +12,7 @@ if TYPE_CHECKING:
     from semstab.config import Config
     from semstab.configure import load_config, load_study
     from semstab.data.events import Events
+    from semstab.data.features import Features
     from semstab.data.frames import Frame, Intrinsics
     from semstab.data.labels import LabelSpace
     from semstab.data.records import Result
@@ -36,6 +37,7 @@ __all__ = [
     "ConfigError",
     "DataError",
     "Events",
+    "Features",
     "Frame",
     "FusedResult",
     "GateConfig",
@@ -68,7 +70,8 @@ __all__ = [
 
 _HOMES = {
     "AcceptanceThresholds": "statistics.acceptance", "Belief": "exports.fused_labels", "Config": "config",
-    "ConfigError": "errors", "DataError": "errors", "Events": "data.events", "Frame": "data.frames",
+    "ConfigError": "errors", "DataError": "errors", "Events": "data.events", "Features": "data.features",
+    "Frame": "data.frames",
     "GateConfig": "gating.gate", "Intrinsics": "data.frames", "LabelSpace": "data.labels",
     "MissingDependencyError": "errors", "Result": "data.records", "SemstabError": "errors", "VoxelTable": "data.voxels",
     "FusedResult": "online", "TemporalStability": "online", "compare": "compare_runs", "compare_maps": "other_maps",

@@ -8,7 +8,7 @@ from collections.abc import Collection, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from semstab.config import Config, merge, nearest, read_yaml, validated
+from semstab.config import Config, DatasetConfig, merge, nearest, read_yaml, validated
 from semstab.config.groups import in_full
 from semstab.core.code import only_named, require_named
 from semstab.datasets import GROUND_TRUTH, open_dataset, resolved
@@ -17,6 +17,8 @@ from semstab.predict.dataset import NAME as PREDICTED
 from semstab.predict.filters import parse
 from semstab.predict.predictor import NAME as STORED
 from semstab.predict.predictor import PredictorConfig, StoredSequence
+from semstab.predict.vocabulary import named
+from semstab.predict.vocabulary_dataset import NAME as VOCABULARIES
 
 
 def load_config(
@@ -173,11 +175,34 @@ def resolve(config: Config) -> Config:
 
     Sequential models that predict in a run are shown the frames that it selects.
     """
-    dataset = config.dataset
+    return config.model_copy(update={"dataset": resolved(_shown_frames(config, config.dataset))})
+
+
+def _shown_frames(config: Config, dataset: DatasetConfig) -> DatasetConfig:
+    """Return a dataset whose sequential models are shown the frames of the configuration."""
+    more: dict[str, Any] = {}
     if dataset.name == PREDICTED:
-        shown = config.model_dump(mode="json", include={"frames", "scene_frames"})
-        dataset = dataset.model_copy(update={"options": {**dataset.options, **shown}})
-    return config.model_copy(update={"dataset": resolved(dataset)})
+        more = config.model_dump(mode="json", include={"frames", "scene_frames"})
+    if dataset.name == VOCABULARIES:
+        inner = validated(DatasetConfig, dataset.options["dataset"])
+        more = {"dataset": _shown_frames(config, inner).model_dump(mode="json")}
+    return dataset.model_copy(update={"options": {**dataset.options, **more}})
+
+
+def with_vocabularies(config: Config, files: Sequence[Path]) -> Config:
+    """Return the configuration with labels that vocabularies give to the features of its models.
+
+    Raises:
+        ConfigError: If a file is no vocabulary.
+    """
+    vocabularies = named([*files])
+    options = {"dataset": config.dataset.model_dump(mode="json"), "vocabularies": [str(file) for file in files]}
+    models = config.models
+    if models is not None:
+        over = [(model, name) for model in models for name, own in vocabularies.items() if own.is_for(model)]
+        models = [*models, *(f"{model}@{name}" for model, name in over if model != GROUND_TRUTH)]
+    dataset = DatasetConfig(name=VOCABULARIES, options=options)
+    return config.model_copy(update={"dataset": dataset, "models": models})
 
 
 def _of_file(path: str | Path | None) -> dict[str, Any]:

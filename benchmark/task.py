@@ -11,8 +11,9 @@ from pathlib import Path
 import numpy as np
 
 from semstab.config import Config, Exclusion, Part, Perturbation, as_range, nearest
-from semstab.core.types import Mask
+from semstab.core.types import Float64, Mask
 from semstab.data.distances import distances_of
+from semstab.data.features import OF_FEATURES
 from semstab.data.frames import Frame
 from semstab.data.labels import LabelMapping, LabelSpace
 from semstab.data.results import UnitName
@@ -53,6 +54,14 @@ class Task:
     def digest(self) -> str:
         """Return a hash of the input behind it."""
         return self.scene.digest([*self.indices], self.model)
+
+
+def class_distances(task: Task, config: Config) -> Float64 | None:
+    """Return distances (K, K) between the classes of a run: those of the settings, else of the model's own names."""
+    target = task.mapping.target
+    given = distances_of(target, config.distances)
+    own = task.scene.label_space(task.model)
+    return task.scene.distances(task.model) if given is None and own == target else given
 
 
 def open_scenes(config: Config, run_folder: Path | None = None, *, posed: bool = True) -> dict[str, Scene]:
@@ -100,7 +109,8 @@ def tasks_of(scene: Scene, config: Config, others: Sequence[str] = ()) -> Iterat
     indices = as_range(frames.indices)
     for model in names:
         source = scene.label_space(model)
-        target = source if config.taxonomy is None else LabelSpace.load(config.taxonomy)
+        keeps = config.taxonomy is None or source == OF_FEATURES  # which has no classes to map
+        target = source if keeps else LabelSpace.load(str(config.taxonomy))
         mapping = source.mapping_to(target)
         distances_of(target, config.distances)  # a file that cannot be used is named before any frame is read
         predicted = [*dict.fromkeys((*source.classes, *target.classes))]

@@ -40,6 +40,10 @@ REGISTRY = Registry(
             "semstab.predict.dataset:PredictedDataset",
             "another dataset with labels that models make while it is fused: `run --predict`",
         ),
+        "vocabularies": Entry(
+            "semstab.predict.vocabulary_dataset:VocabularyDataset",
+            "another dataset with labels that vocabularies give to its features: `run --vocabulary`",
+        ),
         "frames": Entry("semstab.online.frames:Frames", "frames that a Python program gives to `semstab.fuse`"),
         "city": Entry(
             "semstab.datasets.city:City",

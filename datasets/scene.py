@@ -76,6 +76,7 @@ class Scene(ABC):
         replaced: Label sources in its files that predictions stand for, and that are not read.
         unread: The images in a folder of label maps of which none is read, and what reads them; None if there are none.
         in_program: Whether its frames are those of a program, and not in files.
+        with_features: Models whose frames have features.
         usual: Values of options that the format's own data have where nothing is said, as they are typed.
     """
 
@@ -103,6 +104,7 @@ class Scene(ABC):
     posed: bool = True
     replaced: Sequence[str] = ()
     in_program: bool = False
+    with_features: tuple[str, ...] = ()
     usual: Mapping[str, str] = MappingProxyType({})
 
     @abstractmethod
@@ -138,6 +140,10 @@ class Scene(ABC):
             f"depth of {name}": fingerprint(frame.depth.tobytes()),
             f"pose of {name}": view_fingerprint(frame.T_wc, frame.intrinsics, frame.shape),
         }
+
+    def distances(self, model: str) -> Float64 | None:
+        """Return distances (K, K) between the classes of a model, by their meaning; None if there are none."""
+        return None
 
     @property
     def by_name(self) -> tuple[str, ...]:

@@ -96,10 +96,12 @@ class Prediction:
         labels: (H, W) uint8 or uint16: ids of its label space, 255 (65535) where it has no prediction; of a model
             without classes, region ids from 1, `UNASSIGNED` where there is no region.
         scores: (H, W, K) float32 that sum to 1 over the classes, or None where only labels are wanted.
+        features: (h, w, D) float16 or float32 of a grid that covers the image evenly, of a model that gives features.
     """
 
     labels: Labels
     scores: Float32 | None = None
+    features: npt.NDArray[np.floating[Any]] | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -109,10 +111,12 @@ class Streamed:
     Attributes:
         labels: Those of a `Prediction`.
         maps: A function that gives the scores (H, W) float32 of each class in order, anew at each call.
+        features: Those of a `Prediction`.
     """
 
     labels: Labels
     maps: Callable[[], Iterator[Float32]]
+    features: npt.NDArray[np.floating[Any]] | None = None
 
 
 class Model(Protocol):
@@ -126,6 +130,8 @@ class Model(Protocol):
             a sequence in order, all of them, from the first one after `reset`.
         wants_geometry: Whether `predict` is also given `geometry=`, one `Frame` an image: its depth, intrinsics and
             pose at the image's own pixels, depth 0 where it is not known; labels are all 0, there is no colour.
+        gives_features: Whether its predictions have features; without labels its label space is
+            `semstab.data.features.OF_FEATURES`, and all labels are 0.
         streams: Whether `stream` needs less memory than `predict`: it is called where scores are many.
     """
 
@@ -134,6 +140,7 @@ class Model(Protocol):
     fit_frames: int = 0
     sequential: bool = False
     wants_geometry: bool = False
+    gives_features: bool = False
     streams: bool = False
 
     def fit(self, images: Sequence[Image]) -> Model:
@@ -170,7 +177,8 @@ class Model(Protocol):
 def streamed(prediction: Prediction) -> Streamed:
     """Return a prediction whose scores, where it has any, are handed out class by class."""
     scores = prediction.scores
-    return Streamed(prediction.labels, lambda: iter(() if scores is None else np.moveaxis(scores, 2, 0)))
+    maps = lambda: iter(() if scores is None else np.moveaxis(scores, 2, 0))  # noqa: E731
+    return Streamed(prediction.labels, maps, prediction.features)
 
 
 def ask(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import reprlib
 import sys
 from collections.abc import Callable, Mapping, Sequence
 from functools import partial
@@ -13,6 +14,7 @@ import numpy.typing as npt
 from pydantic import BaseModel, ConfigDict, Field
 
 from semstab.core.code import Code, guarded
+from semstab.data.features import OF_FEATURES
 from semstab.data.frames import Frame
 from semstab.data.labels import IGNORE_8BIT, IGNORE_16BIT, LabelSpace
 from semstab.errors import ConfigError, DataError
@@ -87,7 +89,8 @@ class OwnModel(Model):
     It gives labels (H, W), whole numbers in the order of its classes, 255 (of more than 255 classes 65535) or less than
     0 where it has no prediction; or scores (H, W, K) that sum to 1. A tensor is as good as an array. It may say
     `classes`, `gives_scores`, `sequential` (then it has `reset`) and `wants_geometry` (then it is called with image and
-    frame).
+    frame). With `gives_features = True` it gives a mapping with `features` (h, w, D), float, and labels or scores;
+    without classes it gives features alone, as a mapping or an array.
     """
 
     def __init__(self, code: Code, given: OwnOptions) -> None:
@@ -103,7 +106,9 @@ class OwnModel(Model):
         if not callable(self._call):
             raise ConfigError(f"{code.text}: has no method predict(image), and cannot be called with an image")
         self._made = made
-        self.label_space = _label_space(code, made, given.classes)
+        stated = getattr(made, "gives_features", getattr(code.module, "gives_features", False))
+        self.gives_features = bool(stated)
+        self.label_space = _label_space(code, made, given.classes, alone=self.gives_features)
         self.gives_scores = bool(getattr(made, "gives_scores", True))
         self.sequential = bool(getattr(made, "sequential", False))
         self.wants_geometry = bool(getattr(made, "wants_geometry", False))
@@ -136,21 +141,38 @@ class OwnModel(Model):
 
     def _predict(self, image: Image, frame: Sequence[Any], scores: bool) -> Prediction:
         image = image if image.flags.writeable else image.copy()  # torch warns of arrays that cannot be written to
-        output = guarded(self._code.text, lambda: _array(self._call(image, *frame)))
-        shape, K = image.shape[:2], len(self.label_space or ())
+        answer = guarded(self._code.text, lambda: self._call(image, *frame))
+        features, shape, K = None, image.shape[:2], len(self.label_space or ())
+        if self.gives_features:
+            answer, features = self._split(answer, shape)
+        output = guarded(self._code.text, lambda: _array(answer))
         if output.shape == shape and output.dtype.kind in "iu":
             if scores:
                 raise DataError(
                     f"{self._code.text}: gives labels, no scores; leave scores out, or let it give (H, W, K)"
                 )
-            return Prediction(_ids(output, K, self._code.text))
+            return Prediction(_ids(output, K, self._code.text), None, features)
         if output.shape == (*shape, K) and output.dtype.kind == "f":
             soft = output if output.dtype == np.float16 else output.astype(np.float32, copy=False)
-            return Prediction(_ids(soft.argmax(axis=2), K, self._code.text), soft if scores else None)
+            return Prediction(_ids(soft.argmax(axis=2), K, self._code.text), soft if scores else None, features)
         raise DataError(
             f"{self._code.text}: gave {output.dtype} of shape {output.shape} for an image of {shape}; give labels"
             f" {shape} of whole numbers, or scores {(*shape, K)}"
         )
+
+    def _split(self, answer: Any, shape: tuple[int, ...]) -> tuple[Any, npt.NDArray[Any]]:
+        """Return labels or scores, and the features of an answer; all labels are 0 if it has features alone."""
+        alone = self.label_space == OF_FEATURES
+        given = answer if isinstance(answer, Mapping) else {"features": answer} if alone else {}
+        features = given.get("features")
+        labels = given.get("scores", given.get("labels"))
+        if features is None or (labels is None) != alone:
+            wanted = "features" if alone else "features and labels, or features and scores"
+            raise DataError(
+                f"{self._code.text}: gave {reprlib.repr(sorted(given)) if given else type(answer).__name__}; with"
+                f" gives_features = True let it give a dict with {wanted}"
+            )
+        return np.zeros(shape, np.uint8) if alone else labels, _array(features)
 
 
 def contents(options: Mapping[str, Any]) -> dict[str, Any]:
@@ -183,7 +205,8 @@ def _ids(labels: npt.NDArray[Any], classes: int, who: str) -> Labels:
     return narrowed(np.where(labels < 0, ignore, labels), classes)
 
 
-def _label_space(code: Code, made: Any, classes: Sequence[str] | str | None) -> LabelSpace:
+def _label_space(code: Code, made: Any, classes: Sequence[str] | str | None, *, alone: bool = False) -> LabelSpace:
+    """Return the classes that are stated; those of a model that gives features `alone` if none are."""
     names = class_names(classes) if classes is not None else None
     for owner in (made, code.module):
         for attribute in ("label_space", "classes", "names", "CLASSES"):
@@ -192,6 +215,8 @@ def _label_space(code: Code, made: Any, classes: Sequence[str] | str | None) -> 
         return names
     if isinstance(names, Mapping):  # from ids, as Ultralytics has it
         names = [names[k] for k in sorted(names)]
+    if names is None and alone:
+        return OF_FEATURES
     if names is None or isinstance(names, str) or not all(isinstance(name, str) for name in names):
         hint = "give it classes = [...], or name them with --classes a,b,c"
         raise ConfigError(f"{code.text}: its classes are not known; {hint}")

@@ -128,7 +128,7 @@ class InTaxonomy(Wrapped):
                     self._mapping.scores(each.scores.astype(np.float32, copy=False), "prediction"), dtype=np.float32
                 )
                 mapped[labels == ignore_id(labels)] = 0
-            predictions.append(Prediction(labels, mapped))
+            predictions.append(Prediction(labels, mapped, each.features))
         return predictions
 
     def stream(self, image: Image) -> Streamed:

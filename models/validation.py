@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import copy
+import dataclasses
 import json
 from collections.abc import Iterator, Sequence
 from typing import Any, Self
@@ -11,6 +12,7 @@ import numpy as np
 import numpy.typing as npt
 
 from semstab.core.types import Float32
+from semstab.data.features import Features
 from semstab.data.frames import Frame
 from semstab.data.labels import LabelSpace, ignore_id
 from semstab.errors import ConfigError, DataError
@@ -33,6 +35,7 @@ class Wrapped(Model):
         self.fit_frames = inner.fit_frames
         self.sequential = inner.sequential
         self.wants_geometry = inner.wants_geometry
+        self.gives_features = inner.gives_features
 
     def fit(self, images: Sequence[Image]) -> Self:
         """Return a copy around the inner model adapted to the sequence."""
@@ -62,8 +65,8 @@ class Wrapped(Model):
 
 
 MEMBERS = (
-    "label_space", "gives_scores", "fit_frames", "sequential", "wants_geometry", "streams", "fit", "reset", "predict",
-    "stream", "identity",
+    "label_space", "gives_scores", "fit_frames", "sequential", "wants_geometry", "gives_features", "streams", "fit",
+    "reset", "predict", "stream", "identity",
 )  # fmt: skip
 
 SUM_TOLERANCE = 0.01
@@ -80,6 +83,7 @@ class Checked(Wrapped):
 
     def __init__(self, model: Any, name: str) -> None:
         self.name = name
+        self._components = 0
         if lacks := [member for member in MEMBERS if not hasattr(model, member)]:
             raise ConfigError(
                 f"model '{name}': a {type(model).__name__} has no {', '.join(lacks)}; derive its class from"
@@ -112,7 +116,8 @@ class Checked(Wrapped):
         """See `Model`."""
         answer = self.inner.stream(image)
         self._check_labels(answer.labels, image.shape[:2])
-        return Streamed(answer.labels, lambda: self._maps(answer, image.shape[:2]))
+        self._check_features(answer.features, image.shape[:2])
+        return Streamed(answer.labels, lambda: self._maps(answer, image.shape[:2]), answer.features)
 
     def identity(self) -> dict[str, Any]:
         """Return the identity of the model, which JSON must hold."""
@@ -131,8 +136,9 @@ class Checked(Wrapped):
         if not isinstance(prediction, Prediction):
             raise self._wrong(f"gave {_kind(prediction)}; give a semstab.models.Prediction")
         self._check_labels(prediction.labels, image.shape[:2])
+        self._check_features(prediction.features, image.shape[:2])
         if not wants_scores:
-            return Prediction(prediction.labels)
+            return dataclasses.replace(prediction, scores=None)
         self._check_scores(prediction.scores, image.shape[:2])
         return prediction
 
@@ -170,6 +176,20 @@ class Checked(Wrapped):
             raise self._wrong(f"gave scores of shape {scores.shape}; give {(*shape, K)}, the classes last")
         if not _add_up(scores):
             raise self._wrong("gave scores that are no shares: they must be 0 or more and sum to 1; apply a softmax")
+
+    def _check_features(self, features: Any, shape: tuple[int, ...]) -> None:
+        if (features is not None) != self.gives_features:
+            said = "gives_features = True" if features is None else "no gives_features = True"
+            raise self._wrong(f"says {said}, and gave {_kind(features)} as features; let both agree")
+        if features is None:
+            return
+        try:
+            D = Features.over(features, (shape[0], shape[1])).D
+        except DataError as error:
+            raise self._wrong(f"gave bad features: {error}") from error
+        self._components = self._components or D
+        if self._components != D:
+            raise self._wrong(f"gave features of {D} components, and of {self._components} before; keep to one number")
 
     def _wrong(self, what: str) -> DataError:
         return DataError(f"model '{self.name}' {what}")

@@ -14,6 +14,7 @@ import numpy.typing as npt
 from semstab.check.chain import Chain, MapContent
 from semstab.check.continuity import Neighbours
 from semstab.core.types import Int64, Mask
+from semstab.data.features import OF_FEATURES
 from semstab.data.labels import LabelSpace
 
 LEAST_POINTS = 15
@@ -210,6 +211,8 @@ def id_remarks(maps: Sequence[Ids], ignore: int, space: LabelSpace | None, whole
     `whole` are maps of which no pixel was left out.
     """
     used = sorted({int(i) for labels in maps for i in np.unique(labels)} - {ignore})
+    if space == OF_FEATURES:
+        return
     if len(used) == 1 and len(maps) >= LEAST_MAPS:
         name = f" ({space.classes[space.ids.index(used[0])]})" if space is not None and used[0] in space.ids else ""
         yield f"have one class, id {used[0]}{name}, in all {len(maps)} frames that were read: are the files right?"

@@ -186,6 +186,11 @@ class Source:
     model: Models = None
 
 
+Vocabularies = Annotated[list[Path] | None, typer.Option(
+    metavar="FILE", help="Label the features of models by the likeliest name of a vocabulary; repeatable.",
+    show_default="none", rich_help_panel=SETTINGS)]
+
+
 @dataclass(frozen=True)
 class Prediction:
     """A model that makes the labels in memory, and filters over the labels."""
@@ -193,6 +198,7 @@ class Prediction:
     predict: Predicted = None
     classes: Classes = None
     filters: Filters = None
+    vocabulary: Vocabularies = None
 
     @property
     def model_options(self) -> dict[str, Any]:

@@ -50,6 +50,14 @@ def run(
 
 
 def _configured(prediction: opt.Prediction, config: Path | None, content: dict[str, Any]) -> Config:
+    """Return the configuration of a file and further settings, with vocabularies over the features of its models."""
+    from semstab.configure import with_vocabularies
+
+    loaded = _labelled(prediction, config, content)
+    return with_vocabularies(loaded, prediction.vocabulary) if prediction.vocabulary else loaded
+
+
+def _labelled(prediction: opt.Prediction, config: Path | None, content: dict[str, Any]) -> Config:
     """Return the configuration of a file and further settings, of stored labels or of a model that predicts them."""
     from semstab.configure import filtered_config, load_config, predicted_config
     from semstab.predict.predictor import parse_predictors

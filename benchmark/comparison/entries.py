@@ -231,6 +231,13 @@ def open_run(named: str | os.PathLike[str]) -> RunHandle:
 def handle_of(result: Result, model: str, source: Path | None = None) -> RunHandle:
     """Return one label source of a run, at the base settings and backend; `source` is its folder, if it has one."""
     seed = result.manifest.get("seed")
+    for record in result.select(model=model):
+        features = None if record.statistics is None else record.statistics.features
+        if features is not None and features.alone:
+            raise ConfigError(
+                f"{source or model}: {model} gives features and no labels, and what is compared is of labels; name its"
+                f" features (--vocabulary FILE), or see `semstab-bench show {source or 'RUN'} features`"
+            )
     scenes = {
         scene: Entry(
             summary=record.summary, image_space=record.image_space, georeference=result.georeference.get(scene),

@@ -9,6 +9,8 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TypeVar
 
+import numpy as np
+
 from semstab.comparison.differences import holm, sums_difference
 from semstab.comparison.observations import compared_observations
 from semstab.core.types import THESE_FRAMES, THIS_SCENE, Scope
@@ -75,7 +77,8 @@ def rank_models(result: Result) -> Ranking:
 
     Scenes in which not all models have observations do not count.
     """
-    records = [record for record in result.select() if record.unit.model != GROUND_TRUTH]
+    labelled = (record for record in result.select() if not _has_features_alone(record))
+    records = [record for record in labelled if record.unit.model != GROUND_TRUTH]
     models: dict[str, list[Record]] = {}
     for record in records:
         models.setdefault(record.unit.model, []).append(record)
@@ -164,6 +167,36 @@ def _difference(new: ClusterSums, other: ClusterSums) -> Interval:
     return sums_difference(ALPHA.key, new, other, scope=scope)
 
 
+def over_one_model(names: Sequence[str]) -> tuple[str, ...]:
+    """Return the label sources NET@VOCABULARY of the model that has most of them; none if no model has two."""
+    of: dict[str, list[str]] = {}
+    for name in names:
+        net, at, _ = name.rpartition("@")
+        of.setdefault(net if at else "", []).append(name)
+    of.pop("", None)
+    most = max(of.values(), key=len, default=[])
+    return tuple(most) if len(most) > 1 else ()
+
+
+def with_one_number_of_classes(samples: Mapping[str, SpotObservations]) -> dict[str, SpotObservations]:
+    """Return samples of different classes with as many classes as the largest has; alpha stays what it is."""
+    K = max(sample.K for sample in samples.values())
+
+    def widened(sample: SpotObservations) -> SpotObservations:
+        label, neighbour, beyond = (
+            np.where(labels >= sample.K, K, labels).astype(np.uint16)
+            for labels in (sample.label, sample.neighbour, sample.beyond)
+        )
+        return replace(sample, label=label, neighbour=neighbour, beyond=beyond, K=K, classes=(), distances=None)
+
+    return {name: widened(sample) for name, sample in samples.items()}
+
+
+def _has_features_alone(record: Record) -> bool:
+    features = None if record.statistics is None else record.statistics.features
+    return features is not None and features.alone
+
+
 def _is_uninformative(record: Record) -> bool:
     return record.statistics is not None and record.statistics.verdict.level == "uninformative"
 
@@ -171,10 +204,16 @@ def _is_uninformative(record: Record) -> bool:
 def _common(files: Files) -> tuple[Mapping[str, ClusterSums], Mapping[str, float]]:
     """Return the sums of the observations that all models of a scene with the same classes made.
 
-    Beside them is alpha of each model if what it leaves out counts as disagreeing.
+    Vocabularies over the features of one model are compared whatever their names: alpha is beyond chance. Beside the
+    sums is alpha of each model if what it leaves out counts as disagreeing.
     """
     loaded = {name: SpotObservations.load(file) for name, file, _ in files}
     names = sharing_classes({name: each.classes for name, each in loaded.items()})
+    vocabularies = over_one_model([*loaded])
+    if {*names} & {*vocabularies}:
+        vocabularies = tuple(name for name in loaded if name in (*names, *vocabularies))
+    if len(vocabularies) > len(names):
+        names, loaded = vocabularies, with_one_number_of_classes({name: loaded[name] for name in vocabularies})
     if not names:
         return {}, {}
     both = compared_observations({name: loaded[name] for name in names})

@@ -10,6 +10,7 @@ import numpy as np
 
 from semstab.core.files import read_limited
 from semstab.core.types import Float64
+from semstab.data.features import OF_FEATURES
 from semstab.data.labels import LabelSpace, name_key
 from semstab.errors import DataError
 
@@ -30,6 +31,8 @@ def distances_of(space: LabelSpace, source: str | Path | None = None) -> Float64
     Raises:
         DataError: If the file cannot be used; the message names the row.
     """
+    if space == OF_FEATURES:
+        return None
     if source is None:
         return tree_distances(space.groups) if any(space.groups) else None
     path = Path(source)

@@ -13,6 +13,7 @@ import numpy as np
 import numpy.typing as npt
 
 from semstab.core.types import Float32, Float64, Mask, UInt8, UInt16
+from semstab.data.features import Features
 from semstab.data.labels import IGNORE_8BIT, IGNORE_16BIT, flat, ignore_id
 from semstab.errors import DataError
 
@@ -122,6 +123,8 @@ class Frame:
         files: File that each field came from ('depth', 'pose', 'labels', ...); error messages name it.
         points: (H, W, 3) or (N, 3) float32 sensor coordinates, metres, instead of depth and intrinsics; those that are
             not finite, or at the sensor itself, are invalid.
+        features: `Features`, or (h, w, D) float of a grid that covers the image evenly, coarser than the depth or as
+            fine; of a scan (N, D). Without labels and scores all pixels are of one class, 0.
 
     Raises:
         DataError: If shapes disagree, the pose is not rigid or not finite, or a type is wrong.
@@ -152,6 +155,7 @@ class Frame:
     timestamp: float | None = None
     files: Mapping[str, str] = field(default_factory=dict)
     points: Float32 | None = None
+    features: Features | None = None
 
     def __post_init__(self) -> None:
         if self.points is not None:
@@ -160,8 +164,12 @@ class Frame:
         if self.points is None:
             object.__setattr__(self, "intrinsics", _intrinsics(self.intrinsics, self.where("intrinsics")))
         self._set("T_wc", self._checked_pose())
+        if self.features is not None:
+            object.__setattr__(self, "features", self._checked_features(self.features))
+            if self.labels is None and self.scores is None:
+                object.__setattr__(self, "labels", np.zeros(self.shape, np.uint8))
         if (self.labels is None) == (self.scores is None):
-            raise DataError(f"{self.where('labels')}: give labels or scores, one of the two")
+            raise DataError(f"{self.where('labels')}: give labels or scores, one of the two, or features")
         if self.labels is not None:
             self._set("labels", self._checked_labels(np.asarray(self.labels)))
         if self.scores is not None:
@@ -247,7 +255,8 @@ class Frame:
     @property
     def nbytes(self) -> int:
         """Bytes of its images, the mask of valid pixels included."""
-        return self.depth.size + sum(image.nbytes for image in self._images.values())
+        images = self.depth.size + sum(image.nbytes for image in self._images.values())
+        return images + (0 if self.features is None else self.features.nbytes)
 
     @property
     def _images(self) -> dict[str, npt.NDArray[Any]]:
@@ -265,8 +274,11 @@ class Frame:
         pick = (slice(None, None, stride), slice(None, None, stride))
         images: dict[str, Any] = {name: image[pick] for name, image in self._images.items()}
         if self.points is not None:
+            if self.features is not None:
+                images["features"] = self.features.vectors[pick]
             return dataclasses.replace(self, **images)
-        return dataclasses.replace(self, intrinsics=self.intrinsics.every(stride), **images)
+        features = None if self.features is None else self.features.every(stride)
+        return dataclasses.replace(self, intrinsics=self.intrinsics.every(stride), **images, features=features)
 
     def within(self, side: int) -> Frame:
         """Return the frame by the least stride that leaves at most `side` pixels along each axis.
@@ -342,6 +354,16 @@ class Frame:
                 " wrong sign, as where left-handed coordinates (Unity, Unreal, CARLA) are taken as they are; convert it"
             )
         return T
+
+    def _checked_features(self, given: Any) -> Features:
+        """Return features whose grid has a place in the image."""
+        try:
+            if isinstance(given, Features):
+                return given
+            vectors = np.asarray(given)
+            return Features.over(vectors[None] if self.is_scan and vectors.ndim == 2 else vectors, self.shape)
+        except DataError as error:
+            raise DataError(f"{self.where('features')}: {error}") from error
 
     def _checked_mask(self, name: str, mask: npt.NDArray[Any]) -> Mask:
         if mask.dtype != np.bool_:

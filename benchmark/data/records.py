@@ -83,6 +83,10 @@ class ImageSpace:
     self_vc16: float = math.nan
     edge_recall: float = math.nan
 
+    def without_classes(self) -> ImageSpace:
+        """Return what is defined of a model without labels: the co-visible share."""
+        return ImageSpace(compensated_share=self.compensated_share)
+
     @property
     def of_scans(self) -> bool:
         """Return whether it is of scans: their points meet in space alone, the pixels of images in the image, too."""

@@ -6,7 +6,7 @@ import hashlib
 import math
 import re
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 from semstab.core.json_form import INLINE, inline
 from semstab.core.types import Float32, Int64, UInt16
@@ -177,6 +177,22 @@ class TableSummary:
 
     def __getitem__(self, measure: Measure) -> float:
         return self.means[measure]
+
+    def without_classes(self) -> TableSummary:
+        """Return the summary of the map of a model without labels: no measure of classes is defined."""
+
+        def unknown(means: MeasureMeans) -> MeasureMeans:
+            return MeasureMeans(dict.fromkeys(means.value, math.nan), dict.fromkeys(means.voxels, 0))
+
+        strata, well_seen, classes = (
+            tuple(replace(own, means=unknown(own.means)) for own in each)
+            for each in (self.strata, self.well_seen, self.classes)
+        )
+        recurrent = replace(self.recurrent, means=unknown(self.recurrent.means))
+        return replace(
+            self, means=unknown(self.means), strata=strata, recurrent=recurrent, classes=classes, well_seen=well_seen,
+            categories={}, confused_with={},
+        )  # fmt: skip
 
 
 @dataclass(frozen=True)

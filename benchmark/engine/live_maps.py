@@ -21,7 +21,7 @@ from semstab.core.background import Background
 from semstab.core.prefetch import Fetched
 from semstab.core.process import Stopwatch
 from semstab.core.types import Float64, Int32
-from semstab.data.distances import distances_of
+from semstab.data.features import OF_FEATURES
 from semstab.data.frames import Frame
 from semstab.data.results import FrameReport, UnitName
 from semstab.datasets import Scene
@@ -36,8 +36,9 @@ from semstab.metrics.image_space import ImageSpaceMeter
 from semstab.metrics.video_flicker import Flows, VideoFlickerMeter
 from semstab.pixels.scans import pictured
 from semstab.statistics import Sampler
+from semstab.statistics.feature_spots import FeatureObservations
 from semstab.statistics.observations import SpotObservations
-from semstab.task import Task, prepare, truth_task
+from semstab.task import Task, class_distances, prepare, truth_task
 
 WARM_UP_STRIDE = 8
 """A backend is warmed up with every n-th pixel of each axis of the first frame."""
@@ -150,6 +151,9 @@ class LiveMap:
             self.truth.integrate(prepared.truth)
         self.observations += report.voxels
         self.soft = self.soft or frame.scores is not None
+        if self.task.mapping.target == OF_FEATURES:
+            nan = math.nan
+            return dataclasses.replace(report, drift_sum=nan, map_vss_all=nan, map_entropy_all=nan)
         return report
 
     @staticmethod
@@ -180,8 +184,12 @@ class LiveMap:
         if self.sampler is None:
             return None
         space = self.task.mapping.target
-        sample = self.sampler.sample(space.classes, distances_of(space, self.config.distances))
+        sample = self.sampler.sample(space.classes, class_distances(self.task, self.config))
         return sample.without(self.left_out)
+
+    def sampled_features(self) -> FeatureObservations | None:
+        """Return the sampled features; None without any."""
+        return None if self.sampler is None else self.sampler.features()
 
 
 _warm: set[tuple[str, str, int, bool]] = set()
@@ -273,6 +281,7 @@ class Stream:
         frame, compensated = now.frame, math.nan
         with self._watch("flicker") as lap:
             flicker = flicker_in_place(self._previous, frame)
+        of_features = self.task.mapping.target == OF_FEATURES
         if self.image_space is not None:
             with self._watch("image space"):
                 compensated = self.image_space.add(frame, now.truth)
@@ -292,8 +301,8 @@ class Stream:
             live: FrameRow(
                 report,
                 timestamp=frame.timestamp,
-                flicker_percent=flicker,
-                compensated_flicker_percent=compensated,
+                flicker_percent=math.nan if of_features else flicker,
+                compensated_flicker_percent=math.nan if of_features else compensated,
                 decode_seconds=now.seconds,
                 network_seconds=now.network,
                 wait_seconds=now.waited,

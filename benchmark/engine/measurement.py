@@ -22,6 +22,7 @@ from semstab.core.process import Stopwatch, trim_malloc
 from semstab.core.types import Float64
 from semstab.data.events import Events
 from semstab.data.evidence import stretches
+from semstab.data.features import OF_FEATURES
 from semstab.data.frames import LeftOut
 from semstab.data.measures import RECURRENT, dominant, mean, measures, vss
 from semstab.data.parquet import Tile
@@ -44,7 +45,7 @@ from semstab.engine.live_maps import LiveMap, Stream
 from semstab.engine.place_pictures import PICTURED as PICTURED_PLACES
 from semstab.engine.place_pictures import pictures_of_places
 from semstab.engine.series import Series
-from semstab.engine.tiles import TILE_OBSERVATIONS, TileResult
+from semstab.engine.tiles import TILE_FEATURES, TILE_OBSERVATIONS, TileResult
 from semstab.engine.units import Unit, unit_key
 from semstab.engine.work import Start, Work
 from semstab.errors import DataError
@@ -56,6 +57,7 @@ from semstab.metrics.up_axis import estimate_up
 from semstab.metrics.video_flicker import VideoFlickerMeter, video_picture
 from semstab.statistics import Analysis, MapSample, SpotObservations, analyse
 from semstab.statistics.agreement import alpha_of, alpha_sums, ratio_of
+from semstab.statistics.feature_spots import FeatureObservations
 from semstab.statistics.frame_disagreement import LoneDisagreement, by_frame, outlying_frames
 from semstab.statistics.places import worst_places
 from semstab.statistics.verdict import Limits
@@ -80,6 +82,7 @@ def finish(live: LiveMap, stream: Stream, watch: Stopwatch) -> Work:
     work, config, tile, files = live.work, live.config, live.work.tile, Files(live.work.start)
     fused = _fused_map(live, watch) if work.fuses else None
     observations, sums, sample, analysis = live.sampled_observations(), dict[str, Float64](), None, None
+    features = live.sampled_features()
     with contextlib.closing(live.background), contextlib.closing(Background("semstab-files", 1)) as beside:
         if fused is not None and tile is None and not len(fused.table):
             raise no_voxels(live.task, config)
@@ -94,7 +97,7 @@ def finish(live: LiveMap, stream: Stream, watch: Stopwatch) -> Work:
             elif fused is not None:
                 sums = (TableSums.of(fused.table, config.strata) if sample is None else sample.summary).arrays()
             if sample is not None and tile is None:
-                analysis = analyse_sample(live.task, config, sample, observations)
+                analysis = analyse_sample(live.task, config, sample, observations, features)
             trim_malloc(least=SMALL if tile is None else 0)
         result = TileResult(
             {},
@@ -121,7 +124,7 @@ def finish(live: LiveMap, stream: Stream, watch: Stopwatch) -> Work:
                     record = replace(record, pixels=pixels)
         with watch("write"):
             beside.drain()
-            files.write(_savers(live, stream, fused, observations, sample, analysis, of_frames))
+            files.write(_savers(live, stream, fused, observations, features, sample, analysis, of_frames))
             if fused is not None and config.statistics:
                 files.write(_map_savers(live, fused, analysis))
             if tile is not None:
@@ -201,11 +204,17 @@ CAST = "what moved cannot be told: depth is cast at a surface, which has no move
 """Why spots that moved are not found."""
 
 
-def analyse_sample(task: Task, config: Config, sample: MapSample, observations: SpotObservations | None) -> Analysis:
+def analyse_sample(
+    task: Task,
+    config: Config,
+    sample: MapSample,
+    observations: SpotObservations | None,
+    features: FeatureObservations | None = None,
+) -> Analysis:
     """Return the statistics of a map; its true labels are right, and bound how far geometry lets labels agree."""
     why = CAST if config.moving == "tell" and task.scene.surface is not None else ""
     return analyse(
-        sample, observations, name=task.model, edges=config.strata, critical=config.critical_classes,
+        sample, observations, features=features, name=task.model, edges=config.strata, critical=config.critical_classes,
         scope=config.scope, limits=Limits(**config.verdict.model_dump()), frame_name=task.scene.frame_name,
         moving_untold=why,
     )  # fmt: skip
@@ -266,13 +275,15 @@ def record_of(unit: Unit, task: Task, rows: Series, result: TileResult, analysis
     """Return the record of a unit from its time series, its result and the statistics of its map."""
     config = unit.config
     sums = TableSums.read(result.sums)
+    table = sums.summary(config.voxel_size if unit.fuses else math.nan, task.mapping.target.classes, config.strata)
+    of_features = task.mapping.target == OF_FEATURES
     cut, most = rows.column("scores_left_out"), rows.column("most_scores_left_out")
     summary = UnitSummary(
         unit=unit.name,
         taxonomy=task.mapping.target.name,
         frames=len(task.indices),
-        table=sums.summary(config.voxel_size if unit.fuses else math.nan, task.mapping.target.classes, config.strata),
-        flicker_percent=mean(rows.column("flicker_percent")),
+        table=table.without_classes() if of_features else table,
+        flicker_percent=math.nan if of_features else mean(rows.column("flicker_percent")),
         fuse_ms_per_frame=mean(1e3 * rows.column("seconds")),
         stages_ms={stage: mean(1e3 * rows.column(f"{stage}_seconds")) for stage in STAGES},
         left_out=int(rows.column("left_out").sum()),
@@ -295,6 +306,8 @@ def record_of(unit: Unit, task: Task, rows: Series, result: TileResult, analysis
 def in_image_space(record: Record, task: Task, result: TileResult, points: VoxelTable | Float64) -> Record:
     """Return the record with what is measured in image coordinates, and the scene's up axis."""
     image_space = ImageSpaceMeter(result.image).result(record.summary.flicker_percent)
+    if task.mapping.target == OF_FEATURES:
+        image_space = image_space.without_classes()
     up = up_axis(task.scene, points, result.poses) if task.scene.posed else None
     return replace(record, image_space=image_space, up=up, quality=result.quality, video_measures=result.video_measures)
 
@@ -327,6 +340,7 @@ def _savers(
     stream: Stream,
     fused: FusedMap | None,
     observations: SpotObservations | None,
+    features: FeatureObservations | None,
     sample: MapSample | None,
     analysis: Analysis | None,
     of_frames: OfFrames,
@@ -342,6 +356,8 @@ def _savers(
         savers[overview_file(live.task)] = partial(save_overview, stream.overview | pictures)
     if tile is not None and observations is not None:
         savers[f"{tile.folder}/{tile.size}_{TILE_OBSERVATIONS}"] = observations.save
+    if tile is not None and features is not None:
+        savers[f"{tile.folder}/{tile.size}_{TILE_FEATURES}"] = features.save
     if tile is None and unit.stored:
         savers |= unit_savers(live.task, live.rows, observations, analysis, of_frames)
     if fused is not None and len(fused.table) and tile is not None and sample is not None:

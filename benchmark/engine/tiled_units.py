@@ -29,13 +29,14 @@ from semstab.engine.measurement import (
     unit_savers,
     written,
 )
-from semstab.engine.tiles import TILE_OBSERVATIONS, TileResult, joined_series
+from semstab.engine.tiles import TILE_FEATURES, TILE_OBSERVATIONS, TileResult, joined_series
 from semstab.engine.units import Unit
 from semstab.engine.work import Job, Start, UnitTile, Work
 from semstab.errors import SemstabError
 from semstab.metrics.agreement import together
 from semstab.metrics.summary import TableSums
 from semstab.statistics import Analysis, MapSample, SpotObservations
+from semstab.statistics.feature_spots import FeatureObservations
 from semstab.statistics.sample import MOST_VOXELS
 
 GUESS = 4
@@ -151,7 +152,9 @@ def assembled(
     analysis = None
     if sample is not None:  # sums in the order of the tiles, not in that of their ends
         sample = dataclasses.replace(sample, summary=sums)
-        analysis = analyse_sample(task, config, sample, observations)
+        vectors = folder / tasks[0].folder / f"{tasks[0].size}_{TILE_FEATURES}"
+        features = FeatureObservations.load(vectors, observations) if vectors.exists() and observations else None
+        analysis = analyse_sample(task, config, sample, observations, features)
     files = {name: digest for each in (frames, *tiles) for name, digest in each.files.items()}
     files = {name: digest for name, digest in files.items() if not name.startswith(tasks[0].folder)}
     of_frames = {} if analysis is None else analysis.of_frames()

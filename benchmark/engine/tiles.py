@@ -21,8 +21,8 @@ from semstab.data.results import Agreement
 from semstab.engine.series import NUMBERS, Series
 from semstab.errors import DataError
 
-TILE_OBSERVATIONS = "observations.parquet"
-"""File of the sample of observations of all frames."""
+TILE_OBSERVATIONS, TILE_FEATURES = "observations.parquet", "features.npz"
+"""Files of the sample of observations of all frames, and of their features."""
 
 MOST_TILES = 1 << 16
 """Tiles that one frame may meet."""

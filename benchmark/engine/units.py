@@ -26,7 +26,7 @@ from semstab.config import (
     Sweeps,
 )
 from semstab.core.code import Code, is_code
-from semstab.data.distances import distances_of
+from semstab.data.features import OF_FEATURES
 from semstab.data.labels import LabelSpace
 from semstab.data.measures import measures
 from semstab.data.records import REGIONS, Variation
@@ -34,7 +34,7 @@ from semstab.data.results import UnitName
 from semstab.data.statistics import CONFIDENCE
 from semstab.datasets import GROUND_TRUTH, Scene
 from semstab.errors import ConfigError, DataError
-from semstab.task import Task, applies, frame_indices, open_scenes, selected, tasks_of, truth_task
+from semstab.task import Task, applies, class_distances, frame_indices, open_scenes, selected, tasks_of, truth_task
 
 logger = logging.getLogger("semstab")
 
@@ -47,7 +47,7 @@ OF_MAPS = (
 )  # fmt: skip
 """Settings that a video, which has no map, does not use."""
 
-FORMAT = 15
+FORMAT = 16
 """Part of every key: raise it with any change of the numbers that a unit's settings and input lead to, and with a
 setting's default."""
 
@@ -241,10 +241,13 @@ def _base_units(config: Config, scenes: Mapping[str, Scene]) -> Iterator[Unit]:
             one = settings.model_copy(update={"models": [task.model]})
             if config.truth and scene.ground_truth and task.model != GROUND_TRUTH and truth_task(task) is None:
                 space, target = scene.label_space(GROUND_TRUTH), task.mapping.target
-                logger.warning(
-                    "%s: labels are not compared with the ground truth, as %s has classes that %s has not;"
-                    " list them under its ignored, or among members", name, space.name, target.name,
-                )  # fmt: skip
+                if target == OF_FEATURES:
+                    logger.info("%s: features of %s are not compared with the ground truth", name, task.model)
+                else:
+                    logger.warning(
+                        "%s: labels are not compared with the ground truth, as %s has classes that %s has not;"
+                        " list them under its ignored, or among members", name, space.name, target.name,
+                    )  # fmt: skip
             sampled = _is_sampled(config, config.backends[0])
             if config.video_measures == "dis" and scene.missing(task.indices[0], color=True):
                 raise ConfigError(f"{name}: there are no images for optical flow; use --video-measures depth")
@@ -371,7 +374,7 @@ def identity(config: Config, task: Task) -> str:
         "frames": [*task.indices],
         "taxonomy": [mapping.target.name, mapping.target.classes, mapping.source.ids, mapping.rows],
     }
-    if (distances := distances_of(mapping.target, config.distances)) is not None:
+    if (distances := class_distances(task, config)) is not None:
         content["distances"] = distances.tolist()
     truth = truth_task(task) if config.truth else None
     compared = {} if truth is None else {"truth": truth.mapping.rows}

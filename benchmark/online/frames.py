@@ -16,12 +16,16 @@ from pydantic import BaseModel
 
 from semstab.core.files import ScratchFolder
 from semstab.core.types import Float64
+from semstab.data.features import OF_FEATURES, Features
 from semstab.data.frames import Frame
 from semstab.data.labels import LabelSpace
 from semstab.datasets.scene import GROUND_TRUTH, Dataset, Scene
 from semstab.errors import DataError
 
-FIELDS = "labels", "scores", "depth", "intrinsics", "T_wc", "color", "mask", "timestamp", "truth", "points"
+FIELDS = (
+    "labels", "scores", "depth", "intrinsics", "T_wc", "color", "mask", "timestamp", "truth", "points",
+    "features",
+)  # fmt: skip
 """The fields of a posed label map that is given as a mapping; see `Frame`. truth (H, W) has the true labels."""
 
 
@@ -51,14 +55,15 @@ def as_frame(given: Frame | Mapping[str, Any], index: int) -> tuple[Frame, Frame
                 " labels, points, T_wc"
             )
     for name in fields.keys() - {"intrinsics", "timestamp"}:
-        fields[name] = None if fields[name] is None else as_array(fields[name])
+        if not (fields[name] is None or isinstance(fields[name], Features)):
+            fields[name] = as_array(fields[name])
     if hasattr(fields.get("intrinsics"), "detach"):
         fields["intrinsics"] = as_array(fields["intrinsics"])
     truth = fields.pop("truth", None)
     frame = Frame(index, **fields)
     if truth is None:
         return frame, None
-    return frame, dataclasses.replace(frame, labels=truth, scores=None, color=None, mask=None)
+    return frame, dataclasses.replace(frame, labels=truth, scores=None, color=None, mask=None, features=None)
 
 
 class Sequence:
@@ -68,11 +73,14 @@ class Sequence:
         classes: The number of classes by the largest label, or by the scores.
         timestamps: (n,) seconds, where all frames have one and they ascend.
         of_scans: Whether one of them is a scan.
+        has_features: Whether all of them have features.
+        of_features: Whether they have no labels, too, which are of class 0 then.
     """
 
     def __init__(self, frames: Iterable[Frame | Mapping[str, Any]]) -> None:
         self._folder = ScratchFolder()
         self.count, self.classes, self.of_scans = 0, 0, False
+        self.of_features = self.has_features = True
         self.has_truth, times, digest = True, list[float | None](), hashlib.blake2b(digest_size=16)
         for given in frames:
             frame, truth = as_frame(given, self.count)
@@ -81,6 +89,11 @@ class Sequence:
             true = None if truth is None else truth.labels
             for image in (frame.depth, frame.points, frame.labels, frame.scores, frame.T_wc, true):
                 digest.update(b"" if image is None else np.ascontiguousarray(image).data)
+            if frame.features is not None:
+                digest.update(np.ascontiguousarray(frame.features.vectors).data)
+                digest.update(repr((frame.features.first, frame.features.step)).encode())
+            self.has_features = self.has_features and frame.features is not None
+            self.of_features = self.of_features and frame.features is not None and _classes(frame) <= 1
             digest.update(repr((frame.intrinsics, frame.timestamp)).encode())
             self.classes = max(self.classes, _classes(frame), 0 if truth is None else _classes(truth))
             self.has_truth = self.has_truth and truth is not None
@@ -157,7 +170,11 @@ class FramesScene(Scene):
         self._sequence = sequence
         self.name, self.models, self.ground_truth = options.scene, (options.model,), sequence.has_truth
         self.of_scans = sequence.of_scans
+        self.with_features = (options.model,) if sequence.has_features else ()
         classes = options.classes or tuple(f"class {k}" for k in range(max(2, sequence.classes)))
+        if sequence.of_features:
+            self._space = OF_FEATURES
+            return
         if len(classes) < sequence.classes:
             raise DataError(f"{self.name}: there are labels up to {sequence.classes - 1}, but {len(classes)} classes")
         self._space = LabelSpace(options.scene, classes)

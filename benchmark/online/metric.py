@@ -28,6 +28,8 @@ from semstab.online.summary import Summary
 from semstab.statistics import MapSample, Sampler, SpotObservations, Views, analyse, psa
 from semstab.statistics.accumulate import sums_of_spots
 from semstab.statistics.cluster_sums import value
+from semstab.statistics.feature_spots import MOST_BYTES, FeatureObservations
+from semstab.statistics.features import alpha_of_features
 from semstab.statistics.sampler import BUDGET
 from semstab.statistics.votes import SpotVotes
 
@@ -42,6 +44,7 @@ class State:
         updates: (n,) how often a further frame moved the belief of each voxel.
         spots: The sampled observations from which alpha is computed; None without alpha.
         one_in: The table holds one in so many voxels.
+        features: The sampled features; None without any.
     """
 
     frames: int
@@ -50,6 +53,7 @@ class State:
     spots: SpotObservations | None
     flicker: tuple[float, int]
     one_in: int
+    features: FeatureObservations | None = None
 
     def __add__(self, other: State) -> State:
         """Return the sum of this state and that of another process for the same sequence.
@@ -62,7 +66,9 @@ class State:
         table, updates = _added(a.table, b.table, a.updates, b.updates)
         flicker = self.flicker[0] + other.flicker[0], self.flicker[1] + other.flicker[1]
         spots = None if a.spots is None or b.spots is None else _joined(a.spots, b.spots)
-        return State(self.frames + other.frames, table, updates, spots, flicker, one_in)
+        one, two = self.features, other.features
+        features = _with_features(one, two) if one is not None and two is not None else one or two
+        return State(self.frames + other.frames, table, updates, spots, flicker, one_in, features)
 
     def _thinned(self, one_in: int) -> State:
         if one_in == self.one_in:
@@ -85,11 +91,14 @@ class State:
             self._flicker,
             whole.recurrent.share,
         )
-        return dict(zip(Summary.NAMES, map(float, numbers), strict=True))
+        scalars = dict(zip(Summary.NAMES, map(float, numbers), strict=True))
+        if self.features is not None:
+            scalars["feature_alpha"] = alpha_of_features(self.features)
+        return scalars
 
     def summary(self) -> Summary:
         """Return the numbers of a run of these frames."""
-        analysis = analyse(MapSample.draw(self._table()), self.spots)
+        analysis = analyse(MapSample.draw(self._table()), self.spots, features=self.features)
         return Summary.of(self.frames, analysis.table, analysis.summary, self._flicker)
 
     def _table(self) -> VoxelTable:
@@ -149,7 +158,8 @@ class _Map:
             table = table.rows(in_sample(table.index.T, self._one_in))
         spots = None if self._sampler is None else self._sampler.sample()
         flicker = self._flicker, self._pairs
-        return State(self._frames, table, table.op.astype(np.int64) - 1, spots, flicker, self._one_in)
+        features = None if self._sampler is None else self._sampler.features()
+        return State(self._frames, table, table.op.astype(np.int64) - 1, spots, flicker, self._one_in, features)
 
 
 class TemporalStability:
@@ -211,7 +221,13 @@ class TemporalStability:
         self._merged: dict[str, State] = {}
 
     def update(
-        self, predicted: Any, depth: Any, intrinsics: Any, T_wc: Any, sequence: str | int | Sequence[Any] = ""
+        self,
+        predicted: Any,
+        depth: Any,
+        intrinsics: Any,
+        T_wc: Any,
+        sequence: str | int | Sequence[Any] = "",
+        features: Any = None,
     ) -> None:
         """Fuse one frame, or a batch of frames in the order of time.
 
@@ -224,8 +240,14 @@ class TemporalStability:
             intrinsics: (3, 3) or (B, 3, 3) camera matrix, or `Intrinsics`.
             T_wc: (4, 4) or (3, 4), camera to world in metres; or (B, ...).
             sequence: Which sequence they belong to, one name or one a frame; sequences may alternate.
+            features: (D, h, w) or (B, D, h, w) float of a grid that covers the image evenly, optional: `compute` then
+                has feature_alpha, too. Without labels predicted is None.
         """
-        frames = self._frames(as_array(predicted), as_array(depth), intrinsics, as_array(T_wc))
+        depth = as_array(depth)
+        predicted = np.zeros(depth.shape, np.uint8) if predicted is None else as_array(predicted)
+        frames = self._frames(predicted, depth, intrinsics, as_array(T_wc))
+        if features is not None:
+            frames = _featured(frames, as_array(features))
         names = [sequence] * len(frames) if isinstance(sequence, str | int) else [*sequence]
         if len(names) != len(frames):
             raise DataError(f"sequence: {len(names)} names for {len(frames)} frames; give one name, or one a frame")
@@ -238,10 +260,13 @@ class TemporalStability:
     def compute(self) -> dict[str, float]:
         """Return alpha, vss_op3, sbd_op3 (bits), psa_op2, flicker (percent) and recurrent_share, means over sequences.
 
+        With features there is feature_alpha, too; the numbers of labels mean nothing where predicted was None.
+
         A run of these frames gives the same numbers; a number is NaN where undefined, as before the first update.
         """
         rows = [state.scalars() for state in self.states().values()]
-        return {name: mean(np.array([row[name] for row in rows], np.float64)) for name in Summary.NAMES}
+        names = dict.fromkeys((*Summary.NAMES, *(name for row in rows for name in row)))
+        return {name: mean(np.array([row.get(name, math.nan) for row in rows], np.float64)) for name in names}
 
     def by_sequence(self) -> dict[str, Summary]:
         """Return the numbers of each sequence, its verdict among them."""
@@ -319,6 +344,15 @@ class TemporalStability:
         return np.where(known, labels, none).astype(dtype)
 
 
+def _featured(frames: Sequence[Frame], features: npt.NDArray[Any]) -> list[Frame]:
+    """Return frames with their features (D, h, w), of a batch (B, D, h, w)."""
+    features = features[None] if features.ndim == 3 else features
+    if features.ndim != 4 or len(features) != len(frames):
+        raise DataError(f"features of shape {features.shape} for {len(frames)} frames; give (D, h, w), or (B, D, h, w)")
+    pairs = zip(frames, np.moveaxis(features, 1, -1), strict=True)
+    return [dataclasses.replace(frame, features=own) for frame, own in pairs]
+
+
 def _are_cameras(intrinsics: Any) -> bool:
     return isinstance(intrinsics, list | tuple) and all(isinstance(one, Intrinsics) for one in intrinsics)
 
@@ -366,6 +400,23 @@ def _added(a: VoxelTable, b: VoxelTable, updates_a: Int64, updates_b: Int64) -> 
         **index_columns(index), **summed, first_frame=first, last_frame=last, voxel_size=a.voxel_size,
         evidence=Evidence(starts, (key % a.K).astype(np.uint16), weight, a.K), classes=a.classes,
     ), updates  # fmt: skip
+
+
+def _with_features(a: FeatureObservations, b: FeatureObservations) -> FeatureObservations:
+    """Return the features of both, each for its own spots, in no more memory than those of one process.
+
+    Raises:
+        DataError: If their numbers of components differ.
+    """
+    if a.D != b.D:
+        raise DataError(f"features have {a.D} components in one process, {b.D} in another; give one network's")
+    share, most = min(a.spots.share, b.spots.share), min(BUDGET, MOST_BYTES // (2 * a.D))
+    a, b = a.within(share), b.within(share)
+    while len(a.vectors) + len(b.vectors) > most:
+        share //= 2
+        a, b = a.within(share), b.within(share)
+    both = _joined(a.spots, b.spots)
+    return FeatureObservations(both, np.concatenate([a.vectors, b.vectors]), max(a.one_in, b.one_in))
 
 
 def _joined(a: SpotObservations, b: SpotObservations) -> SpotObservations:

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from typing import ClassVar
 
 from semstab.data.measures import ENTROPY, SBD, VSS
 from semstab.data.results import TableSummary
-from semstab.data.statistics import MapStatistics
+from semstab.data.statistics import UNKNOWN, MapStatistics
 
 
 @dataclass(frozen=True)
@@ -26,6 +27,7 @@ class Summary:
         recurrent_share: Share of the voxels with OP >= 3, 0 to 1.
         verdict: The level.
         probability: Probability that the level is right.
+        feature_alpha: Alpha of features, if frames have some; with its ends feature_alpha_low, feature_alpha_high.
     """
 
     NAMES: ClassVar = ("alpha", "vss_op3", "sbd_op3", "psa_op2", "flicker", "recurrent_share")
@@ -44,11 +46,15 @@ class Summary:
     recurrent_share: float
     verdict: str
     probability: float
+    feature_alpha: float = math.nan
+    feature_alpha_low: float = math.nan
+    feature_alpha_high: float = math.nan
 
     @classmethod
     def of(cls, frames: int, table: TableSummary, statistics: MapStatistics, flicker: float) -> Summary:
         """Return the summary of a map's statistics."""
         verdict, alpha = statistics.verdict, statistics.headline.alpha
+        of_features = UNKNOWN if statistics.features is None else statistics.features.alpha
         return cls(
             frames=frames,
             voxels=table.voxels,
@@ -64,6 +70,9 @@ class Summary:
             recurrent_share=table.recurrent.share,
             verdict=verdict.decisive,
             probability=verdict.decisive_probability,
+            feature_alpha=of_features.value,
+            feature_alpha_low=of_features.low,
+            feature_alpha_high=of_features.high,
         )
 
     def scalars(self) -> dict[str, float]:

@@ -50,10 +50,16 @@ class TemporalStability(Metric):
         self._all: metric.TemporalStability | None = None
 
     def update(
-        self, predicted: Any, depth: Any, intrinsics: Any, T_wc: Any, sequence: str | int | Sequence[Any] = ""
+        self,
+        predicted: Any,
+        depth: Any,
+        intrinsics: Any,
+        T_wc: Any,
+        sequence: str | int | Sequence[Any] = "",
+        features: Any = None,
     ) -> None:
         """Fuse one frame, or a batch of frames in the order of time."""
-        self._own.update(predicted, depth, intrinsics, T_wc, sequence)
+        self._own.update(predicted, depth, intrinsics, T_wc, sequence, features)
 
     def compute(self) -> dict[str, torch.Tensor]:
         """Return the scalars of all frames of all processes, float64."""

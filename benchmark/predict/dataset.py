@@ -19,13 +19,14 @@ from pydantic import BaseModel, Field, field_validator
 from semstab.config import DatasetConfig, FrameSelection, Settings
 from semstab.core.files import ScratchFolder
 from semstab.core.types import Float64, UInt8
+from semstab.data.features import Features
 from semstab.data.frames import Frame
 from semstab.data.labels import LabelSpace
 from semstab.datasets import GROUND_TRUTH, Dataset, Filtering, Scene, open_dataset, resolved
-from semstab.datasets.geometry.lenses import Labels, Scores
+from semstab.datasets.geometry.lenses import Labels, Scores, require_same_view
 from semstab.datasets.scene import select_frames
 from semstab.errors import ConfigError, DataError
-from semstab.models import Model, create
+from semstab.models import Model, Prediction, create
 from semstab.predict.filters import Filtered, parse
 from semstab.predict.images import ImageSequence, first_images
 from semstab.predict.predictor import NAME as STORED
@@ -207,6 +208,10 @@ class PredictedScene(Scene):
         self._dataset = dataset
         self._producers: dict[str, Producer] = {}
         self._digests: dict[int, bytes] = {}
+        self.with_features = tuple(
+            name for name, each in dataset.predictors.items()
+            if each.model != STORED and not each.filters and dataset.model(name).gives_features
+        )  # fmt: skip
 
     def __len__(self) -> int:
         """Return the number of frames."""
@@ -310,7 +315,17 @@ class PredictedScene(Scene):
         labels = None if scores else prediction.labels
         frame = producer.sequence.predicted(index, labels=labels, scores=prediction.scores)
         assert frame is not None
-        return dataclasses.replace(frame, color=self._inner.color(index) if color else None)
+        color_image = self._inner.color(index) if color else None
+        return dataclasses.replace(frame, color=color_image, features=self._features(frame, prediction))
+
+    def _features(self, frame: Frame, prediction: Prediction) -> Features | None:
+        """Return features that were predicted on an image with the view of the depth; None without any."""
+        if prediction.features is None:
+            return None
+        if getattr(self._inner, "on_photographs", False):
+            raise DataError(f"{self.name}: features on photographs with another camera than the depth are not read")
+        require_same_view(prediction.labels.shape, frame.shape, frame.where("depth"), "the image is {} but depth is {}")
+        return Features.over(prediction.features, frame.shape)
 
     def digest(self, indices: list[int], model: str) -> str:
         """Return a hash of the model, its settings, and the image, depth and pose of those frames.

@@ -186,7 +186,7 @@ class Filtered(Wrapped):
             raise ConfigError(f"--filter {filters[0]}: '{name}' finds regions without classes; leave the filter out")
         self.filters = tuple(filters)
         self.space = inner.label_space
-        self.gives_scores = True
+        self.gives_scores, self.gives_features = True, False
         self.sequential = inner.sequential or any(spec.kind.sequential for spec in filters)
         self.wants_geometry = inner.wants_geometry or any(spec.kind.wants_geometry for spec in filters)
         self.seconds: list[float] = []

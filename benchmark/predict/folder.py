@@ -16,6 +16,7 @@ import numpy.typing as npt
 from semstab.core.files import FolderLock, atomic_path, content_key, read_json, write_image, write_json, write_stack
 from semstab.core.json_form import from_json
 from semstab.core.types import Float32
+from semstab.data.features import Features
 from semstab.data.labels import LabelSpace
 from semstab.datasets.files.labels import LABEL_SPACE_FILE, SUFFIXES
 from semstab.datasets.files.options import inside
@@ -30,8 +31,10 @@ MANIFEST_FILE = "predictions.json"
 SAVE_SECONDS = 5.0
 """Seconds of work that a killed process may lose at most."""
 
-Kind = Literal["labels", "scores", "regions", "points"]
-WRITTEN: Mapping[Kind, str] = {"labels": ".png", "scores": ".npz", "regions": ".png", "points": ".label"}
+Kind = Literal["labels", "scores", "features", "regions", "points"]
+WRITTEN: Mapping[Kind, str] = {
+    "labels": ".png", "scores": ".npz", "features": ".npy", "regions": ".png", "points": ".label"
+}  # fmt: skip
 """The suffix of the files that are written."""
 
 ScoreType = Literal["float16", "float32"]
@@ -67,7 +70,8 @@ class PredictionFolder:
 
     Attributes:
         path: The folder.
-        kind: Kind of maps: PNG ids, .npz scores (K, H, W), PNG region ids, .label ids of the points of a scan.
+        kind: Kind of maps: PNG ids, .npz scores (K, H, W), .npy features (h, w, D), PNG region ids, .label ids of the
+            points of a scan.
         settings: All that the maps depend on in addition to the image, for JSON.
         about: The rest of the manifest.
         space: The classes; None for regions.
@@ -137,6 +141,14 @@ class PredictionFolder:
                 temporary.write_bytes(values.astype("<u4").tobytes())
         else:
             write_image(self.file(name), values)
+        self._done(name, image, seconds)
+
+    def write_features(self, name: str, image: str, vectors: npt.NDArray[Any], seconds: float) -> None:
+        """Store a frame's features (h, w, D) of unit length, in half precision."""
+        self._claimed()
+        unit = Features(vectors, (0.0, 0.0), (1.0, 1.0)).vectors.astype(np.float16)
+        with atomic_path(self.file(name)) as temporary, temporary.open("wb") as file:
+            np.save(file, unit)
         self._done(name, image, seconds)
 
     def write_scores(self, name: str, image: str, maps: Iterable[npt.NDArray[Any]], seconds: float) -> None:

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Self
 
 from semstab.data.frames import Frame
-from semstab.datasets.formats.images import read_labels, read_scores
+from semstab.datasets.formats.images import read_features, read_labels, read_scores
 from semstab.errors import ConfigError
 from semstab.models import Image, Model, Prediction
 from semstab.models.validation import Wrapped
@@ -88,11 +88,13 @@ class Producer(PredictionObserver):
         """
         self.wait(index)
         name = f"{self._name}/{self.sequence.image_name(index)}"
-        labels = read_labels(self._folder / f"labels/{name}.png")
-        if not scores:
-            return Prediction(labels)
+        labels, soft, features = read_labels(self._folder / f"labels/{name}.png"), None, None
         shape = (labels.shape[0], labels.shape[1])
-        return Prediction(labels, read_scores(self._folder / f"scores/{name}.npz", "KHW", shape))
+        if self.model.gives_features:
+            features = read_features(self._folder / f"features/{name}.npy", shape).vectors
+        if scores:
+            soft = read_scores(self._folder / f"scores/{name}.npz", "KHW", shape)
+        return Prediction(labels, soft, features)
 
     def index_of(self, digest: str) -> int | None:
         """Return the frame whose image has that digest, once it is there; None where none of the announced ones has."""

@@ -163,6 +163,8 @@ def predict_sequence(
 ) -> SequenceReport:
     """Predict the images of these indices into out/labels/NAME, and out/scores/NAME; regions into out/regions/NAME.
 
+    Features of a model that gives some go into out/features/NAME.
+
     A model that adapts to a sequence is fitted to the sequence's first images. Frames that an earlier start of the
     same finished are reused; an image whose content changed is predicted again. If a frame is missing, a sequential
     model is shown all of them again from the first one.
@@ -294,6 +296,10 @@ class _Work:
         alike = self.sequence.labels_like_depth and not self.options.at_image
         frame = self.sequence.predicted(picture.index, labels=prediction.labels) if alike else None
         for folder in self.folders:
+            if folder.kind == "features":
+                assert prediction.features is not None
+                folder.write_features(picture.name, picture.digest, prediction.features, seconds)
+                continue
             if folder.kind != "scores":
                 labels = prediction.labels if frame is None else frame.predicted
                 folder.write(picture.name, picture.digest, labels, seconds)
@@ -317,6 +323,8 @@ def _folders(
     kinds: list[Kind] = ["regions"] if space is None else ["labels"]
     if options.scores:
         kinds.append("scores")
+    if model.gives_features:
+        kinds.append("features")
     return [
         PredictionFolder(
             out / kind / options.name,

@@ -21,6 +21,7 @@ from semstab.configure import require_named_code, settings_of_folder
 from semstab.core.prefetch import prefetch
 from semstab.core.process import available_bytes
 from semstab.core.types import Float64, Int64
+from semstab.data.features import FeatureColours
 from semstab.data.frames import Frame
 from semstab.data.labels import LabelSpace
 from semstab.data.measures import measures
@@ -69,6 +70,7 @@ class GroupLog:
         self._size, self._fused = voxel_size, fused
         self._drift = DriftLog(voxel_size)
         self._maps: dict[str, VoxelLogger] = {}
+        self._colours: FeatureColours | None = None
         self._tables: dict[str, VoxelTable] = {}  # by backend, as they are finished
         self.last: tuple[int, float | None] = (task.indices[-1], None)
         """The number and timestamp of the last frame."""
@@ -108,6 +110,13 @@ class GroupLog:
         for name, (picture, every) in pictures.items():
             image = rr.SegmentationImage(picture, draw_order=-10)
             stream.log(path(self._scene, "camera", self.task.model, name), image, over_camera(every))
+        if frame.features is not None:  # in the colours of the first frame
+            self._colours = self._colours or FeatureColours.of(frame.features)
+        if frame.features is not None and self._colours is not None and self._colours.fit(frame.features):
+            colours = frame.features.image(self._colours(frame.features), frame.shape, 0)[::stride, ::stride]
+            image_of_features = rr.Image(np.ascontiguousarray(colours), draw_order=-5).compress(jpeg_quality=90)
+            where = path(self._scene, "camera", self.task.model, "features")
+            stream.log(where, image_of_features, over_camera(stride))
 
     def log_unit(
         self, stream: rr.RecordingStream, summary: UnitSummary, table: VoxelTable, tolerance: float, factor: int = 1

@@ -11,6 +11,7 @@ import yaml
 from semstab.backends import rule_of
 from semstab.comparison.caution import suspicions
 from semstab.config import BACKENDS, BASE
+from semstab.data.features import OF_FEATURES
 from semstab.data.measures import VSS
 from semstab.data.records import Record, Result
 from semstab.data.results import UnitSummary, VoxelAdvice
@@ -91,7 +92,8 @@ def warnings(result: Result) -> Iterator[str]:
 def _not_counting_frames(result: Result) -> Iterator[str]:
     """Yield which maps have evidence by another rule than the mean, of which what counts frames is not known."""
     units = [record.summary for sweep in (BASE, BACKENDS) for record in result.select(sweep)]
-    known = [(run.unit.backend, run.statistics) for run in units if run.statistics is not None]
+    labelled = [run for run in units if run.taxonomy != OF_FEATURES.name]
+    known = [(run.unit.backend, run.statistics) for run in labelled if run.statistics is not None]
     names = [name for name, found in known if found.repeated.voxels and math.isnan(found.agreement.psa_op2.value)]
     if names:
         yield (
@@ -103,7 +105,7 @@ def _not_counting_frames(result: Result) -> Iterator[str]:
 def _one_class_covers(runs: Sequence[UnitSummary]) -> Iterator[str]:
     """Yield which classes cover most of a map, so that they determine most of its numbers."""
     covering: dict[str, list[tuple[str, float]]] = {}
-    for run in runs:
+    for run in (each for each in runs if each.taxonomy != OF_FEATURES.name):
         if max(row.share for row in run.table.classes) >= ONE_CLASS:
             largest = max(run.table.classes, key=lambda row: row.voxels)
             covering.setdefault(largest.name, []).append((run.unit.model, largest.share))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import json
 import math
 from collections.abc import Iterator, Mapping, Sequence
@@ -13,11 +14,12 @@ import numpy as np
 
 from semstab.core.palette import KINDS
 from semstab.core.types import UInt8
+from semstab.data.features import OF_FEATURES
 from semstab.data.georeference import Georeference
 from semstab.data.measures import SBD, VSS, dominant, headlines, measures
 from semstab.data.records import OVERVIEW, Failure, Record, Result
 from semstab.data.results import slug
-from semstab.data.statistics import CONFIDENCE, Estimate, MapStatistics, short
+from semstab.data.statistics import CONFIDENCE, Correlogram, Estimate, MapStatistics, short
 from semstab.data.topdown import EMPTY
 from semstab.metrics import CATEGORIES, CATEGORY_COLORS, NOT_ASSESSED, categories, macro_mean
 from semstab.metrics.image_space import mean_over_scenes
@@ -127,6 +129,8 @@ def _scene_verdict(record: Record) -> dict[str, str]:
         return {"scene": record.unit.scene, "level": "not assessed", "kind": "open", "probability": ""}
     verdict = statistics.verdict
     level, kind = verdict.difference or verdict.level, KINDS.get(verdict.decisive, "bad")
+    if statistics.features is not None and statistics.features.alone:
+        level, kind = "features, no labels", "open"
     p = "" if verdict.difference else verdict.stated
     return {"scene": record.unit.scene, "level": level, "kind": kind, "probability": p}
 
@@ -151,6 +155,9 @@ def _numbers(
     alphas = [stats.headline.alpha.value for stats in assessed]
     alpha = macro_mean(alphas)
     yield "alpha", "" if math.isnan(alpha) else short(alpha), interval(None if head is None else head.alpha)
+    of_features = [stats.features.alpha for stats in assessed if stats.features is not None]
+    one_of_them = of_features[0] if len(of_features) == 1 else None
+    yield "alpha of features", mean([each.value for each in of_features], "{:.2f}").lstrip("0"), interval(one_of_them)
     yield "two views agree", mean([stats.agreeing for stats in assessed], "{:.0f} %", 100), "of the spots"
     if one is not None and one.told_ranges is not None:
         value, note = one.told_ranges.parts
@@ -167,6 +174,8 @@ def _numbers(
         return
     together = pooled(records)
     yield "seen 3 times or more", f"{100 * together.recurrent.share:.0f} %", f"of {together.voxels:,} voxels"
+    if assessed and all(stats.features is not None and stats.features.alone for stats in assessed):
+        return
     enough = together.recurrent.voxels >= ENOUGH
     few = f"fewer than {ENOUGH:,} voxels with OP ≥ 3"
     for measure in headlines():
@@ -207,7 +216,8 @@ def _scenes(result: Result, folder: Path, above: Mapping[str, FromAbove]) -> Ite
             if path.exists():
                 overviews[record.unit.model] = Overview.load(path)
         up, colors = result.up.get(scene), {name: k for k, name in enumerate(result.models)}
-        drawn = [] if up is None else [record for record in records if record.voxels_file is not None]
+        labelled = [record for record in records if record.summary.taxonomy != OF_FEATURES.name]
+        drawn = [] if up is None else [record for record in labelled if record.voxels_file is not None]
         yield {
             "name": scene,
             "maps": [
@@ -372,14 +382,22 @@ def _groupings(records: Sequence[Record]) -> Iterator[dict[str, str]]:
 
 def _distance(records: Sequence[Record], colors: Mapping[str, int]) -> Iterator[dict[str, str]]:
     """Yield charts of agreement by the distance of two observations."""
-    for axis, title, unit in (
-        ("time", "In time", "frames apart"),
-        ("angle", "In angle", "degrees between the views"),
-        ("baseline", "In space", "metres between the cameras"),
+    kinds: dict[str, list[tuple[Record, Correlogram | None]]] = {"": [], ", features": []}
+    for record in records:
+        statistics = record.statistics
+        features = None if statistics is None else statistics.features
+        kinds[""].append((record, None if statistics is None else statistics.correlogram))
+        kinds[", features"].append((record, None if features is None else features.correlogram))
+    for (axis, title, unit), (of, correlograms) in itertools.product(
+        (
+            ("time", "In time", "frames apart"),
+            ("angle", "In angle", "degrees between the views"),
+            ("baseline", "In space", "metres between the cameras"),
+        ),
+        kinds.items(),
     ):
         lines = []
-        for record in records:
-            correlogram = record.statistics and record.statistics.correlogram
+        for record, correlogram in correlograms:
             bins = getattr(correlogram, axis) if correlogram else ()
             if bins:
                 name, alphas = record.unit.model, [each.alpha for each in bins]
@@ -388,7 +406,7 @@ def _distance(records: Sequence[Record], colors: Mapping[str, int]) -> Iterator[
                     Line(name, [each.mean for each in bins], [alpha.value for alpha in alphas], ends, colors[name])
                 )
         if lines:
-            yield {"title": title, "chart": line_chart(lines, unit, "alpha", zero=True)}
+            yield {"title": f"{title}{of}", "chart": line_chart(lines, unit, "alpha", zero=True)}
 
 
 # --- All scenes together ----------------------------------------------------------------------------------------------

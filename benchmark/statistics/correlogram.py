@@ -8,7 +8,7 @@ from __future__ import annotations
 import dataclasses
 import itertools
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from typing import Any
 
 import numpy as np
@@ -56,10 +56,32 @@ def correlogram(spots: SpotObservations) -> Correlogram:
     for these frames.
     """
     logs = spots.logs()
-    seen, _ = logs[0]
     labels = np.unique(np.concatenate([log.evidence.label for log, _ in logs]))  # the other classes change nothing
+
+    def sums(by_lag: Sequence[Lag], cluster: Int64, clusters: int) -> list[Float64]:
+        return [_sums(log, labels, square, by_lag, cluster, clusters) for log, square in logs]
+
+    return in_bins(spots, sums, len(labels), PAIRED_ALPHA)
+
+
+def in_bins(
+    spots: SpotObservations,
+    sums_of: Callable[[Sequence[Lag], Int64, int], Sequence[Float64]],
+    K: int,
+    number: Functional,
+) -> Correlogram:
+    """Return a number of pairs in bins of the distance of two views of a spot.
+
+    Args:
+        spots: Observations, whose first answers are paired.
+        sums_of: Returns the sums (bins + 1, clusters, 4 + K) of pairs, of one answer or of the three, from the pairs of
+            each lag, the cluster of each observation and the number of clusters.
+        K: Number of columns of evidence.
+        number: The number, which is of `ALPHA_SUMS`.
+    """
+    seen = spots.observations()
     cubes, of, edge = _cubes(seen)
-    step, most = 1, min(MOST_GROUPS, max(1, MOST_SUMS // (max(len(cubes), 1) * (4 + len(labels)))))
+    step, most = 1, min(MOST_GROUPS, max(1, MOST_SUMS // (max(len(cubes), 1) * (4 + K))))
     while len(frames := np.unique(seen.frame // step)) > most:
         step *= 2
     group = np.searchsorted(frames, seen.frame // step)
@@ -72,8 +94,8 @@ def correlogram(spots: SpotObservations) -> Correlogram:
         pairs += np.bincount(bins.ravel(), minlength=len(pairs))
         distance += np.bincount(bins.ravel(), weights=apart.ravel(), minlength=len(pairs))
         by_lag.append((first, second, bins))
-    sums = [_sums(log, labels, square, by_lag, cluster, len(keys)) for log, square in logs]
-    columns = side_by_side(dict(zip((*ALPHA_SUMS, "square"), (1, 1, 1, len(labels), 1), strict=True)))
+    sums = sums_of(by_lag, cluster, len(keys))
+    columns = side_by_side(dict(zip((*ALPHA_SUMS, "square"), (1, 1, 1, K, 1), strict=True)))
     rows, specs = [], []
     for k in np.flatnonzero(pairs[:-1] >= LEAST_PAIRS):
         some = np.flatnonzero(sums[0][k, :, 1])
@@ -82,7 +104,7 @@ def correlogram(spots: SpotObservations) -> Correlogram:
         where = cubes[cube[some]], frames[group[some]]
         answers = tuple(ClusterSums(*where, each[k, some], columns, edge, step) for each in sums)
         of_bin = dataclasses.replace(answers[0], answers=answers)
-        specs.append(spec_of(of_bin, PAIRED_ALPHA, scope=scope_of(of_bin, key=PAIRED_ALPHA)))
+        specs.append(spec_of(of_bin, number, scope=scope_of(of_bin, key=number)))
         rows.append((k, float(distance[k] / pairs[k]), int(pairs[k])))
     of_axis: dict[str, tuple[LagBin, ...]] = dict.fromkeys(AXES, ())
     for (k, lag, count), alpha in zip(rows, confidence_intervals(specs), strict=True):

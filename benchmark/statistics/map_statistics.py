@@ -6,15 +6,18 @@ import dataclasses
 import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
 
 from semstab.core.types import THIS_SCENE, Float64, Scope
 from semstab.data.events import Events
+from semstab.data.features import OF_FEATURES
 from semstab.data.information import by_group
-from semstab.data.measures import SBD
+from semstab.data.measures import SBD, MeasureMeans, measures
 from semstab.data.results import TableSummary
 from semstab.data.statistics import (
+    UNKNOWN,
     ClassAgreement,
     CorrectnessStatistics,
     DriftStatistics,
@@ -58,6 +61,8 @@ from semstab.statistics.cube_sums import (
     row_columns,
 )
 from semstab.statistics.drift import expected_sbd
+from semstab.statistics.feature_spots import FeatureObservations
+from semstab.statistics.features import feature_agreement
 from semstab.statistics.frame_disagreement import LoneDisagreement, by_frame, lone_disagreement, outlying_frames
 from semstab.statistics.geometry import losses
 from semstab.statistics.groupings import groupings
@@ -160,6 +165,7 @@ def analyse(
     sample: MapSample,
     spots: SpotObservations | None = None,
     *,
+    features: FeatureObservations | None = None,
     limit: VoxelTable | None = None,
     name: str = "",
     seed: int = 0,
@@ -179,6 +185,7 @@ def analyse(
         sample: The map, or a sample of it, with its log and the ground truth.
         spots: Labels that views give spots, taken of the same frames by a `Sampler`; without them there is no alpha and
             no verdict.
+        features: Features that views give spots, taken by the same sampler.
         limit: The map of view-independent labels; the ground truth's where it is not given.
         name: Name of the model, for the verdict.
         seed: Seed of random orders.
@@ -190,6 +197,7 @@ def analyse(
         moving_untold: Why it is not told which spots moved.
     """
     table, events = sample.table.measured(), sample.events
+    alone = spots is not None and spots.classes == OF_FEATURES.classes
     truth = None if sample.truth is None else join_truth(table, sample.truth)
     limit = sample.truth if limit is None else limit
 
@@ -222,7 +230,7 @@ def analyse(
     moved = None if spots is None else moved_spots(spots, sums, headline.alpha, scope, frame_name)
     stability = verdict(
         name or "model", headline=headline, spots=agreement_of_spots, flips=flips, voxels=repeats, share=repeated.share,
-        limits=limits, moved=moved,
+        limits=limits, moved=moved, labels=not alone,
     )  # fmt: skip
     summary = MapStatistics(
         schema=SCHEMA, name=name, seed=seed, K=table.K, voxel_size=table.voxel_size,
@@ -243,9 +251,29 @@ def analyse(
         groupings=None if spots is None else groupings(spots, sums, scope, limits),
         moved=moved,
         moving_untold=moving_untold,
+        features=None if features is None else feature_agreement(features, scope, alone=alone, name=frame_name),
     )  # fmt: skip
+    if alone:
+        summary, lone = _without_classes(summary), None
     moving = {} if spots is None else moving_percent(spots)
     return Analysis(summary, whole, sums, sample, shares, drawn, lone, moving)
+
+
+def _without_classes(summary: MapStatistics) -> MapStatistics:
+    """Return the statistics of the map of a model without labels: no number of labels is defined."""
+
+    def unknown(section: Any) -> Any:
+        values = {field.name: getattr(section, field.name) for field in dataclasses.fields(section)}
+        nothing: dict[type, Any] = {Interval: UNKNOWN, float: math.nan, tuple: ()}
+        changed = {name: nothing[type(value)] for name, value in values.items() if type(value) in nothing}
+        return dataclasses.replace(section, **changed)
+
+    means = MeasureMeans(dict.fromkeys((measure.key for measure in measures()), math.nan), {})
+    strata = tuple(dataclasses.replace(unknown(own), means=means) for own in summary.strata)
+    sections = {name: unknown(getattr(summary, name)) for name in ("agreement", "headline", "drift", "uncertainty")}
+    sections |= dict.fromkeys(("flipping", "correlogram", "geometry", "correctness"))
+    sections |= dict.fromkeys(("outlying_frames", "ranges", "groupings", "moved"))
+    return dataclasses.replace(summary, **sections, strata=strata)
 
 
 def _means(locations: ClusterSums, sums: ClusterSums, scope: Scope) -> dict[str, Interval]:

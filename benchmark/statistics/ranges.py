@@ -39,7 +39,7 @@ def range_agreement(
     if not len(spots):
         return None
     distance = spots.distance
-    edges = _edges(distance)
+    edges = edges_of(distance)
     if len(edges) < 3:
         return None
     strata = []
@@ -54,7 +54,7 @@ def range_agreement(
     return RangeAgreement(tuple(strata), limits.usable, *_reliable(strata, limits.usable))
 
 
-def _edges(distance: Float64) -> list[float]:
+def edges_of(distance: Float64) -> list[float]:
     """Return ends of strata that each have enough entries, the first one 0; the last one is the farthest distance."""
     least = max(LEAST_ENTRIES, LEAST_SHARE * len(distance))
     chosen, below = [0.0], 0

@@ -19,9 +19,10 @@ import numpy as np
 import numpy.typing as npt
 
 from semstab.core.arrays import Rows
-from semstab.core.types import Float64, Int64, Mask, UInt16
+from semstab.core.types import Float64, Int32, Int64, Mask, UInt16
 from semstab.data.frames import Frame
 from semstab.data.labels import fixed
+from semstab.statistics.feature_spots import FeatureObservations, FeatureStore
 from semstab.statistics.observations import COLUMNS, TYPES, VIEW, SpotObservations, Views
 from semstab.statistics.votes import DepthMemory, KeptDepth, SpotVotes, firm
 
@@ -162,6 +163,8 @@ class Sampler:
         self._noise = 0.0
         self._widths: list[float] = []
         self._known = 0
+        self._features = FeatureStore()
+        self._pixel: tuple[Int32, Int64] | None = None
         self._clear()
 
     def _clear(self) -> None:
@@ -170,10 +173,13 @@ class Sampler:
         self._found, self._firm = np.empty(1 << 12, np.int32), np.ones(1 << 12, np.bool_)
         self._table = np.full(1 << 14, -1, np.int64)
         self._columns = {name: np.empty(1 << 14, dtype) for name, dtype in TYPES.items()}
+        self._features.clear()
 
     def add(self, frame: Frame) -> None:
         """Add the answers of a frame."""
         self._frames += 1
+        if frame.features is not None:
+            self._features.start(frame)
         few = frame.depth[:: _few(frame.shape), :: _few(frame.shape)]
         few = few[(few > 0) & (few < np.inf)]
         if not len(few):
@@ -188,16 +194,22 @@ class Sampler:
             self._noise = _noise(frame)
             self._find(frame, T, seed)
             self._remember(view, frame, T, None)
-            self._take(view, *self._answers_of_image(frame, T, seed))
+            answers = self._answers_of_image(frame, T, seed)
         else:
             self._find_in_points(sparse, T, seed)
             self._remember(view, frame, T, sparse)
-            self._take(view, *self._answers_of_points(frame, sparse, T, seed))
+            answers = self._answers_of_points(frame, sparse, T, seed)
+        if frame.features is not None:
+            self._take_features(frame, sparse, view, *answers[:2])
+        self._take(view, *answers)
 
     def _view_of(self, frame: Frame, depth: float, sparse: Sparse | None) -> int | None:
         """Return the view of a frame with this median depth, a new one or not; None if the frame repeats another."""
         small = frame.predicted[:: max(1, -(-frame.shape[0] // SIDE)), :: max(1, -(-frame.shape[1] // SIDE))]
-        digest = hashlib.blake2b(np.ascontiguousarray(small).tobytes(), digest_size=16).digest()
+        hashed = hashlib.blake2b(np.ascontiguousarray(small).tobytes(), digest_size=16)
+        if frame.features is not None:
+            hashed.update(np.ascontiguousarray(frame.features.vectors).data)
+        digest = hashed.digest()
         same = self._seen.get(digest)
         if same is not None and same.sees_alike(frame):
             return None
@@ -305,6 +317,7 @@ class Sampler:
         n = project(self._point[:n], *where, spot, pixel, x, y, error, room)
         spot, pixel, x, y, error, room = spot[:n], pixel[:n], x[:n], y[:n], error[:n], room[:n]
         self._learn(self._known, spot, error)
+        self._pixel = spot, pixel
         out = _room(n)
         m = answer(
             spot, pixel, x, y, room, self._allowed(), fixed(frame.depth), *_labels(frame), self.K, camera, self._hash,
@@ -321,6 +334,7 @@ class Sampler:
         n = project_sparse(self._point[:n], *sparse.arrays, *place, T, spot, x, y, error, room, nearest)
         spot, x, y, error, room, nearest = spot[:n], x[:n], y[:n], error[:n], room[:n], nearest[:n]
         self._learn(self._known, spot, error)
+        self._pixel = spot, nearest
         out = _room(n)
         if sparse.labels is None:
             m = answer_sparse(
@@ -346,10 +360,24 @@ class Sampler:
         while self._answers > self.budget or self._spots > MOST_SPOTS:
             self._halve()
 
+    def _take_features(self, frame: Frame, sparse: Sparse | None, view: int, spot: Int32, label: UInt16) -> None:
+        """Add the features of a view at the pixels, or points, that answer for spots, whatever their labels."""
+        assert frame.features is not None
+        assert self._pixel is not None
+        spot = spot[label <= self.K]
+        seen, pixel = self._pixel
+        pixel = pixel[np.searchsorted(seen, spot)]
+        if sparse is None:
+            v, u = np.divmod(pixel, frame.shape[1])
+        else:
+            u, v = (pixel, 0 * pixel) if frame.is_scan else (sparse.u[pixel], sparse.v[pixel])
+        self._features.add(frame.features, view, spot, frame.features.cells(u, v), self._hash)
+
     def _halve(self) -> None:
         self._share //= 2
         left = self._hash[: self._spots] < self._share
         number = np.cumsum(left, dtype=np.int32) - 1
+        self._features.renumber(left, number)
         rows = np.flatnonzero(left[self._columns["spot"][: self._answers]])
         for name, column in self._columns.items():
             column[: len(rows)] = number[column[rows]] if name == "spot" else column[rows]
@@ -393,6 +421,10 @@ class Sampler:
             return None
         n, views = self._spots, len(self._views)
         return self._memory.votes_on(self._point[:n], self._found[:n], self._firm[:n], views, self._sigma)
+
+    def features(self) -> FeatureObservations | None:
+        """Return a copy of the features of the sample so far; None without features."""
+        return self._features.sample(self.sample())
 
 
 def _room(n: int) -> tuple[Any, ...]:

@@ -74,6 +74,7 @@ ACTED_ON, LEAST_FLIPS = ("stable", "usable"), 0.001
 
 NO_SPOTS = "no spots were sampled; give the observations of a `Sampler`"
 TOO_FEW_VOXELS = "its map has too few locations to act on; use smaller voxels, or frames that overlap more"
+FEATURES_ALONE = "it gives features and no labels; VSS, SBD, entropy, flicker and classes have no number"
 EMPTY = "no spot was sampled: no pixel has both depth and a label that counts; see exclude, masks and the depth range"
 STILL = "all frames show one view: the camera stood still, or moved by less than a sampled pixel shows (pixel_stride)"
 
@@ -125,6 +126,7 @@ def verdict(
     share: float,
     limits: Limits = LIMITS,
     moved: MovedSpots | None = None,
+    labels: bool = True,
 ) -> StabilityVerdict:
     """Return the most probable level of alpha, and the level if what the model leaves out counts as disagreeing.
 
@@ -141,9 +143,10 @@ def verdict(
         share: Their share of all voxels.
         limits: Limits of the levels.
         moved: Spots that moved.
+        labels: Whether the model gives labels; without them there is no verdict.
     """
     support = f"{voxels} locations seen twice or more, {share:.0%} of the map"
-    if reason := _missing(spots, voxels):
+    if reason := _missing(spots, voxels) if labels else FEATURES_ALONE:
         return StabilityVerdict("no verdict", math.nan, f"{model}: no verdict, {reason}; {support}")
     assert spots is not None
     of_all_spots, static = headline.alpha, moved if moved is not None and moved.are_found else None

@@ -13,6 +13,7 @@ import numpy as np
 
 from semstab.config import nearest
 from semstab.core.types import Mask, UInt16
+from semstab.data.features import OF_FEATURES
 from semstab.data.labels import IGNORE_16BIT, LabelSpace, ignore_id
 from semstab.datasets.files.options import (
     NO_TRUTH,
@@ -33,18 +34,19 @@ from semstab.errors import ConfigError, DataError
 
 logger = logging.getLogger("semstab")
 
-Kind = Literal["labels", "scores", "masks", "points", "truth"]
+Kind = Literal["labels", "scores", "features", "masks", "points", "truth"]
 KINDS: tuple[Kind, ...] = ("labels", "scores")
 SUFFIXES: Mapping[Kind, tuple[str, ...]] = {
     "labels": images.LABEL_SUFFIXES,
     "scores": images.SCORE_SUFFIXES,
+    "features": images.SCORE_SUFFIXES,
     "masks": images.MASK_SUFFIXES,
     "points": (".label", ".bin", ".npy", ".las", ".laz", ".ply"),
     "truth": (*images.LABEL_SUFFIXES, ".label", ".hdf5"),
 }
 LOSSY_SUFFIXES = (".jpg", ".jpeg")
 DEFAULTS: Mapping[Kind, str] = {"labels": "labels/{model}/{name}", "scores": "scores/{model}/{name}"}
-REGIONS = "regions/{model}/{name}"
+REGIONS, FEATURES = "regions/{model}/{name}", "features/{model}/{name}"
 LABEL_SPACE_FILE = "label_space.yaml"
 """A taxonomy file in a folder of label maps or scores: their classes, where they are not the scene's."""
 
@@ -290,6 +292,14 @@ class LabelMaps:
         if both := next((name for name in regions if name in labels), None):
             raise DataError(f"{base / 'regions' / both}: labels/{both} is called '{both}' too; rename one")
         regions = {name: source for name, source in regions.items() if source.first is not None}
+        template = Template("features", FEATURES, ("model", "name"), ("model", "name"))
+        features = {
+            name: LabelSource.of("features", base, filled, frames, folders)
+            for name, filled in matching_folders(base, template, "model", scene=entry.below_root).items()
+        }
+        self._features = {name: source for name, source in features.items() if source.first is not None}
+        self.with_features = tuple(self._features)
+        labels |= {name: source for name, source in self._features.items() if name not in (*labels, *regions)}
         self.models = tuple(name for name in labels if name != GROUND_TRUTH)
         self.ground_truth = GROUND_TRUTH in labels
         self.regions = tuple(regions)
@@ -331,6 +341,23 @@ class LabelMaps:
             )
         return file
 
+    def features_file(self, frame: Named, model: str) -> Path | None:
+        """Return the file of a frame's features; None for a model without features.
+
+        Raises:
+            DataError: If the model has features, but not of this frame.
+        """
+        source = self._features.get(model)
+        if source is not None and (lost := source.missing(frame)):
+            raise DataError(f"{self._folder}: {listed(lost, str(self._folder))}; add it, or choose other frames")
+        return None if source is None else source.file(frame)
+
+    def missing(self, frame: Named, model: str) -> list[str]:
+        """Return the paths that the files of that frame would have which are not there: labels, features."""
+        features = self._features.get(model)
+        lost = [*self.source(model).missing(frame), *([] if features is None else features.missing(frame))]
+        return [*dict.fromkeys(lost)]
+
     def space(self, model: str) -> LabelSpace | None:
         """Return the classes of a label source, read once; None for regions, and where no file or option has them.
 
@@ -341,7 +368,8 @@ class LabelMaps:
         """
         if model not in self._spaces:
             source = self.source(model)
-            self._spaces[model] = None if model in self.regions else self._stated_space(model, source)
+            classless = model in self.regions or source.kind == "features"
+            self._spaces[model] = None if classless else self._stated_space(model, source)
         return self._spaces[model]
 
     def _stated_space(self, model: str, source: LabelSource) -> LabelSpace | None:
@@ -365,6 +393,8 @@ class LabelMaps:
     def label_space(self, model: str, where: Path) -> LabelSpace:
         """Return the same; raises DataError with `where` where they are not known, ConfigError where it has none."""
         source = self.source(model)
+        if source.kind == "features":
+            return OF_FEATURES
         if model in self.regions:
             raise ConfigError(f"{self._folder}: '{model}' holds regions without classes, which cannot be fused")
         space = self.space(model)

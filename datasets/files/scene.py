@@ -16,6 +16,7 @@ import numpy as np
 from semstab.core.arrays import RecentArrays
 from semstab.core.prefetch import prefetch
 from semstab.core.types import Float32, Float64, UInt8
+from semstab.data.features import Features
 from semstab.data.frames import Frame, Intrinsics
 from semstab.data.labels import LabelSpace
 from semstab.datasets.files.depth import shape_of, stored_depth, stored_scale
@@ -35,6 +36,7 @@ from semstab.datasets.formats.images import (
     depth_size,
     read_color,
     read_confidence,
+    read_features,
 )
 from semstab.datasets.geometry.cameras import UP_AXES, Camera, Poses, to_camera_to_world
 from semstab.datasets.geometry.lenses import (
@@ -59,7 +61,7 @@ PLACES = {
 DEPTH_BYTES = 1 << 27
 """The most bytes of depth images that stay in memory."""
 
-DEPTH, CONFIDENCE, LABELS, MASK = "depth", "confidence", "labels of ", "mask"
+DEPTH, CONFIDENCE, LABELS, FEATURES, MASK = "depth", "confidence", "labels of ", "features of ", "mask"
 """Kinds of a frame's files."""
 
 
@@ -104,6 +106,7 @@ class FileScene(Scene):
         self._folders = folders or Folders()
         self._maps = LabelMaps(options, entry, frames, self._folders, label_folders or {}, truth)
         self.models = self._maps.models
+        self.with_features = self._maps.with_features
         self.ground_truth = self._maps.ground_truth
         self.regions = self._maps.regions
         self.unread = self._maps.unread
@@ -147,7 +150,7 @@ class FileScene(Scene):
         files = [self.surface or frame.depth, *([frame.pose_file] if frame.pose is None else [])]
         files += [frame.confidence] if frame.confidence is not None and self.surface is None else []
         lost = [str(path) for path in files if not self._folders.has(path)]
-        lost += [path for name in sources for path in self._maps.source(name).missing(frame)]
+        lost += [path for name in sources for path in self._maps.missing(frame, name)]
         if color and self._color_file(frame) is None:
             lost.append(f"{self.folder}: the colour of {frame.name}" if frame.color is None else str(frame.color))
         if color and frame.label_lens is not None and not self._folders.has(frame.photograph or Path()):
@@ -185,6 +188,9 @@ class FileScene(Scene):
         file, kind = self._maps.file(self._frame(index), model), self._maps.source(model).kind
         read = self._reader(index, LABELS + model)
         depth, labels, scores = self.depth(index), None, None
+        features = self._features(index, model, (depth.shape[0], depth.shape[1]))
+        if kind == "features":
+            return self._framed(index, depth, None, None, color=color, features=features, files={"features": file})
         if kind != "scores":
             own = self._sizes(index, depth.shape, file, "labels are")
             ids = self._maps.labels(model, file, read, own, self._frame(index))
@@ -194,7 +200,16 @@ class FileScene(Scene):
             stored = self._maps.scores(model, file, (depth.shape[0], depth.shape[1]), read, own)
             scores = self._stored(index, stored, depth.shape, file, "scores are")
         what = "labels" if scores is None else "scores"
-        return self._framed(index, depth, labels, scores, color=color, files={what: file})
+        return self._framed(index, depth, labels, scores, color=color, features=features, files={what: file})
+
+    def _features(self, index: int, model: str, shape: Size) -> Features | None:
+        """Return the features of a frame, at the pixels of its depth image of shape (H, W); None without any."""
+        source = self._frame(index)
+        if (path := self._maps.features_file(source, model)) is None:
+            return None
+        if source.label_lens is not None or source.label_camera is not None:
+            raise DataError(f"{path}: is of a photograph with another camera than the depth; features need the depth's")
+        return read_features(path, shape, self._reader(index, FEATURES + model))
 
     def geometry(self, index: int, *, color: bool = False) -> Frame:
         """Return the frame but for its labels: all pixels are of class 0.
@@ -410,6 +425,7 @@ class FileScene(Scene):
         labels, mask = self._maps.file(source, model), self._maps.mask_file(source)
         confidence = None if depth is None else source.confidence
         files = {DEPTH: depth, CONFIDENCE: confidence, LABELS + model: labels, MASK: mask}
+        files |= {FEATURES + model: self._maps.features_file(source, model)}
         return {(index, what): path for what, path in files.items() if path is not None}
 
     def _view(self, index: int) -> View:
@@ -424,6 +440,7 @@ class FileScene(Scene):
         scores: Scores | None,
         *,
         color: bool,
+        features: Features | None = None,
         files: Mapping[str, Path] | None = None,
     ) -> Frame:
         source, timestamps = self._frame(index), self.timestamps
@@ -438,7 +455,7 @@ class FileScene(Scene):
         known |= dict(files or {})
         return Frame(
             index=int(index), depth=depth, intrinsics=self.intrinsics(index, depth.shape), T_wc=self.T_wc(index),
-            labels=labels, scores=scores, color=self.color(index) if color else None, mask=masked,
+            labels=labels, scores=scores, features=features, color=self.color(index) if color else None, mask=masked,
             timestamp=None if timestamps is None else float(timestamps[index]),
             files={what: str(path) for what, path in known.items() if path is not None},
         )  # fmt: skip

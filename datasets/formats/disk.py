@@ -147,6 +147,12 @@ def decode_array(path: Path, data: bytes, key: str, claimed: Claimed | None = No
     return _decode_npy(str(path), data, claimed)
 
 
+def names_in(data: bytes) -> list[str]:
+    """Return the names of the arrays in the content of an .npz file that `decode_array` has read."""
+    with zipfile.ZipFile(io.BytesIO(data)) as archive:
+        return [name.removesuffix(".npy") for name in archive.namelist()]
+
+
 def _decode_npy(where: str, data: bytes | bytearray, claimed: Claimed | None = None) -> npt.NDArray[Any]:
     """Return the array; numpy itself would evaluate the header as Python, and allocate the claimed size."""
     sizes, kind, order, start = _claims(where, data)

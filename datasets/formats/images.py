@@ -23,8 +23,9 @@ import numpy as np
 import numpy.typing as npt
 
 from semstab.core.types import Float32, Mask, UInt8, UInt16, UInt32
+from semstab.data.features import Features
 from semstab.data.labels import IGNORE_8BIT, IGNORE_16BIT, LabelSpace
-from semstab.datasets.formats.disk import AGAIN, NPY_SHAPE, Claimed, decode_array, read_bytes
+from semstab.datasets.formats.disk import AGAIN, NPY_SHAPE, Claimed, decode_array, names_in, read_bytes
 from semstab.datasets.geometry.lenses import Labels
 from semstab.errors import ConfigError, DataError, summarize_error
 
@@ -210,6 +211,31 @@ def read_scores(
     data = read(path)
     scores = decode_array(path, data, "scores", claimed)
     return np.ascontiguousarray(scores.transpose(1, 2, 0) if layout == "KHW" else scores)
+
+
+def read_features(path: Path, size: Size, read: Read = read_bytes) -> Features:
+    """Return features of an image of `size` (H, W): an .npy (h, w, D), or an .npz with `features` and their grid.
+
+    The grid covers the image evenly, unless the .npz has `first` and `step`: column and row, in pixels of the depth, of
+    the first cell's centre, and columns and rows from one centre to the next.
+
+    Raises:
+        DataError: If the file has another type or layout, or is damaged.
+    """
+
+    def claimed(shape: tuple[int, ...], dtype: np.dtype[Any]) -> None:
+        if len(shape) != 3 or dtype.kind != "f":
+            raise DataError(f"{path}: features must be float (h, w, D), got {dtype} of shape {shape}")
+
+    data = read(path)
+    vectors = decode_array(path, data, "features", claimed)
+    try:
+        if path.suffix.lower() == ".npz" and {"first", "step"} <= set(names_in(data)):
+            (u, v), (across, down) = (decode_array(path, data, name).ravel().tolist() for name in ("first", "step"))
+            return Features(vectors, (u, v), (across, down))
+        return Features.over(vectors, size)
+    except (DataError, ValueError) as error:
+        raise DataError(f"{path}: {error}") from error
 
 
 def read_confidence(path: Path, read: Read = read_bytes, own: FrameSize = ANY_SIZE) -> UInt8 | UInt16:

@@ -19,6 +19,7 @@ from semstab.data.statistics.agreement import (
 )
 from semstab.data.statistics.correctness import Correctness, CorrectnessStatistics, Losses, Quadrants, Reliability
 from semstab.data.statistics.drift import DriftStatistics, Flipping, FlipRates, FrameDisagreement, OutlyingFrames
+from semstab.data.statistics.features import FeatureAgreement, FeaturePlace
 from semstab.data.statistics.groupings import Grouping, Groupings, Merge
 from semstab.data.statistics.intervals import CONFIDENCE, UNDEFINED, UNKNOWN, Estimate, Interval, short
 from semstab.data.statistics.map_statistics import (
@@ -46,6 +47,8 @@ __all__ = [
     "DriftStatistics",
     "EntropyParts",
     "Estimate",
+    "FeatureAgreement",
+    "FeaturePlace",
     "FlipRates",
     "Flipping",
     "FrameAgreement",

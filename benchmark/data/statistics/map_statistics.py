@@ -11,6 +11,7 @@ from semstab.data.measures import MeasureMeans
 from semstab.data.statistics.agreement import Correlogram, FrameAgreement, RangeAgreement, SpotAgreement
 from semstab.data.statistics.correctness import CorrectnessStatistics, Losses
 from semstab.data.statistics.drift import DriftStatistics, Flipping, OutlyingFrames
+from semstab.data.statistics.features import FeatureAgreement
 from semstab.data.statistics.groupings import Groupings
 from semstab.data.statistics.intervals import Interval, short
 from semstab.data.statistics.moving import MovedSpots
@@ -149,6 +150,7 @@ class MapStatistics:
     groupings: Groupings | None = None
     moved: MovedSpots | None = None
     moving_untold: str = ""
+    features: FeatureAgreement | None = None
 
     def __repr__(self) -> str:
         return f"<MapStatistics '{self.name}': {self.stated}>"
@@ -156,6 +158,8 @@ class MapStatistics:
     @property
     def stated(self) -> str:
         """The verdict and the number that it rests on: 'stable (p .98), alpha .93 (.92 to .95)'."""
+        if self.features is not None and self.features.alone:
+            return f"alpha of features {self.features.alpha.text()}"
         static = "" if self.static is None else f", alpha (static) {self.static.alpha.text()}"
         return f"{self.verdict}, alpha {self.headline.alpha.text()}{static}"
 

@@ -12,6 +12,7 @@ from semstab.errors import ConfigError
 from semstab.report.filter_study import of_interest
 from semstab.report.tables.backends import agreement, compared, fusion, fusion_correctness
 from semstab.report.tables.correctness import ceiling, correctness, correlogram
+from semstab.report.tables.features import feature_places, features
 from semstab.report.tables.filters import filter_tables
 from semstab.report.tables.flicker import flicker
 from semstab.report.tables.paper import paper
@@ -48,8 +49,8 @@ __all__ = [
 
 BUILDERS = (
     overview, paper, verdicts, flicker, video_measures, scenes, persistence, classes, temporal_agreement, correlogram,
-    class_agreement, merges, ranges, drift, frames, uncertainty, ceiling, correctness, cross_model, sensitivity,
-    reduced, fusion, fusion_correctness, compared, agreement,
+    class_agreement, merges, features, feature_places, ranges, drift, frames, uncertainty, ceiling, correctness,
+    cross_model, sensitivity, reduced, fusion, fusion_correctness, compared, agreement,
 )  # fmt: skip
 """The functions that make tables, in the paper's order; without numbers for its tables a function returns none."""
 
@@ -57,7 +58,7 @@ OF_IMAGES = (flicker, video_measures, frames)
 """Those of them that also have rows for videos, which have no map."""
 
 WRITTEN = (
-    "filters", "findings", "overview", "verdicts", "scenes", "persistence", "classes", "class_agreement",
+    "filters", "findings", "overview", "verdicts", "features", "scenes", "persistence", "classes", "class_agreement",
     "temporal_agreement", "flicker", "ranges", "frames", "correctness", "video_measures", "sensitivity", "fusion",
     "agreement",
 )  # fmt: skip

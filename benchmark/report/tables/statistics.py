@@ -36,6 +36,7 @@ INTERVALS = (
     f"Brackets hold intervals at {CONFIDENCE:.0%}: of alpha, PSA and accuracy for this scene flown again if there are"
     f" {LEAST_FRAMES} frames, of other numbers for these frames."
 )
+NO_LABELS = "it gives features and no labels: see alpha of features"
 SEEN_TWICE = "The table shows the voxels seen twice or more."
 
 T = TypeVar("T")
@@ -412,5 +413,5 @@ def _verdict_row(record: Record, stats: MapStatistics) -> Row:
         UNDEFINED if right is None else right.quadrants.wrong_of_consistent_op3.percent,
         stats.repeated.voxels,
         100 * stats.repeated.share,
-        ADVICE[stats.verdict.decisive],
+        NO_LABELS if stats.features is not None and stats.features.alone else ADVICE[stats.verdict.decisive],
     )

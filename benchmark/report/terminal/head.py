@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping, Sequence
 
 from semstab.core.types import THESE_FRAMES
+from semstab.data.features import OF_FEATURES
 from semstab.data.records import Result
 from semstab.data.results import UnitSummary
 from semstab.report.narrative import noted
@@ -21,8 +22,9 @@ def head_lines(name: str, result: Result, runs: Sequence[UnitSummary], width: in
     views = min((each.views for each in spots if each is not None and each.views < each.frames), default=None)
     seen = "" if views is None else f" of {views} distinct views"
     chosen = " (chosen)" if any(advice.chosen for advice in result.advice.values()) else ""
-    classes = " and ".join(map(str, sorted({run.table.K for run in runs})))
-    what = f"{counts} frames{seen}, {classes} classes, {_metres(first.table.voxel_size)} voxels{chosen}"
+    numbers = {run.table.K for run in runs if run.taxonomy != OF_FEATURES.name}
+    of = f"{' and '.join(map(str, sorted(numbers)))} classes" if numbers else "features"
+    what = f"{counts} frames{seen}, {of}, {_metres(first.table.voxel_size)} voxels{chosen}"
     beside = "    ".join(filter(None, (_geometry(result), _scope(runs))))
     line = f"{name}    {what}    {beside}".rstrip()
     yield line if len(line) <= width else f"{name}    {what}\n  {beside}".rstrip()

@@ -80,7 +80,10 @@ def _model_row(name: str, records: Sequence[Record]) -> list[str]:
     statistics = [record.statistics for record in records if record.statistics is not None]
     levels = Counter(own.verdict.decisive for own in statistics).most_common()
     verdicts = levels[0][0] if len(levels) == 1 else ", ".join(f"{level} {n}" for level, n in levels[:2])
-    alpha = over_scenes([own.headline.alpha.value for own in statistics])
+    of_features = [own.features.alpha.value for own in statistics if own.features is not None and own.features.alone]
+    if of_features:
+        verdicts = "features"
+    alpha = over_scenes(of_features or [own.headline.alpha.value for own in statistics])
     agree = 100 * macro_mean([own.agreeing for own in statistics])
     flicker = macro_mean([record.image_space.compensated_flicker_percent for record in records])
     recurrent = pooled(records).recurrent
@@ -110,6 +113,9 @@ def _cell(records: Sequence[Record], scene: str, *, interval: bool) -> str:
     if statistics is None:
         return "-"
     alpha = statistics.headline.alpha
+    if statistics.features is not None and statistics.features.alone:
+        alpha = statistics.features.alpha
+        return f"features {alpha.text() if interval else short(alpha.value)}"
     return f"{statistics.verdict.decisive} {alpha.text() if interval else short(alpha.value)}"
 
 

@@ -14,6 +14,7 @@ from semstab.metrics import CATEGORIES
 from semstab.report.means import ENOUGH
 from semstab.report.narrative import nearly_all
 from semstab.report.terminal.disagreement import class_lines, outlying_lines
+from semstab.report.terminal.features import features_alone
 from semstab.report.terminal.head import head_lines
 from semstab.report.terminal.layout import LEVELS, WIDTH, percent, percents, wrapped
 from semstab.statistics.verdict import DANGEROUS, LIMITS, why_undecided
@@ -23,6 +24,9 @@ def one_model(result: Result, record: Record, width: int) -> Iterator[str]:
     """Yield the verdict, the shares of the map, flicker, the classes that disagree most, and the paper's means."""
     run, statistics = record.summary, record.summary.statistics
     yield from head_lines(f"{run.unit.scene} / {run.unit.model}", result, [run], width)
+    if statistics is not None and statistics.features is not None and statistics.features.alone:
+        yield from features_alone(statistics.features, record)
+        return
     if statistics is not None:
         yield from _verdict(run)
     recurrent, shares = run.table.recurrent, run.table.categories
@@ -71,12 +75,10 @@ def _verdict(run: UnitSummary) -> Iterator[str]:
     yield f"  two views see the same class at {percent(statistics.agreeing)} of the spots"
     if told and statistics.verdict.level != "misleading":
         yield f"  {told}"
-    if statistics.told_ranges is not None:
-        yield from wrapped(statistics.told_ranges.text)
-    if statistics.groupings is not None:
-        yield from wrapped(statistics.groupings.text)
-    if statistics.spots is not None and statistics.spots.meaning is not None:
-        yield from wrapped(statistics.spots.meaning.text)
+    meaning = None if statistics.spots is None else statistics.spots.meaning
+    for section in (statistics.told_ranges, statistics.groupings, meaning, statistics.features):
+        if section is not None:
+            yield from wrapped(section.text)
     yield ""
 
 

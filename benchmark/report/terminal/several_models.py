@@ -42,6 +42,8 @@ def row_of(record: Record, begin: str = "") -> list[str]:
     if statistics is not None:
         level, alpha = str(statistics.verdict), statistics.headline.alpha.text()
         agree = 100 * statistics.agreeing
+        if statistics.features is not None and statistics.features.alone:
+            level, alpha, agree = "features", statistics.features.alpha.text(), math.nan
     recurrent = run.table.recurrent
     means = {m: recurrent[m] if recurrent.voxels >= ENOUGH else math.nan for m in headlines()}
     shown = [short(value, digits=m.digits[0]) for m, value in means.items()]
@@ -54,6 +56,14 @@ def miou(record: Record) -> float:
     """Return the mIoU of the fused labels seen twice or more; NaN without ground truth."""
     statistics = record.summary.statistics
     return math.nan if statistics is None or statistics.correctness is None else statistics.correctness.miou_op2.value
+
+
+def names_text(record: Record) -> str:
+    """Return how many names of a vocabulary are in use: '19 names, as many as 6.2 of equal size'; '' of others."""
+    spots = None if record.statistics is None else record.statistics.spots
+    if "@" not in record.unit.model or spots is None:
+        return ""
+    return f"{record.summary.table.K} names, as many as {spots.effective_classes:.1f} of equal size"
 
 
 OF_MAP = "of each map"
@@ -90,7 +100,16 @@ def several_models(result: Result, records: Sequence[Record], width: int) -> Ite
         ranges = "" if statistics.told_ranges is None else statistics.told_ranges.text
         merged = "" if statistics.groupings is None else statistics.groupings.text
         meaning = statistics.spots.meaning if statistics.spots is not None else None
-        texts = (statistics.verdict.difference, ranges, merged, "" if meaning is None else meaning.text)
+        features = "" if statistics.features is None else statistics.features.text
+        names = names_text(record)
+        texts = (
+            statistics.verdict.difference,
+            names,
+            ranges,
+            merged,
+            "" if meaning is None else meaning.text,
+            features,
+        )
         for text in filter(None, (*statistics.moving_lines, *texts)):
             yield from wrapped(f"{record.unit.model}: {text}")
     yield ""

@@ -42,6 +42,24 @@ def add_pairs(first, second, bins, cluster, log, square, sums):
 
 
 @serial
+def add_feature_pairs(first, second, start, bins, cluster, agreed, own, along, sums):
+    """Add pairs (m,) of observations to `sums` (bins, clusters, 5), in each of a pair's bins (m, axes).
+
+    agreed (m,) is the cosine of a pair, own the squared length of each observation. along (n, bins) is its part along
+    the sum of a bin, of observation `start` and those that follow.
+    """
+    for pair in range(first.shape[0]):
+        for one in (first[pair], second[pair]):
+            of = cluster[one]
+            for axis in range(bins.shape[1]):
+                k = bins[pair, axis]
+                sums[k, of, 0] += agreed[pair]
+                sums[k, of, 1] += 1.0
+                sums[k, of, 2] += own[one]
+                sums[k, of, 3] += along[one - start, k]
+
+
+@serial
 def add_class_pairs(evidence, op, weight_of, sums):
     """Add to `sums` (K, K), above its diagonal, how much two classes share a voxel, times its weight (n,).
 

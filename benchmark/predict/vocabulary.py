@@ -1,0 +1,233 @@
+"""Vocabularies over features: the label of a cell is the name whose embedding its feature is most like."""
+
+from __future__ import annotations
+
+import functools
+import hashlib
+import io
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Self
+
+import numpy as np
+import numpy.typing as npt
+from pydantic import Field, field_validator, model_validator
+
+from semstab.config import Settings, read_yaml, validated
+from semstab.core.files import read_limited
+from semstab.core.types import Float32, Float64, Int64, UInt8, UInt16
+from semstab.data.features import Features
+from semstab.data.labels import IGNORE_8BIT, IGNORE_16BIT, LabelSpace
+from semstab.errors import ConfigError, DataError, MissingDependencyError
+
+MOST_BYTES = 1 << 28
+"""The largest file of embeddings."""
+
+CELLS = 1 << 22
+"""Most cosines that are in memory at a time."""
+
+
+class NameEntry(Settings):
+    """A name with its synonyms, which count as one."""
+
+    name: str = Field(min_length=1, description="the class")
+    synonyms: list[str] = Field(default_factory=list, description="other words for it, with embeddings of their own")
+    group: str = Field("", description="group of the class, from which distances follow: vehicle/two wheels")
+
+
+class EncoderSettings(Settings):
+    """A text encoder of transformers, as CLIP's."""
+
+    checkpoint: str = Field(description="a folder that save_pretrained wrote, or an id on the Hugging Face hub")
+    templates: list[str] = Field(["a photo of a {}."], min_length=1, description="sentences; {} stands for the name")
+
+    @field_validator("templates")
+    @classmethod
+    def _templates_hold_a_name(cls, value: list[str]) -> list[str]:
+        if lacking := [text for text in value if "{}" not in text]:
+            raise ValueError(f"'{lacking[0]}' lacks {{}}, which stands for the name")
+        return value
+
+
+class VocabularySettings(Settings):
+    """The content of a vocabulary's file."""
+
+    name: str | None = Field(None, min_length=1, description="its name; that of the file by default")
+    names: list[NameEntry] = Field(description="names, or name, synonyms, group")
+    embeddings: Path | None = Field(
+        None, description=".npy (n, D): a row for each name and then for each of its synonyms, in order"
+    )
+    encoder: EncoderSettings | None = Field(None, description="a text encoder that makes the embeddings")
+    normalise: bool = Field(True, description="bring embeddings to unit length; false for a classifier's weights")
+    threshold: float | None = Field(None, description="cosine below which a cell has no label; none by default")
+    models: list[str] | None = Field(None, description="models whose features it is for; all by default")
+
+    @field_validator("names", mode="before")
+    @classmethod
+    def _plain_names(cls, value: Any) -> Any:
+        return (
+            [{"name": each} if isinstance(each, str) else each for each in value] if isinstance(value, list) else value
+        )
+
+    @model_validator(mode="after")
+    def _is_complete(self) -> Self:
+        if len(self.names) < 2:
+            raise ValueError(
+                f"has {len(self.names)} name; at least 2 are needed, so that there is something to tell apart"
+            )
+        if (self.embeddings is None) == (self.encoder is None):
+            raise ValueError("give embeddings or encoder, one of the two")
+        return self
+
+
+@dataclass(frozen=True, eq=False)
+class Vocabulary:
+    """Names with embeddings.
+
+    Attributes:
+        space: The names as classes; synonyms are their members.
+        embeddings: (n, D) float32 of names and synonyms.
+        of: (n,) the class of each of them.
+        threshold: Product of embedding and feature below which a cell has no label; None for none.
+        where: Its file, for messages.
+        models: Models whose features it is for; None for all.
+    """
+
+    space: LabelSpace
+    embeddings: Float32
+    of: Int64
+    threshold: float | None
+    where: str
+    models: tuple[str, ...] | None = None
+
+    @classmethod
+    def load(cls, path: Path) -> Vocabulary:
+        """Read a vocabulary's file.
+
+        Raises:
+            ConfigError: If the file is none, or two names are alike.
+            DataError: If its embeddings cannot be used.
+            MissingDependencyError: If its text encoder needs packages that are not installed.
+        """
+        settings = validated(VocabularySettings, read_yaml(path), f"{path}: ")
+        words = [word for each in settings.names for word in (each.name, *each.synonyms)]
+        of = np.repeat(np.arange(len(settings.names)), [1 + len(each.synonyms) for each in settings.names])
+        try:
+            space = LabelSpace(
+                settings.name or path.stem,
+                tuple(each.name for each in settings.names),
+                members=tuple(tuple(each.synonyms) for each in settings.names),
+                groups=tuple(each.group for each in settings.names),
+            )
+        except ConfigError as error:
+            raise ConfigError(f"{path}: {str(error).replace('taxonomy', 'vocabulary', 1)}") from error
+        if settings.encoder is not None:
+            embeddings = _encoded(settings.encoder, words, path)
+        else:
+            assert settings.embeddings is not None
+            embeddings = _stored(path.parent / settings.embeddings, words)
+        length = np.linalg.norm(embeddings, axis=1)
+        if not (wrong := np.isfinite(length) & (length > 0)).all():
+            word = words[int(np.flatnonzero(~wrong)[0])]
+            raise DataError(f"{path}: the embedding of '{word}' has no length or is not finite")
+        if settings.normalise:
+            embeddings = (embeddings / length[:, None]).astype(np.float32)
+        models = None if settings.models is None else tuple(settings.models)
+        return cls(space, embeddings, of.astype(np.int64), settings.threshold, str(path), models)
+
+    def is_for(self, model: str) -> bool:
+        """Return whether it is for the features of a model."""
+        return self.models is None or model in self.models
+
+    @functools.cached_property
+    def digest(self) -> str:
+        """A hash of all that labels depend on."""
+        content = hashlib.blake2b(repr((self.space.to_dict(), self.threshold)).encode(), digest_size=16)
+        content.update(np.ascontiguousarray(self.embeddings).data)
+        content.update(self.of.tobytes())
+        return content.hexdigest()
+
+    @property
+    def distances(self) -> Float64:
+        """(K, K) 1 - cosine of names, each the mean of its words' embeddings of unit length."""
+        unit = self.embeddings.astype(np.float64)
+        unit /= np.linalg.norm(unit, axis=1, keepdims=True)
+        means = np.stack([unit[self.of == k].mean(axis=0) for k in range(len(self.space))])
+        means /= np.maximum(np.linalg.norm(means, axis=1, keepdims=True), 1e-12)
+        distances = np.clip(1 - means @ means.T, 0.0, None)
+        np.fill_diagonal(distances, 0.0)
+        symmetric: Float64 = (distances + distances.T) / 2
+        return symmetric
+
+    def labels(self, features: Features, where: str) -> UInt8 | UInt16:
+        """Return ids (h, w) of the likeliest name of each cell, the ignore id below the threshold.
+
+        Raises:
+            DataError: If features have another number of components than embeddings.
+        """
+        if self.embeddings.shape[1] != features.D:
+            raise DataError(
+                f"{self.where}: embeddings have {self.embeddings.shape[1]} components, and features {features.D}"
+                f" ({where}); take embeddings of the network that gives the features"
+            )
+        vectors = features.vectors.reshape(-1, features.D)
+        dtype, ignored = (np.uint8, IGNORE_8BIT) if len(self.space) <= IGNORE_8BIT else (np.uint16, IGNORE_16BIT)
+        ids: npt.NDArray[Any] = np.empty(len(vectors), dtype)
+        step = max(1, CELLS // len(self.embeddings))
+        for start in range(0, len(vectors), step):
+            likeness = vectors[start : start + step].astype(np.float32) @ self.embeddings.T
+            best = likeness.argmax(axis=1)
+            own = self.of[best].astype(dtype)
+            if self.threshold is not None:
+                own[np.take_along_axis(likeness, best[:, None], axis=1)[:, 0] < self.threshold] = ignored
+            ids[start : start + step] = own
+        return ids.reshape(features.vectors.shape[:2])
+
+    def frame_labels(self, features: Features, shape: tuple[int, int], where: str) -> UInt8 | UInt16:
+        """Return ids (H, W) at the pixels of the depth: each pixel has the label of the cell that it falls into."""
+        ids = self.labels(features, where)
+        ignored = IGNORE_8BIT if ids.dtype == np.uint8 else IGNORE_16BIT
+        shown: npt.NDArray[Any] = features.image(ids, shape, ignored)
+        return shown
+
+
+def _stored(path: Path, words: list[str]) -> Float32:
+    """Return embeddings (n, D) of a file, a row for each of the words."""
+    try:
+        values = np.load(io.BytesIO(read_limited(path, MOST_BYTES)), allow_pickle=False).astype(np.float32)
+    except (OSError, ValueError, TypeError, EOFError) as error:
+        raise DataError(f"{path}: it is no .npy of numbers ({type(error).__name__})") from error
+    if values.ndim != 2 or len(values) != len(words):
+        raise DataError(
+            f"{path}: it has the shape {values.shape}; there are {len(words)} names and synonyms, so ({len(words)}, D)"
+            " is needed"
+        )
+    return np.asarray(values, np.float32)
+
+
+def _encoded(encoder: EncoderSettings, words: list[str], path: Path) -> Float32:
+    """Return embeddings (n, D) of words by a text encoder; raises MissingDependencyError without transformers."""
+    try:
+        from semstab.models.text import text_embeddings
+    except ImportError as error:
+        raise MissingDependencyError(
+            f"{path}: a text encoder cannot be used ({error}); pip install 'semstab[segearth]', or give embeddings"
+        ) from error
+    checkpoint = path.parent / encoder.checkpoint
+    where = str(checkpoint) if checkpoint.is_dir() else encoder.checkpoint
+    return text_embeddings(where, words, encoder.templates)
+
+
+def named(vocabularies: list[Path]) -> dict[str, Vocabulary]:
+    """Return vocabularies by their names.
+
+    Raises:
+        ConfigError: If two have one name, and what `Vocabulary.load` raises.
+    """
+    found: dict[str, Vocabulary] = {}
+    for path in vocabularies:
+        one = Vocabulary.load(path)
+        if one.space.name in found:
+            raise ConfigError(f"{path}: two vocabularies are called '{one.space.name}'; give one a name (name: NAME)")
+        found[one.space.name] = one
+    return found

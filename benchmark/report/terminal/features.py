@@ -1,0 +1,64 @@
+"""The answer on a model that gives features and no labels."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Sequence
+
+from semstab.data.records import Record
+from semstab.data.statistics import FeatureAgreement, LagBin, metres, short
+from semstab.report.terminal.layout import percent, wrapped
+
+MOST_PLACES = 3
+"""Most places that are told."""
+
+WITHOUT = "VSS, SBD, entropy, flicker, classes and a verdict have no number: they are of labels"
+
+
+def features_alone(features: FeatureAgreement, record: Record) -> Iterator[str]:
+    """Yield alpha of features, by range, time and angle, the frames that stand out, and the worst places."""
+    alpha = features.alpha
+    ends = "" if math.isnan(alpha.low) else f" ({alpha.of} {short(alpha.low)} to {short(alpha.high)})"
+    yield f"  FEATURES    alpha {short(alpha.value)}{ends}    {features.components} components"
+    kept = f", 1 in {features.one_in} kept" if features.one_in > 1 else ""
+    yield from wrapped(
+        f"mean cosine {features.cosine:.2f} of two views at one of {features.spots:,} spots{kept},"
+        f" {features.chance:.2f} of any two"
+    )
+    yield from wrapped(WITHOUT)
+    yield ""
+    yield from feature_lines(features)
+    recurrent = record.summary.table.recurrent
+    yield f"  map  {record.summary.table.voxels:,} voxels, {percent(recurrent.share)} seen 3 times or more"
+    yield ""
+
+
+def feature_lines(features: FeatureAgreement) -> Iterator[str]:
+    """Yield alpha by range, time and angle, the frames that stand out, and the worst places."""
+    if told := [row for row in features.ranges if row.is_assessed]:
+        by_range = ", ".join(f"{metres(row.low)} to {metres(row.high)} m {short(row.alpha.value)}" for row in told)
+        yield from wrapped(f"alpha by range: {by_range}")
+    views, degrees = features.correlogram.time, features.correlogram.angle
+    if len(views) > 1:
+        yield from wrapped(f"alpha by views between two: {_ends(views, 0)}")
+    if len(degrees) > 1:
+        yield from wrapped(f"alpha by angle between two views: {_ends(degrees, 1, ' degrees')}")
+    if features.outlying_frames is not None and features.outlying_frames.frames:
+        named = features.outlying_frames.frames
+        more = f" and {len(named) - 3} more" if len(named) > 3 else ""
+        listed = ", ".join(
+            f"{each.name} (cosine {1 - 2 * each.share:.2f}, others {1 - 2 * each.null:.2f})" for each in named[:3]
+        )
+        yield from wrapped(f"frames that stand out: {listed}{more}")
+    for place in features.places[:MOST_PLACES]:
+        x, y, z = place.centre
+        frames = ", ".join(map(str, place.frames))
+        yield from wrapped(
+            f"place at ({x:.1f}, {y:.1f}, {z:.1f}): cosine {place.cosine:.2f},"
+            f" {percent(place.share)} of the disagreement; frames {frames}"
+        )
+
+
+def _ends(bins: Sequence[LagBin], digits: int, unit: str = "") -> str:
+    """Return '.93 at 1, .71 at 40': alpha of the nearest pairs and of the farthest."""
+    return ", ".join(f"{short(each.alpha.value)} at {each.mean:.{digits}f}{unit}" for each in (bins[0], bins[-1]))
