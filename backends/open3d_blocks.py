@@ -202,7 +202,7 @@ class Open3DBlocks(FusionBackend):
     def _attribute(self, name: str) -> Any:
         """Return the attribute, flattened to (voxels, channels).
 
-        It is taken anew each time, because a rehash moves the buffers.
+        It is fetched at each call, because a rehash moves the buffers.
         """
         values = self.grid.attribute(name)
         return values.reshape((-1, values.shape[-1]))

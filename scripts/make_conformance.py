@@ -1,4 +1,4 @@
-"""Write all conformance cases anew, fused by the reference: python scripts/make_conformance.py conformance/cases."""
+"""Write all conformance cases, fused by the reference: python scripts/make_conformance.py conformance/cases."""
 
 from __future__ import annotations
 

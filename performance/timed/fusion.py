@@ -90,7 +90,7 @@ def measure(
         maps = {name: made(name) for name in names}
         for name in names:
             times[name].append([])
-        for frame in (*frames, *frames):  # in turns: what else the machine does meets all of them alike
+        for frame in (*frames, *frames):  # in turns, so that all maps share any other load of the machine
             for name in names:
                 times[name][-1].append(measuring.cpu_ms(maps[name], frame))
         del maps

@@ -126,7 +126,7 @@ def on_the_cpu(frame: semstab.Frame, K: int, name: str, rounds: int) -> dict[str
 
 
 def agreement(K: int, size: tuple[int, int], device: str) -> bool:
-    """Whether torch and numba leave the same map of four frames."""
+    """Return whether torch and numba make the same map of four frames."""
     tables = []
     for name, options in (("torch", {"device": device}), ("numba", {})):
         backend = backends.create(name, voxel_size=VOXEL_SIZE, num_classes=K, **options)

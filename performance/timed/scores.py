@@ -73,7 +73,7 @@ def soft(frame: semstab.Frame, K: int, kind: str) -> semstab.Frame:
 
 
 def steps(frame: semstab.Frame, K: int) -> dict[str, Callable[[], Any]]:
-    """What is measured, in a map that has seen the frame."""
+    """Return the steps that are timed, by name, in a map that has seen the frame."""
     assert frame.scores is not None
     H, W = frame.shape
     flat: npt.NDArray[Any] = frame.scores.reshape(-1)

@@ -54,7 +54,7 @@ def made(index: int, size: tuple[int, int], K: int, noise: float) -> Frame:
 
 
 def milliseconds(work: Callable[..., Any], frame: Frame) -> float:
-    """Of one call with a copy of the frame, as what a frame remembers is part of the work."""
+    """Return the milliseconds of one call with a copy of the frame: filling a frame's caches is part of the work."""
     return measuring.cpu_ms(work, dataclasses.replace(frame))
 
 
