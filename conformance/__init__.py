@@ -85,7 +85,7 @@ def case_folder(name: str) -> Path:
     """Return the folder of a case; one by formula, or `random:SEED`, is written for the time that this process runs.
 
     Raises:
-        ConfigError: If there is none of that name.
+        ConfigError: If no case has this name.
     """
     seed = seed_of(name)
     if seed is None and name not in case_names():

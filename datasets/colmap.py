@@ -87,7 +87,7 @@ class Colmap(FileDataset[ColmapOptions]):
         """Return a frame for each image of the only model.
 
         Raises:
-            DataError: For several models where none is wanted, and what `read_model` raises.
+            DataError: For several models without a setting that selects one, and what `read_model` raises.
         """
         return self._frames(folder, self._only(folder))
 
@@ -174,7 +174,7 @@ MODELS: Mapping[str, tuple[int, int]] = {
     "OPENCV_FISHEYE": (8, 0), "FULL_OPENCV": (12, 2), "FOV": (5, 0), "SIMPLE_RADIAL_FISHEYE": (4, 0),
     "RADIAL_FISHEYE": (5, 0), "THIN_PRISM_FISHEYE": (12, 0), "RAD_TAN_THIN_PRISM_FISHEYE": (16, 0),
 }  # fmt: skip
-"""Number of parameters, and of focal lengths among them; 0 where it distorts even if all coefficients are zero."""
+"""Number of parameters, and of focal lengths among them, or 0 for a model that distorts with zero coefficients."""
 
 MAX_SIDE = 2**24
 MAX_NAME = 1000

@@ -40,7 +40,7 @@ class Seen:
     shape: tuple[int, int]
 
     def depth_image(self) -> Float32:
-        """Return (H, W) float32 in metres, 0 where no point is."""
+        """Return (H, W) float32 in metres, 0 for pixels without a point."""
         image = np.zeros(self.shape, np.float32)
         image[self.v, self.u] = self.depth
         return image
