@@ -54,7 +54,7 @@ def quaternions(order: tuple[int, ...]) -> PoseChange:
 
 
 def angles(factor: float) -> PoseChange:
-    """Return the change of poses whose angles are so many times those that were read."""
+    """Return the change that multiplies the rotation angles of poses by `factor`."""
 
     def of(R: Float64) -> Float64:
         from scipy.spatial.transform import Rotation
@@ -65,7 +65,7 @@ def angles(factor: float) -> PoseChange:
 
 
 def positions(factor: float) -> PoseChange:
-    """Return the change of poses whose positions are so many times those that were read."""
+    """Return the change that multiplies the positions of poses by `factor`."""
     scale = np.array([[1.0, 1, 1, factor]] * 3 + [[1.0] * 4])
     return lambda T: T * scale
 
@@ -136,8 +136,8 @@ def _is_off_centre(sample: Sample) -> bool:
     return _in_pixels_already(sample) and all(off)
 
 
-ANEW = "no setting mends it: write the files anew"
-OR_LEFT_HANDED = f"{ANEW}, or convert the poses where these are left-handed (Unity, Unreal), which looks alike"
+ANEW = "no setting mends it: write the files again"
+OR_LEFT_HANDED = f"{ANEW}, or convert the poses if they are left-handed (Unity, Unreal), which looks the same"
 mistake = functools.partial(Hypothesis[Sample], applies=_in_pixels_already)
 CAMERAS: tuple[Hypothesis[Sample], ...] = (
     mistake("depth images mirrored left to right", _mirrored(1), OR_LEFT_HANDED),

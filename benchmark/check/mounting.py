@@ -1,8 +1,8 @@
-"""Whether fy is off beside fx, or the camera stands elsewhere than the poses have it: both hide in the noise of depth.
+"""Search for a wrong ratio of fy to fx, and for an offset of the camera from its poses: both hide in depth noise.
 
-How deep a point lies in another frame changes with the calibration, and with the place of the camera on what was
-tracked. All of it is fitted at once, by least squares over the points of all pairs of frames: a part counts where it is
-the same alone, so that it stands for nothing else.
+How deep a point lies in another frame changes with the calibration, and with the place of the camera on the tracked
+body. All parameters are fitted at once, by least squares over the points of all pairs of frames. A parameter counts if
+a fit of this parameter alone gives the same value, so that it stands for nothing else.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ FX, FY, ARM, ALL = 0, 1, slice(5, 8), 11
 and forward, and radians about the camera's axes."""
 
 ROUNDS = 4
-"""Times that the points are matched anew."""
+"""Number of times that the points are matched."""
 
 SAME = 0.03
 """The relative error of depth up to which a point is taken for the same surface in the other frame."""

@@ -17,7 +17,7 @@ from semstab.core.types import Float64
 from semstab.datasets.geometry.sweeps import SWEEPS, Sweep, carried, motion_in_sweep, share_of_sweep
 
 LEAST = 0.001
-"""A sweep is right where it takes away a millimetre, too."""
+"""A sweep is also right if it reduces the error by a millimetre."""
 
 
 @dataclass(frozen=True, eq=False)
