@@ -27,7 +27,7 @@ def load_config(
     """Return the configuration of a file, or of settings by name, over the defaults in configs/datasets/.
 
     Args:
-        settings: A YAML file, or settings by name; the defaults where not given.
+        settings: A YAML file, or settings by name; the built-in defaults by default.
         overrides: Settings that come last.
 
     Raises:

@@ -201,7 +201,7 @@ class Coverage:
         return _mean(np.all(self._same_along(voxel_size, np.zeros(3)), axis=1))
 
     def faces(self, voxel_size: float) -> Faces | None:
-        """Return the axes along which faces of voxels lie in a surface, or None without an axis, or if most points stay.
+        """Return the axes along which faces of voxels lie in a surface, or None without an axis or if most points stay.
 
         Along them far fewer points stay than with the grid a quarter, a half or three quarters of a voxel off.
         """

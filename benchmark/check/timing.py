@@ -132,7 +132,7 @@ def _period(scene: Scene) -> float:
 
 
 def _moved(scene: Scene, sample: Sample) -> tuple[list[Pair], Callable[[float], Float64]]:
-    """Return the pairs of frames with poses within reach, and a function from a delay in frames to the pairs' errors."""
+    """Return the pairs of frames with poses within reach, and a function from a delay in frames to their errors."""
     known, views = dict(_poses_around(scene, sample)), sample.views
     reach = {at for at, v in views.items() if all(v.index + k in known for k in range(-REACH, REACH + 1))}
     pairs = [pair for pair in sample.pairs if {*pair} <= reach]
