@@ -70,13 +70,13 @@ class TiledUnit:
         return self._work.unit.name.stated
 
     def next_job(self) -> Job | None:
-        """Return the next tile; None where there is none, or before the pass over the frames has ended."""
+        """Return the next tile, or None without one, or before the pass over the frames has ended."""
         if self._failed or not self._waiting:
             return None
         return (self._waiting.pop(0).bounded(self._bound),)
 
     def take(self, work: Work) -> Work | None:
-        """Take a tile that a worker gave back; return the unit where it came to its end."""
+        """Take a tile that a worker gave back; return the unit if it is complete."""
         if self._failed:
             return None
         if work.error is not None or work.tile is None:
