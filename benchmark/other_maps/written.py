@@ -94,7 +94,7 @@ def _row(name: str, place: Place, point: Any, georeference: Any) -> dict[str, An
 
 
 def pictures(comparison: MapComparison) -> list[Figure]:
-    """Return a picture of each map that compares its classes with the run's, and with ground truth their correctness."""
+    """Return a picture of each map: its classes against the run's, and their correctness with ground truth."""
     return [
         Figure(
             slug("maps", own.agreement.name),
