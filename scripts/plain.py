@@ -27,7 +27,7 @@ RULES = {
     "is none of: is not a": r"\b(?:is|are|be) none of\b",
     "that of, those of: repeat the noun": rf"{START}(?i:that|those) of\b|\bas (?:that|those) of\b",
     "None where: None if, None without": r"\b(?:None|NaN) where\b",
-    "where it, there, no: if": r"\bwhere (?:it|there|no|none|not)\b(?! are on\b)",
+    "where it, there, no: if": r"\bwhere (?:it|there|no|none|not)\b(?! are on\b| (?:is|was|lies)[.,;:)\n])",
     "less: minus": r"\b(?:1|one) less (?:the|its|what)\b",
     "anew: again": r"\banew\b",
     "alike: the same, similar": r"\balike\b",

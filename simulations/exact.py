@@ -77,7 +77,7 @@ class Condition:
 
     @property
     def name(self) -> str:
-        """What a row begins with."""
+        """First words of a row."""
         usual = 6 if PATHS[self.path][0] is yard else 8
         parts = {
             f"{self.K} classes": usual != self.K,
@@ -154,7 +154,7 @@ def alpha_of(unit: Ints, label: Ints) -> Exact:
 
 
 def exact(flown: Flight, labeller: Labeller, points: int, rng: np.random.Generator) -> Exact:
-    """Return alpha of the surface: draw until so many points have two labels."""
+    """Return alpha of the surface: draw until `points` points have two labels."""
     units, labels, drawn, twice, n = [], [], 0, 0, points
     for _ in range(DRAWS):
         point, face = flown.scene.draw(n, rng)

@@ -76,7 +76,7 @@ class Box:
 
 @dataclass(frozen=True)
 class Street:
-    """What is there, and from where it is seen."""
+    """Objects of a street, and the views of them."""
 
     boxes: list[Box]
     poses: np.ndarray

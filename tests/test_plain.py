@@ -60,6 +60,11 @@ def test_a_text_of_many_lines_that_is_no_program_is_read():
     assert rules("a.py", 'def f():\n    """Return a.\n\n    It is drawn anew.\n    """\n') == ["anew"]
 
 
+@pytest.mark.parametrize("sentence", ["It is seen where it was.", "The folder where it lies, and the file."])
+def test_a_place_is_no_condition(sentence):
+    assert rules("a.md", sentence) == []
+
+
 def test_the_line_of_a_finding_is_that_of_the_word():
     found = list(plain.findings("a.py", '"""Return a.\n\nDrops so many.\n"""\n'))
     assert [each.line for each in found] == [3]
