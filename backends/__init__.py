@@ -176,9 +176,9 @@ def create(
 
 
 def _with_rule(name: str, options: dict[str, Any]) -> tuple[str, dict[str, Any]]:
-    """Return name and options that both say the rule: 'numba' with rule='bayes' is 'numba+bayes', as that is by itself.
+    """Return name and options that both have the rule: 'numba' with rule='bayes' and 'numba+bayes' become the same.
 
-    The rule of the options counts, of which the name may be any other word; 'mean' alone is the backend as it is.
+    The rule of the options counts; the name may have any other word for it. 'mean' is the backend without a rule.
     """
     rule = options.get("rule", rule_of(name))
     if not isinstance(rule, str):

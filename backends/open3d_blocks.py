@@ -49,7 +49,7 @@ COPIED_BLOCKS = 1024
 class Open3DBlocks(FusionBackend):
     """Incremental fusion on voxel blocks; `grid` is the VoxelBlockGrid, its attributes named as VoxelTable's columns.
 
-    One is not among those: the bits of `classes` tell of which classes a voxel has evidence.
+    One attribute has no such column: the bits of `classes` tell the classes for which a voxel has evidence.
 
     A map reaches 2^20 voxels to either side of its first camera.
 

@@ -51,7 +51,7 @@ class Colmap(FileDataset[ColmapOptions]):
     """{name} is the image's name in the model without suffix: 0012, or cam0/0012.
 
     Depth maps in .bin files are in the model's unit, others in metres, unless depth_scale says so; with
-    metres_per_unit both become metric. Models that the mapper left beside each other, sparse/0, sparse/1, share no
+    metres_per_unit both become metric. Models that the mapper left next to each other, sparse/0, sparse/1, share no
     coordinates: one is read, or with `model: all` each is a scene, NAME-0, NAME-1.
     """
 

@@ -43,7 +43,7 @@ class Pix4d(Photographs[Pix4dOptions]):
         return True
 
     def reconstruction(self, path: Path, folder: Path) -> Reconstruction:
-        """Read the file, and those of the georeference beside it. Raises DataError for a damaged one."""
+        """Read the file, and the files of the georeference next to it. Raises DataError for a damaged file."""
         shots, project = read_cameras(path), path.name.removesuffix(SUFFIX)
         projection, shift = (path.with_name(f"{project}_{name}") for name in ("wkt.prj", "offset.xyz"))
         if self.options.crs is not None or not projection.is_file():

@@ -74,10 +74,10 @@ class Scene(ABC):
         made: Whether it is simulated, so that each frame has the pose that it was rendered from.
         posed: Whether its frames have depth and a pose, so that they can be fused.
         replaced: Label sources in its files that predictions stand for, and that are not read.
-        unread: The images in a folder of label maps of which none is read, and what reads them; None if there are none.
-        in_program: Whether its frames are those of a program, and not in files.
+        unread: The images in a folder of label maps that nothing reads, and the setting that reads them; None without.
+        in_program: Whether its frames come from a program, and not from files.
         with_features: Models whose frames have features.
-        usual: Values of options that the format's own data have where nothing is said, as they are typed.
+        usual: Default values of options for the format's own data, as they are typed.
     """
 
     name: str

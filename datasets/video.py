@@ -77,8 +77,7 @@ class VideoFrame:
 class Video(Dataset):
     """Folders of images, and video files; label maps lie in labels/MODEL/ in a scene's folder.
 
-    The folder of a video file is the one that is called as it without its suffix: clip/labels/MODEL/000012.png beside
-    clip.mp4.
+    The folder of a video file has its name without the suffix: clip/labels/MODEL/000012.png next to clip.mp4.
     """
 
     Options: type[BaseModel] = VideoOptions

@@ -65,9 +65,9 @@ def vocabularies() -> Mapping[str, Vocabulary]:
 def class_mapping(source: LabelSpace, target: LabelSpace, leniency: Leniency = "strict") -> LabelMapping:
     """Map a model's classes to a taxonomy by name.
 
-    A class goes to that of its vocabulary, or to the class of `target` with its name or among whose members it is; one
-    of which the vocabulary says nothing else goes to its rest. If `target` knows none of these, strict raises
-    ConfigError and names the class, lenient leaves the class out, and warns where these are most.
+    A class goes to the class that its vocabulary names, or to the class of `target` with its name or with it as a
+    member. Another class of a vocabulary goes to the vocabulary's rest. If `target` has none of these, strict raises
+    ConfigError and names the class; lenient leaves the class out, and warns if most classes are left out.
     """
     vocabulary = next((entry for entry in vocabularies().values() if entry.matches(source)), None)
     known, rows, lost = target.row_of, [], []

@@ -101,7 +101,8 @@ def street(
     Facades with windows, trees, roofs, ground, and sky without depth.
 
     - `noise`: standard deviation of depth, as a share of it
-    - `salt`: share of single pixels with a random label, beside 12 % of the blocks of 24x24 pixels; none if clean
+    - `salt`: share of single pixels with a random label, in addition to 12 % of the blocks of 24x24 pixels; none if
+      clean
     """
     rng = np.random.default_rng(index)
     depth, label, T_wc = _street(index, width, height)

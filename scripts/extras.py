@@ -1,4 +1,4 @@
-"""Each extra of setup.cfg, installed alone beside the base install, does what it is for; before, a line names it.
+"""Check that each extra of setup.cfg, alone with the base install, does its work; without it, a line names it.
 
     python scripts/extras.py [EXTRA ...] [--constraint torch==2.13.0]
 

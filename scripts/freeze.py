@@ -141,7 +141,7 @@ for i in range(4):
     cv2.imwrite(str(out / f"wall/labels/regions/{i:04d}.png"), np.tile(ids, (6, 1)))
 settings("regions", {**posed, "voxel_size": 0.25, "region_maps": ["regions"], "backends": ["numpy"]})
 """
-"""Run beside the tests of the kept revision: scenes in the formats of several programs, and settings of studies."""
+"""Run next to the tests of the kept revision: scenes in the formats of several programs, and settings of studies."""
 
 
 def write_scores(folder: Path, K: int) -> None:
@@ -262,7 +262,7 @@ def main() -> int:
     keeps, source, folder = given.action == "keep", given.source.resolve(), given.folder.resolve()
     wanted = tuple(given.case or [""])
     chosen = [case for case in cases() if case.name.startswith(wanted) and (case.quick or not given.quick)]
-    data = folder / "data"  # where the real scenes were when outputs were kept: worktrees have none beside them
+    data = folder / "data"  # where the real scenes were when outputs were kept: worktrees have none next to them
     if keeps:
         folder.mkdir(parents=True, exist_ok=True)
         data.unlink(missing_ok=True)

@@ -195,7 +195,7 @@ def frames(flown: Flight, labeller: Labeller, condition: Condition, rng: np.rand
 
 
 def _hit(camera: Pinhole, seen: Seen) -> npt.NDArray[np.bool_]:
-    """Return the pixels (n,) that rays of a scanner beside the camera hit."""
+    """Return the pixels (n,) that rays of a scanner next to the camera hit."""
     up, aside = np.meshgrid(np.arange(-np.pi / 4, np.pi / 4, RING), np.arange(-np.pi / 4, np.pi / 4, STEP))
     ways = np.stack([np.cos(up) * np.sin(aside), -np.sin(up), np.cos(up) * np.cos(aside)], axis=-1).reshape(-1, 3)
     u, v = (np.rint(x).astype(int) for x in camera.project(ways))

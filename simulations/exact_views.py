@@ -36,7 +36,7 @@ class Sensor(Protocol):
         ...
 
     def project(self, points: Array) -> tuple[Array, Array]:
-        """Return image coordinates of points (n, 3) in the sensor's axes; NaN for points outside of the image."""
+        """Return image coordinates of points (n, 3) in the sensor's axes; NaN for points behind a camera."""
         ...
 
 

@@ -1,4 +1,4 @@
-"""Observations, one a voxel, from the pixels or points of a frame: labels by tiles of the image, scores likewise."""
+"""Observations, one a voxel, from the pixels or points of a frame: labels and scores by tiles of the image."""
 
 from __future__ import annotations
 

@@ -71,7 +71,7 @@ class ObservedScores:
         return ObservedScores(self.key[some], self.pixels[some], self.row[some], self.sums, bounds, self.K)
 
     def sparse(self) -> Observed:
-        """Return the same by entries, of which there are none for classes without evidence."""
+        """Return the same as entries; classes without evidence have no entry."""
         sums = self.rows()
         voxel, label = np.nonzero(sums)
         start = np.searchsorted(voxel, np.arange(len(self.key) + 1))

@@ -37,7 +37,8 @@ def scale_eight(_typing: Any, scores: Any, _at: Any, _K: Any, keys: Any, scale: 
     """Invert the sum of each of eight pixels' scores, from scores[at] on.
 
     Arguments: scores, at, K, keys, scale, u.
-    Leaves the result in scale[u : u + 8]; a key in keys[u : u + 8], int64, becomes -1 if its result is not positive.
+    Leaves the result in scale[u : u + 8]; a key in keys[u : u + 8], int64, becomes -1 if the sum is not a positive
+    number.
     """
 
     def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
@@ -68,10 +69,10 @@ def add_two(
     """Add u's scores and the next pixel's to their voxel.
 
     Arguments: scores, at, K, scale, u, end, sums, to, fresh.
-    sums[to : to + K] += scale[u] * scores[at + u * K : at + (u + 1) * K], or = where `fresh`, and likewise of u + 1 if
-    that is below `end`; it is read in any case, as nobody can predict whether it is, and must be there.
+    sums[to : to + K] += scale[u] * scores[at + u * K : at + (u + 1) * K], or = if `fresh`, and the same for u + 1 if
+    u + 1 is below `end`. Pixel u + 1 is read in any case, without a branch, and must exist.
 
-    `sums` is float64, and has room for a multiple of `LANES` values at `to`: those beyond K get 0 added.
+    `sums` is float64, and has room for a multiple of `LANES` values at `to`: values beyond K get 0 added.
     """
 
     def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:

@@ -336,9 +336,9 @@ def find_words_of_points(
 
 @serial
 def _finish(table, table_count, word, count, n, lost, corner, partition, spread, low, high):
-    """Empty the table into a band's entries, of which there are n; return how many are left, see `_describe`.
+    """Empty the table into a band's n entries; return the number of entries that remain, see `_describe`.
 
-    Returns -1 where a pixel is `lost`.
+    Returns -1 if a pixel is `lost`.
     """
     n = _flush(table, table_count, word, count, n)
     n = _describe(word, count, n, corner, partition, spread, low, high)

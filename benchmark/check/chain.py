@@ -34,7 +34,7 @@ FITS = 0.05
 """Frames fit each other up to this error, if it is not APART times the usual error."""
 
 DISAGREE = 0.25
-"""Share of the points by which labels of a frame agree less with those beside it than these with each other."""
+"""Share of the points by which labels of a frame agree less with its neighbours' than these with each other."""
 
 SEVERAL = 3
 """Classes of the maps around one that looks wrong."""
@@ -115,7 +115,7 @@ class Chain:
         return self.error(a, b) <= min(FITS, max(CONTRADICTS, APART * self.usual))
 
     def contradicts(self, pair: Pair, *neighbours: Pair) -> bool:
-        """Return whether two frames contradict each other, and those beside them do not."""
+        """Return whether two frames contradict each other, and their neighbours do not."""
         if not all(self.fits(*one) for one in neighbours):
             return False
         least = max(CONTRADICTS, *(APART * error for error in (self.usual, *(self.error(*one) for one in neighbours))))
@@ -130,7 +130,7 @@ class Chain:
     def misfits(self) -> list[tuple[int, Pair]]:
         """Return the positions of frames that contradict both neighbours, which fit each other; with these.
 
-        Neighbours are the nearest frames on both sides, or those beside two such frames.
+        Neighbours are the nearest frames on both sides, or the frames next to two such frames.
         """
         found = dict[int, Pair]()
         for a, between, c in self._around():
@@ -145,7 +145,7 @@ class Chain:
                 yield self.positions[k], self.positions[k + 1 : k + 1 + width], self.positions[k + 1 + width]
 
     def _strange(self, pair: Pair, neighbour: Pair) -> bool:
-        """Return whether two frames contradict each other, or see nothing of each other where those beside them do."""
+        """Return whether two frames contradict each other, or see nothing of each other while their neighbours do."""
         if self.contradicts(pair, neighbour):
             return True
         share = self.links[pair].share if pair in self.links else 1.0
@@ -196,7 +196,7 @@ class Chain:
     def departures(self) -> list[Pair]:
         """Return two successive frames that see nothing of each other by their poses, though the view goes on.
 
-        Those beside them on each side see each other.
+        Their neighbours on each side see each other.
         """
         far = [link.still for (a, b), link in self.links.items() if self._gap(a, b) == GAPS[-1]]
         runs = zip(self.positions, self.positions[1:], self.positions[2:], self.positions[3:], strict=False)

@@ -1,4 +1,4 @@
-"""Frames that do not fit their neighbours, and poses that jump: each frame beside those before and after it."""
+"""Frames that do not fit their neighbours, and poses that jump: each frame against the frames before and after it."""
 
 from __future__ import annotations
 
@@ -229,7 +229,7 @@ class Neighbours:
         return [linked(told[a], told[b], self._configured) if a in told and b in told else None for a, b in pairs]
 
     def said_of_many(self, chain: Chain, misfits: Sequence[int]) -> str:
-        """Return the line on frames that do not fit those beside them, where they are many."""
+        """Return the line on frames that do not fit their neighbours, if there are many."""
         return (
             f"{len(misfits)} of {len(chain.positions)} frames do not fit the frames beside them, which fit each other:"
             f" {self._list(misfits, MOST_LOST)}; their poses or depth are wrong: correct them, or leave them out:"
@@ -237,7 +237,7 @@ class Neighbours:
         )
 
     def said_of_misfits(self, chain: Chain, misfits: Sequence[tuple[int, Pair]]) -> Iterator[str]:
-        """Yield a line on frames that do not fit those beside them."""
+        """Yield a line on frames that do not fit their neighbours."""
         for position, beside in misfits[:MOST_NAMED]:
             yield f"{self._misfit(chain, position, beside)}; correct it, or leave the frame out ({LEAVE_OUT})"
         if len(misfits) > MOST_NAMED:
@@ -283,7 +283,7 @@ class Neighbours:
 
 
 def _step(first: Float64, second: Float64) -> float:
-    """Return how far a camera moves and turns, which only tells a step from those beside it."""
+    """Return how far a camera moves and turns; the number only compares a step with its neighbours."""
     R, t = motion(first, second)
     return float(np.linalg.norm(t) + np.linalg.norm(R - np.eye(3)))
 

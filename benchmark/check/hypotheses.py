@@ -1,4 +1,4 @@
-"""The mistakes of files that are looked for in scenes of cameras and of scans, beside other conventions of a camera.
+"""The mistakes of files that are looked for in scenes of cameras and of scans, in addition to other conventions.
 
 A new one is an entry of `CAMERAS` or `SCANS`: its name, what it changes, and the mend in words.
 """
@@ -23,7 +23,7 @@ LEAST_FOCAL = 8.0
 """Pixels; a shorter focal length is one divided by the image's size."""
 
 TO_CAMERA = np.array([[0.0, -1, 0, 0], [0, 0, -1, 0], [1, 0, 0, 0], [0, 0, 0, 1]])
-"""From the axes of a LiDAR (x forward, y left, z up) to those of a camera beside it (x right, y down, z forward)."""
+"""From a LiDAR's axes (x forward, y left, z up) to the axes of a camera next to it (x right, y down, z forward)."""
 
 PoseChange = Callable[[Float64], Float64]
 

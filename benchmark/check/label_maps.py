@@ -1,4 +1,4 @@
-"""Label maps of frames in a row, as they are and as each hypothesis supposes, beside the edges of depth and colour."""
+"""Label maps of frames in a row, as they are and as each hypothesis supposes, against the edges of depth and colour."""
 
 from __future__ import annotations
 

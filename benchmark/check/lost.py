@@ -1,4 +1,4 @@
-"""Lost tracking that was written as a pose: the identity, or the last known pose once more, while the view moves on."""
+"""Lost tracking that was written as a pose: the identity, or the last known pose again, while the view moves on."""
 
 from __future__ import annotations
 
@@ -130,7 +130,7 @@ def _lost_of(run: Run, links: Sequence[Link | None], limit: float) -> Sequence[i
 
 
 def _fits(run: Run, links: Sequence[Link | None], limit: float) -> bool:
-    """Return whether one of its ends fits the frame beside it."""
+    """Return whether one of its ends fits the frame next to it."""
     known = [link for pair, link in zip(run.pairs, links, strict=True) if link is not None and pair not in run.within]
     return any(link.error < limit for link in known)
 

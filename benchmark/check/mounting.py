@@ -42,7 +42,7 @@ CERTAIN = 6.0
 """Standard errors by which a part is off beyond doubt: pairs share frames, and noise is not all that there is."""
 
 ALIKE = 0.5
-"""A part that is fitted alone differs by less than this share of itself from what it is beside all others."""
+"""Share of itself by which a parameter may differ between a fit of it alone and a fit of all parameters."""
 
 LEAST_ASPECT = 0.03
 """The least difference of the changes of fx and fy that is named."""
@@ -77,7 +77,7 @@ class Change:
 
 
 def with_mounting(verdict: Verdict, sample: Sample) -> Verdict:
-    """Return the verdict, which says that fy is off beside fx, or a lever arm forgotten, where that is beyond doubt."""
+    """Return the verdict with a note on a wrong ratio of fy to fx, or a forgotten lever arm, if beyond doubt."""
     if verdict.mend or verdict.state == "unclear":
         return verdict
     whole = fitted_change(sample, np.eye(ALL))

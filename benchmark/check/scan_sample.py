@@ -112,7 +112,7 @@ class ScanSample:
         return other
 
     def surfaces(self, pair: Pair, every: int = 1) -> Surfaces:
-        """Seek points of the pair's first scan beside surfaces of its second one."""
+        """Compare points of the pair's first scan with surfaces of its second scan."""
         here, there = (self._clouds[position] for position in pair)
         return Surfaces.of(here.sought[::every], there.points, there.tree, *self._motion(pair))
 

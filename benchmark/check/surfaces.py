@@ -1,4 +1,4 @@
-"""Points of one scan beside the surfaces of another: whether two scans lie on each other.
+"""Points of one scan against the surfaces of another: whether two scans lie on each other.
 
 The nearest point would not tell: the rings of a scanner lie metres apart on the ground and move with the sensor, so
 that the scans of a straight drive meet best, point by point, where their poses stand still.

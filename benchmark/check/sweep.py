@@ -22,7 +22,7 @@ LEAST = 0.001
 
 @dataclass(frozen=True, eq=False)
 class Swept:
-    """Points of scans beside surfaces of others, and the motions (6,) of both sensors in a sweep, by pair."""
+    """Points of scans against surfaces of other scans, and the motions (6,) of both sensors in a sweep, by pair."""
 
     pairs: tuple[tuple[Surfaces, Float64, Float64], ...]
 

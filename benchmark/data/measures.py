@@ -279,7 +279,7 @@ RESERVED = frozenset((
     "statistics", "strata", "summary", "table", "taxonomy", "truth_file", "unit", "up", "variation",
     "video_measures", "voxel_alpha", "voxel_size", "voxels", "voxels_file", "well_seen", "wrong_of_consistent",
 ))  # fmt: skip
-"""Keys that no measure may have: fields beside its mean in JSON, other differences of maps, other compared numbers."""
+"""Keys that no measure may have: fields next to its mean in JSON, other differences of maps, other compared numbers."""
 
 _REGISTER = {measure.key: measure for measure in (VSS, SBD, ENTROPY, MARGIN)}
 

@@ -48,7 +48,8 @@ class Variation:
     Attributes:
         sweep: 'base', 'shared_taxonomy', 'backends', or the swept setting: 'voxel_size' (metres), 'pixel_stride',
             'frame_count', 'depth_noise' (relative standard deviation), 'translation_noise' (metres), 'rotation_noise'
-            (degrees), 'translation_drift' (metres a square root of frame), 'rotation_drift' (degrees likewise).
+            (degrees), 'translation_drift' (metres a square root of frame), 'rotation_drift' (degrees a square root of
+            frame).
         value: Value of the swept setting; None for 'base', 'shared_taxonomy' and 'backends'.
         repeat: Counts the repeats of a random variation from 0; each has a seed of its own.
     """

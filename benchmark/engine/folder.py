@@ -66,7 +66,7 @@ WRITTEN = (UNITS, VOXELS, TRUTH, EVENTS, OBSERVATIONS, FRAMES, SUMS, OVERVIEW, T
 """Folders into which files are written."""
 
 OWN_FILES = (SETTINGS, FAILURES, DIGESTS, "summary.json", "manifest.json", "report.html", "recording.rrd")
-"""Files of a run beside these folders."""
+"""Files of a run next to these folders."""
 
 
 def require_output(path: str | Path, inputs: Iterable[str | Path | None] = ()) -> None:

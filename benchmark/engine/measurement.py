@@ -139,7 +139,7 @@ def finish(live: LiveMap, stream: Stream, watch: Stopwatch) -> Work:
 class FusedMap(NamedTuple):
     """A map at its end, without the locations whose fused class is left out; reduced: `reduced_sums`, or empty.
 
-    It is checked against the reference beside the statistics.
+    It is checked against the reference in parallel with the statistics.
     """
 
     table: VoxelTable
@@ -416,7 +416,7 @@ def save_overview(arrays: Mapping[str, Any], path: Path) -> None:
 
 
 def pictures_of_outlying(task: Task, config: Config, of_frames: OfFrames) -> dict[str, npt.NDArray[Any]]:
-    """Return pictures of the first frames that stand out, which are read once more, as arrays by name; none of scans.
+    """Return pictures of the first frames that stand out, which are read again, as arrays by name; none of scans.
 
     A frame is held against those of the run before and after it, the first and the last one against the two nearest.
     """

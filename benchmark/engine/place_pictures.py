@@ -15,7 +15,7 @@ from semstab.statistics.places import Place, PlaceView
 from semstab.task import Task, read
 
 PICTURED, READ, EACH = 6, 4, 2
-"""The most places that have pictures, the most frames that are read once more for them, and the most of a place."""
+"""The most places that have pictures, the most frames that are read again for them, and the most of a place."""
 
 EDGE, AROUND, LEAST = 160, 3.0, 48
 """Edge of a picture in pixels; the edge of the part of the frame that it shows, as a multiple of the place's extent;

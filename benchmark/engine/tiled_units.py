@@ -186,7 +186,7 @@ def assembled(
 
 
 def _with_columns(task: UnitTile, slug: str, analysis: Analysis, folder: Path) -> Savers:
-    """Return the file of a tile's voxels, once more with the columns of the statistics."""
+    """Return the file of a tile's voxels, again with the columns of the statistics."""
     assert task.index is not None
     waiting = folder / task.folder / VOXELS / f"tile={task.index[0]}_{task.index[1]}.parquet"
 

@@ -43,7 +43,7 @@ IN_A_RUN = (
     "scenes", "frames", "scene_frames", "taxonomy", "voxel_size", "pixel_stride", "exclude", "critical_classes",
     "statistics",
 )  # fmt: skip
-"""The settings of a run that a definition fixes, beside its dataset."""
+"""The settings of a run that a definition fixes, in addition to its dataset."""
 
 
 class Benchmark(Settings):

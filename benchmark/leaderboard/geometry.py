@@ -156,7 +156,7 @@ class _Content:
 
 
 def geometry_file(definition: Path) -> Path:
-    """Return the file beside a definition that has its spots."""
+    """Return the file next to a definition that has its spots."""
     return definition.with_name(definition.stem + SUFFIX)
 
 

@@ -237,7 +237,7 @@ def _about(benchmark: Benchmark, result: Result, config: Config, handle: RunHand
 
 
 def _require_statement(path: Path, about: Submission) -> None:
-    """Raise DataError where what stands beside the sums is no statement: a line of text, a day, a time."""
+    """Raise DataError if a field next to the sums is not valid: a line of text, a day, a time."""
     texts = {name: getattr(about, name) for name in ("made", "semstab", "python", "platform", "processor")}
     texts |= {f"packages.{name}": f"{name} {version}" for name, version in about.packages.items()}
     for name, text in texts.items():

@@ -1,4 +1,4 @@
-"""Formulas of predicted classes beside the true ones, from sums over pixels or voxels: IoU and calibration."""
+"""Formulas of predicted against true classes, from sums over pixels or voxels: IoU and calibration."""
 
 from __future__ import annotations
 

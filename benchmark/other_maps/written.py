@@ -113,7 +113,7 @@ RANK_OF_RIGHT = np.array([0.0, 3.0, 4.0, 4.0, 1.0])
 
 
 def draw(comparison: MapComparison, own: Voxelwise) -> Canvas:
-    """Return the picture of a map beside the run's."""
+    """Return the picture of a map next to the run's."""
     union, run, georeference = own.laid_together(comparison.run), comparison.run, comparison.first.georeference
     size, up = run.grid.size, comparison.first.up or (0.0, 0.0, 1.0)
     laid = centers(union.index, size)

@@ -127,7 +127,7 @@ class OpenBag:
 
     Args:
         path: The file, or the folder of a rosbag2.
-        parts: The files of a recording that was split, of which `path` is the first, in the order of time.
+        parts: The files of a recording that was split, in the order of time; `path` is the first.
 
     Attributes:
         path: The same.

@@ -50,8 +50,8 @@ class BagScanOptions(PoseOptions, ScanOptions):
 class BagScans(OfBags, ScanDataset[BagScanOptions]):
     """{name} is the stamp of the cloud in whole nanoseconds, 1305031102175304000.
 
-    Predictions may be named by it in seconds, too, with nine digits or six. They are in the folder that is called as
-    the bag is without its suffix: run/labels/MODEL/ beside run.bag.
+    Names of predictions may also have the stamp in seconds, with nine digits or six. Predictions are in the folder that
+    has the bag's name without its suffix: run/labels/MODEL/ next to run.bag.
     """
 
     Options: type[BaseModel] = BagScanOptions

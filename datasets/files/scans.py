@@ -97,9 +97,9 @@ class ScanDataset(ScenesBelow[Options]):
     """Scenes of scans below a root. A reader recognises a scene's folder, lists its scans, and reads points and ids.
 
     Attributes:
-        labels: Templates of predictions, of which the first that finds some counts.
+        labels: Templates of predictions; the first template that finds files counts.
         truth: Template of ground truth, or None.
-        taxonomy: The classes of the labels, where options name no others.
+        taxonomy: The classes of the labels, unless options name others.
         in_world: Whether points are in the world already; a pose is then only where the sensor was.
 
     Raises:
@@ -465,10 +465,10 @@ MOST_TRAINED = 34
 
 
 def narrow_ids(path: Path, data: bytes, points: int) -> npt.NDArray[np.integer[Any]]:
-    """Return ids (N,) of a .label of uint16 or int64, of which N points tell the width.
+    """Return ids (N,) of a .label of uint16 or int64; the number of points N tells the width.
 
     Raises:
-        DataError: If some of 64 bits are no ids of 16.
+        DataError: If some of the 64-bit numbers do not fit in 16 bits.
     """
     if len(data) == 2 * points:
         return np.frombuffer(data, "<u2")

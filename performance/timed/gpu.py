@@ -1,4 +1,4 @@
-"""Time of one frame through backend `torch`, its input on the device already, beside the floor and the CPU backends.
+"""Time of one frame through backend `torch`, its input on the device already, with the floor and the CPU backends.
 
 The map grows by one view fused at ever new places; then places chosen at random are fused again, as ids, as logits, and
 as ids of three models at once. Medians of `rounds` frames by CUDA events, after a warm-up. The floor is the bytes

@@ -1,4 +1,4 @@
-"""CPU time and memory of one LiDAR scan on each backend, beside the same fusion by np.unique.
+"""CPU time and memory of one LiDAR scan on each backend, and of the same fusion by np.unique.
 
 A scanner of 64 beams drives along a street of walls and boxes at 1.2 m a scan; points err by 2 cm, and a share of them,
 `--wrong`, has a random label. With `--data` the scans are those of a folder of SemanticKITTI, with their true labels. A

@@ -1,4 +1,4 @@
-"""CPU time of a frame's spots, on which alpha rests, beside fusing it; and their memory over a flight.
+"""CPU time of a frame's spots, on which alpha rests, and of fusing it; and the memory of spots over a flight.
 
 A UAV flies over blocks of houses, 1.5 m a frame. After `--warm` frames all code is compiled, and most spots that a
 frame shows are known. Then every second frame is added to the sampler, and fused by backend `numba`, the baseline of
