@@ -1,4 +1,4 @@
-"""The published networks of EdgeNets as models of semstab: copy this file into a clone of EdgeNets, next to model/.
+"""The published networks of EdgeNets as models of semstab: copy this file into a clone of EdgeNets, beside model/.
 
     semstab-bench predict --model EdgeNets/nets.py:espnetv2_voc --set scale=2.0 --name espnetv2-2.0 --data SCENE
     semstab-bench --data SCENE --predict EdgeNets/nets.py:dicenet_voc,scale=0.75,soft=True

@@ -1,4 +1,4 @@
-"""Costs of a frame and of a voxel as the number of frames, voxels or classes grows by 1, 2, 4 and 8.
+"""Costs of a frame and of a voxel as the number of frames, voxels or classes grows by factors of 1, 2, 4 and 8.
 
 Frames of a flight (flight.py) are fused at places 200 m apart, each as often as there are frames. One of three grows,
 the others stay. 'ms' is the CPU time of a later frame, all of whose voxels are known, the median; 'bytes' is what the
