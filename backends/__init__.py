@@ -65,7 +65,7 @@ class FusionBackend(Protocol):
     """A fusion of frames into metric voxels, made with `voxel_size` (metres), `num_classes` (K >= 2) and own options.
 
     A pixel (u, v) with depth d falls into the voxel floor(x_w / r), evaluated in float64 in this order, so that
-    every backend decides alike at a voxel's face:
+    every backend assigns a point on a voxel's face to the same voxel:
 
         x_c = ((u - cx) / fx) * d        y_c = ((v - cy) / fy) * d        z_c = d
         x_w = ((R00 * x_c + R01 * y_c) + R02 * z_c) + t0     and so on
@@ -94,16 +94,16 @@ class FusionBackend(Protocol):
         """Return the map so far."""
 
     def events(self) -> Events | None:
-        """Return the log of observations, or None where the backend has none."""
+        """Return the log of observations, or None without a log."""
         return None
 
     def changes(self) -> Changes | None:
-        """Return the changes by the last frame, for the recording; None where the backend does not say them."""
+        """Return the changes by the last frame, for the recording, or None if the backend does not report changes."""
         return None
 
 
 def rule_of(name: str) -> str:
-    """Return the rule in the name of a backend, '' where it is its own: 'bayes' of 'numba+bayes'."""
+    """Return the rule in the name of a backend, as 'bayes' of 'numba+bayes'; '' for the backend's own rule."""
     return name.partition(BY_RULE)[2]
 
 
@@ -176,9 +176,9 @@ def create(
 
 
 def _with_rule(name: str, options: dict[str, Any]) -> tuple[str, dict[str, Any]]:
-    """Return name and options that both say the rule: 'numba' with rule='bayes' is 'numba+bayes', as that is by itself.
+    """Return name and options that both have the rule: 'numba' with rule='bayes' and 'numba+bayes' become the same.
 
-    The rule of the options counts, of which the name may be any other word; 'mean' alone is the backend as it is.
+    The rule of the options counts; the name may have any other word for it. 'mean' is the backend without a rule.
     """
     rule = options.get("rule", rule_of(name))
     if not isinstance(rule, str):

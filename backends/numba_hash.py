@@ -90,7 +90,7 @@ FULL = 0.7
 """Largest share of a partition's slots in use."""
 
 FIRST_SLOTS = 64
-"""Of a partition."""
+"""Slots of a new partition's hash."""
 
 
 class NumbaHash:
@@ -100,7 +100,7 @@ class NumbaHash:
 
     Attributes:
         evidence: 'float64', or 'float32' for half the memory of the evidence.
-        threads: Number of threads; all of numba's where not given.
+        threads: Number of threads; all of numba's threads by default.
         history: Store every observation, for `events`; memory then grows with each.
         within: The voxels that the map is restricted to.
     """
@@ -221,7 +221,8 @@ class NumbaHash:
     def table(self) -> VoxelTable:
         """Return the map so far.
 
-        The hash, and what records have been given room for, make room for it; a further frame makes them anew.
+        The hash and the spare room of the records are freed first, to make room for the map. A further frame
+        allocates both again.
         """
         self._slots = np.empty((PARTITIONS, 0), dtype=SLOT)
         self._records.resize(max(len(self), 1), refcheck=False)
@@ -246,18 +247,18 @@ class NumbaHash:
 
     @property
     def origin(self) -> Int64:
-        """(3,) voxel index that packed keys count from: that of the first camera; of an empty map 0."""
+        """(3,) voxel index that packed keys count from: the voxel of the first camera, or 0 for an empty map."""
         return np.zeros(3, dtype=np.int64) if self._pixels.origin is None else self._pixels.origin
 
     def events(self) -> Events | None:
-        """Return every observation in order of integration within a voxel, where there is a `history`; else None."""
+        """Return every observation, in order of integration within a voxel, or None without a `history`."""
         if self._history is None:
             return None
         order = self._order()
         return self._history.events(order, columns_of_keys(self._records["key"][order], self.origin))
 
     def _make_slots(self, needed: int) -> None:
-        """Make room in the hash for so many voxels of a partition; it is made of the records where there is none."""
+        """Make room in the hash for `needed` voxels of a partition; without a hash, build it from the records."""
         now = self._slots.shape[1]
         size = max(now, FIRST_SLOTS)
         while needed > FULL * size:

@@ -145,7 +145,7 @@ def _observe_voxel(record, nodes, ranges, s, few, node, label, weight, first, la
     """Add one observation to a voxel that disagrees with itself, or with the frame; see `observe_row`.
 
     - `s`: work space with room for K values, all 0
-    - `few`, `node`: likewise for the evidence and the shares of the classes, see `observe_few`, and their nodes
+    - `few`, `node`: work space for the evidence and the shares of the classes, see `observe_few`, and their nodes
     """
     evidence, shares = few[0], few[1]
     for e in range(first, last):

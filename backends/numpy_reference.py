@@ -210,7 +210,7 @@ class NumpySample(NumpyHistory):
 
 
 def in_sample(index: npt.NDArray[np.integer], one_in: int = ONE_IN) -> Mask:
-    """Return which voxels of that index (3, n) are in the sample of one in so many, a power of 2."""
+    """Return a mask (n,) of the voxels with index (3, n) that are in a sample of one in `one_in`, a power of 2."""
     mixed = np.zeros(index.shape[1], np.int64)
     for axis, odd in zip(index, ODD, strict=True):
         mixed += axis * odd

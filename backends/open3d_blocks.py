@@ -49,7 +49,7 @@ COPIED_BLOCKS = 1024
 class Open3DBlocks(FusionBackend):
     """Incremental fusion on voxel blocks; `grid` is the VoxelBlockGrid, its attributes named as VoxelTable's columns.
 
-    One is not among those: the bits of `classes` tell of which classes a voxel has evidence.
+    One attribute has no such column: the bits of `classes` tell the classes for which a voxel has evidence.
 
     A map reaches 2^20 voxels to either side of its first camera.
 
@@ -202,7 +202,7 @@ class Open3DBlocks(FusionBackend):
     def _attribute(self, name: str) -> Any:
         """Return the attribute, flattened to (voxels, channels).
 
-        It is taken anew each time, because a rehash moves the buffers.
+        It is fetched at each call, because a rehash moves the buffers.
         """
         values = self.grid.attribute(name)
         return values.reshape((-1, values.shape[-1]))

@@ -107,8 +107,8 @@ class Projector(Aggregator):
     def _touched(self, frame: Frame) -> Int64:
         """Return blocks (n, 3) near the voxels that hold a point of a valid pixel, sorted.
 
-        Open3D's own search among the pixels' points takes seconds where there are millions of them, or looks at each
-        fourth pixel only. It computes in float32, so the voxels count from a block near the camera.
+        Open3D's own search among the pixels' points takes seconds for millions of points, or looks at each fourth
+        pixel only. It computes in float32, so the voxels count from a block near the camera.
         """
         valid = np.where(frame.valid, np.uint8(0), np.uint8(IGNORE_8BIT))
         holding = super().index_of(super().observe(dataclasses.replace(frame, labels=valid, scores=None)).key)

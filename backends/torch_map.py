@@ -178,7 +178,7 @@ class TorchMaps:
         return VoxelTable(**index, **values, voxel_size=self.voxel_size)
 
     def changes(self, name: str) -> Changes | None:
-        """Return the changes of a model's map by the last view, brought to memory; None where it was not fused."""
+        """Return the changes of a model's map by the last view, in main memory, or None if the view was not fused."""
         last = self._updates.get(name)
         if last is None:
             return None
@@ -349,7 +349,7 @@ class TorchMap(FusionBackend):
 
         Args:
             depth: (H, W) float metres.
-            intrinsics: Those of the depth image.
+            intrinsics: Intrinsics of the depth image.
             T_wc: (4, 4) camera-to-world, as a `Frame` has it.
             index: The index of the frame.
             labels: (H, W), as a `TensorPrediction` has them; give labels, scores or logits.

@@ -28,7 +28,7 @@ SCORE_BITS, SCORE_BITS_SINGLE = 48, 25
 that were computed in float32 in units of 2^-25, half the distance of the float32 numbers below 1."""
 
 SUMS = len(fields(Change))
-"""The count of numbers that `update` returns: those of a `Change`, in its order."""
+"""The count of numbers that `update` returns: the fields of a `Change`, in its order."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -130,9 +130,9 @@ def camera_terms(view: DepthView, grid: MapGrid) -> list[torch.Tensor]:
 def camera_terms_single(view: DepthView, grid: MapGrid) -> list[torch.Tensor]:
     """Return a (3, 1, W), b (3, H, 1), start and offset (3, 1, 1), float32: x_w / r = d (a + b) + start.
 
-    Units are voxels, with the whole voxels of the camera's position left to the integers: so float32 holds no more
-    than the distance from the camera, and decides alike in UTM-sized coordinates. Of a scan they are R (3, 3, 1, 1),
-    start and offset: x_w / r = R p + start.
+    Units are voxels. Integers hold the whole voxels of the camera's position, so float32 holds no more than the
+    distance from the camera, and gives the same voxels in UTM-sized coordinates. A scan has R (3, 3, 1, 1), start and
+    offset: x_w / r = R p + start.
     """
     ray_x, ray_y = view.rays
     R, t = view.camera.T_wc[:3, :3] / grid.voxel_size, view.camera.T_wc[:3, 3] / grid.voxel_size
@@ -212,7 +212,7 @@ class Update:
     Attributes:
         sums: (SUMS,) float64 a `Change`.
         observed: (n,) numbers of the frame's voxels that were updated.
-        changed: (n, 3) float64 of each: drift in bits, NaN where it is new; dominant class before and after.
+        changed: (n, 3) float64 of each: drift in bits, NaN for a new voxel; dominant class before and after.
     """
 
     sums: torch.Tensor

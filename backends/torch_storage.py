@@ -162,7 +162,7 @@ class Storage:
         return self.hash.bytes + sum(columns.capacity * columns.row_bytes for columns in self.columns.values())
 
     def add(self, keys: torch.Tensor, rows: torch.Tensor, voxels: int) -> None:
-        """Enter those keys (n,) whose row is a new one; with them there are so many voxels."""
+        """Enter the keys (n,) whose row is new; the map then has `voxels` voxels."""
         if voxels > self.voxels:
             self.hash.insert(keys, rows, self.voxels)
             self.voxels = voxels
@@ -227,7 +227,7 @@ class TensorPrediction:
 
     Attributes:
         labels: (H, W) integer class ids. Ignored are 255 in uint8 and 65535 in uint16; in other types every negative
-            id, and 255 (65535 where there are more classes than that).
+            id, and 255 (65535 with more than 255 classes).
         scores: (K, H, W) float, non-negative; normalised per pixel, pixels without a finite positive sum left out.
         logits: (K, H, W) float, as models give them; softmax over the classes, in float32 unless they are float64.
 
@@ -278,7 +278,7 @@ class DepthView:
     def of(
         cls, depth: Image, intrinsics: Intrinsics, T_wc: npt.ArrayLike, index: int, device: torch.device
     ) -> DepthView:
-        """Return a view of a depth image on any device, copied where it is elsewhere.
+        """Return a view of a depth image on any device, copied if the image is on another device.
 
         Raises:
             DataError: As Frame does.

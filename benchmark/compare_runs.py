@@ -98,11 +98,10 @@ def maps(comparison: ComparisonData, known: Mapping[str, Georeference] = Mapping
         if scene.scene in comparison.up:
             yield Figure(
                 slug("comparison_map", scene.scene, against.other),
-                f"Changes: {scene.scene}, {against.other} less {comparison.result.base}",
+                f"Changes: {scene.scene}, {against.other} minus {comparison.result.base}",
                 "The map shows the largest change in each column of voxels that both saw twice or more: of agreement"
-                " between frames and, where there is ground truth, of correctness. Numbers name the areas that got"
-                " worse.",
-                f"Maps of {scene.scene} from above: orange where {against.other} is worse, blue where it is better.",
+                " between frames and, with ground truth, of correctness. Numbers name the areas that got worse.",
+                f"Maps of {scene.scene} from above: {against.other} is worse at orange places, better at blue places.",
                 partial(_draw, changes, comparison.up[scene.scene], scene.scene, against, known.get(scene.scene)),
                 unit=slug(scene.scene, against.other),
             )
@@ -185,7 +184,7 @@ def compare(
 
 
 def georeferences(runs: Sequence[str | os.PathLike[str]]) -> Mapping[str, Georeference]:
-    """Return the georeferences of scenes by name, as the first folder of a run has them: those of all are the same."""
+    """Return the georeferences of scenes by name from the first run with a folder: all runs have the same."""
     folders = (folder for folder, _ in map(run_and_model, runs) if folder.is_dir())
     return next((load_result(folder).georeference for folder in folders), {})
 

@@ -27,7 +27,7 @@ def load_config(
     """Return the configuration of a file, or of settings by name, over the defaults in configs/datasets/.
 
     Args:
-        settings: A YAML file, or settings by name; the defaults where not given.
+        settings: A YAML file, or settings by name; the built-in defaults by default.
         overrides: Settings that come last.
 
     Raises:
@@ -162,7 +162,7 @@ def filtered_config(filters: Sequence[str], path: str | Path | None, overrides: 
         if name != GROUND_TRUTH:
             scores = StoredSequence(scene, name, False).has_scores
             stored = {"model": STORED, "options": {"source": name}, "scores": scores, "filters": filters}
-            if scores and name.removesuffix("-scores") in names:  # beside the labels of that name
+            if scores and name.removesuffix("-scores") in names:  # next to the labels of this name
                 stored["name"] = "-".join([name, *(str(parse(text)).replace(":", "-") for text in filters)])
             predictors.append(validated(PredictorConfig, stored))
     content = merge(dataset_defaults({"dataset": config.dataset.model_dump()}), _over(_of_file(path), overrides))

@@ -98,9 +98,9 @@ def quantised(depth: Float32, scale: float) -> tuple[UInt16, float]:
 
 
 def depth_format(depths: Sequence[Float32], tolerance: float) -> DepthFormat:
-    """Return the 16-bit format that holds these images best, exactly if there is one.
+    """Return the 16-bit format that holds these images best, without error if possible.
 
-    Floats where none is good enough.
+    Returns the format of floats if every 16-bit format has a larger error than `tolerance`.
     """
     scales = sorted(KNOWN_SCALES, key=lambda scale: (scale != MILLIMETRES, scale))
     errors = {scale: max(quantised(depth, scale)[1] for depth in depths) for scale in scales}
@@ -301,9 +301,9 @@ def convert(
 ) -> Iterator[Converted]:
     """Write the scenes, frames and label sources that a resolved configuration selects to OUT/SCENE, one by one.
 
-    Where no label source is named, all are written, the ground truth too. Files that an earlier start finished
-    stay. Depth becomes 16-bit PNG where no pixel is off by more than `depth_error` metres, else float32 .npy; with 0
-    the folder gives the voxels of the source. `progress` is called after each frame: task, frames done, all frames.
+    By default all label sources are written, the ground truth too. Files that an earlier start finished stay. Depth
+    becomes 16-bit PNG if the error of every pixel is at most `depth_error` metres, else float32 .npy; with 0 the folder
+    gives the voxels of the source. `progress` is called after each frame: task, frames done, all frames.
 
     Raises:
         ConfigError: For a folder with other content.

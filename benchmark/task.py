@@ -28,10 +28,10 @@ class Task:
     """A model on a scene: its frames, and the mapping of its labels to rows of evidence.
 
     Attributes:
-        indices: Indices of the frames, ascending; a range where they are evenly spaced.
-        top_k: Number of the largest scores of a pixel that are fused; all where not given.
+        indices: Indices of the frames, ascending; a range for evenly spaced frames.
+        top_k: Number of the largest scores of a pixel that are fused; all by default.
         left_out: Number of selected frames without a file or a pose.
-        apart: Backends whose maps need not agree with those of the others, where a plan puts backends together.
+        apart: Backends whose maps need not agree with the maps of the other backends of a plan.
     """
 
     scene: Scene
@@ -57,7 +57,7 @@ class Task:
 
 
 def class_distances(task: Task, config: Config) -> Float64 | None:
-    """Return distances (K, K) between the classes of a run: those of the settings, else of the model's own names."""
+    """Return distances (K, K) between the classes of a run, from the settings, else from the model's own names."""
     target = task.mapping.target
     given = distances_of(target, config.distances)
     own = task.scene.label_space(task.model)
@@ -160,7 +160,7 @@ def frame_indices(scene: Scene, config: Config, sources: Sequence[str] = ()) -> 
 def selected(
     wanted: list[str] | None, known: Sequence[str], extra: Sequence[str], kind: str, where: str
 ) -> Sequence[str]:
-    """Return the wanted names, all known ones where none are named; `extra` ones only by name."""
+    """Return the wanted names, by default all known names; `extra` names must be named."""
     for name in wanted or ():
         if name not in (*known, *extra):
             raise ConfigError(f"{where}: no {kind} '{name}'; {nearest(name, [*known, *extra])}")
@@ -168,7 +168,7 @@ def selected(
 
 
 def read(task: Task, index: int, pixel_stride: int = 1, *, color: bool = False) -> Frame:
-    """Return a frame of the task, ready to fuse; colour only where it is wanted."""
+    """Return a frame of the task, ready to fuse, with colour if `color`."""
     return prepare(task, task.scene.frame(index, task.model, color=color), pixel_stride)
 
 
@@ -192,7 +192,7 @@ def prepare(task: Task, frame: Frame, pixel_stride: int = 1) -> Frame:
 
 
 def _unlabelled(frame: Frame) -> Mask | None:
-    """Return (H, W) the pixels with depth to which the model gave no label; None where there are none.
+    """Return (H, W) the pixels with depth to which the model gave no label, or None if every pixel has a label.
 
     Classes that the run's taxonomy leaves out count as labels, and so do pixels that were left out because they move.
     """
@@ -212,7 +212,7 @@ def _in_label_space(mapping: LabelMapping, frame: Frame) -> Frame:
 
 
 def truth_task(task: Task) -> Task | None:
-    """Return the ground truth in the unit's label space; None where there is none, or where it does not map to that."""
+    """Return the ground truth in the unit's label space, or None if it is missing or does not map to this space."""
     if not task.scene.ground_truth or task.model == GROUND_TRUTH:
         return None
     try:

@@ -51,7 +51,7 @@ SECONDS = 120.0
 """Seconds that a program may take for a case, on a busy machine."""
 
 LONG = ("frames_65536",)
-"""Cases of so many frames that a backend that takes a millisecond a frame needs a minute."""
+"""Cases of very many frames: a backend that takes a millisecond a frame needs a minute."""
 
 AT_FACES = (
     "faces", "decimal_faces", "negative", "ranges", "near", "rays", "quotients", "utm", "utm_faces", "utm_origins",
@@ -66,9 +66,9 @@ OF_SCANS = ("scan", "scan_scores", "scan_faces", "scan_utm", "scans_and_images")
 
 @dataclass(frozen=True)
 class Verdict:
-    """The result of a case: no problem where the program's table is the expected one, else where it differs.
+    """The result of a case: `problem` is the first difference of the program's table from the expected table, or ''.
 
-    `left_out` names what the case has and the program was declared not to take: then it was not run.
+    `left_out` names the parts of the case that the program was declared not to take: then the case was not run.
     """
 
     case: str
@@ -85,7 +85,7 @@ def case_folder(name: str) -> Path:
     """Return the folder of a case; one by formula, or `random:SEED`, is written for the time that this process runs.
 
     Raises:
-        ConfigError: If there is none of that name.
+        ConfigError: If no case has this name.
     """
     seed = seed_of(name)
     if seed is None and name not in case_names():
@@ -126,13 +126,13 @@ def conform(
 ) -> Iterator[Verdict]:
     """Run `command CASE OUT` for each case, or for some, and compare what it wrote to OUT with what is expected.
 
-    The command may be a backend's FILE.py:NAME. A program that fails alike in the first three cases is not started
-    again. So many random cases, with seeds from 0, follow. Without `scans` or `scores` the cases that have some are not
-    run, and said not to be.
+    The command may be a backend's FILE.py:NAME. A program with the same failure in the first three cases is not started
+    again. `random` random cases, with seeds from 0, follow. Without `scans` or `scores`, cases with scans or scores are
+    not run, and their verdicts say so.
 
     Raises:
-        ConfigError: For a case that there is not, or a command that cannot be read or started, or fails alike in the
-            first three cases.
+        ConfigError: For an unknown case, a command that cannot be read or started, or the same failure in the first
+            three cases.
     """
     names = [*(only or case_names()), *(f"{RANDOM}{seed}" for seed in range(random))]
     for name in only:
@@ -157,7 +157,7 @@ def conform(
             problem = failed or compared(folder, out, tolerance)
         failures.append(failed)
         if failed and failures == [failed] * ALIKE:
-            raise ConfigError(f"{command}: {failed}, in the first {ALIKE} cases alike (PROGRAM CASE OUT)")
+            raise ConfigError(f"{command}: {failed}, in each of the first {ALIKE} cases (PROGRAM CASE OUT)")
         yield Verdict(name, problem)
 
 
@@ -169,7 +169,7 @@ def needs(folder: Path) -> list[str]:
 
 
 def compared(folder: Path, out: Path, tolerance: float = TOLERANCE) -> str:
-    """Return where a program's table differs from the expected one, with the likely cause; empty where it does not."""
+    """Return the first difference of a program's table from the expected table, with the likely cause, or ''."""
     try:
         expected, actual = read_rows(folder / EXPECTED), read_rows(out)
     except DataError as error:
@@ -180,7 +180,7 @@ def compared(folder: Path, out: Path, tolerance: float = TOLERANCE) -> str:
 
 
 def _ran(words: Sequence[str], folder: Path, out: Path) -> str:
-    """Run the program; what went wrong, where it did not end well."""
+    """Run the program; return what went wrong, or ''."""
     try:
         done = subprocess.run(
             [*words, str(folder), str(out)], capture_output=True, timeout=SECONDS, check=False, stdin=subprocess.DEVNULL

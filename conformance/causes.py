@@ -52,7 +52,7 @@ def _floor(q: Float64) -> Float64:
 
 @dataclass(frozen=True)
 class Mistake:
-    """What is done to a frame, its points (3, n) and the voxels of points (n, 3), and how to mend it."""
+    """A mistake: changes of a frame, of its points (3, n) and of the voxels of points (n, 3), and the mend in words."""
 
     words: str
     read: Callable[[Frame], Frame] = lambda frame: frame
@@ -101,7 +101,7 @@ class _Mistaken(FromObservations):
 
 
 def likely_cause(voxel_size: float, num_classes: int, frames: Sequence[Frame], expected: Rows, actual: Rows) -> str:
-    """Return which mistake makes the actual rows of these frames, in words with its mend; '' where none does."""
+    """Return the mistake that gives the actual rows of these frames, in words with its mend, or ''."""
     return next(_causes(voxel_size, num_classes, frames, expected, actual), "")
 
 

@@ -158,7 +158,7 @@ def resolved(config: DatasetConfig) -> DatasetConfig:
 
 
 def open_dataset(name: str, options: dict[str, Any] | BaseModel, run_folder: Path | None = None) -> Dataset:
-    """Open a dataset by name with its options, for a run in that folder where there is one.
+    """Open a dataset by name with its options, for the run in `run_folder`, if any.
 
     Raises:
         ConfigError: If the name or an option cannot be used.

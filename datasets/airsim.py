@@ -64,7 +64,7 @@ class Row:
 
 
 class AirSim(FileDataset[AirSimOptions]):
-    """{name} is the image's name without suffix: img_0_0_1530000000000000000; that of any image of its row is found."""
+    """{name} is the image's name without suffix, img_0_0_1530000000000000000; any image of the frame's row will do."""
 
     Options: type[BaseModel] = AirSimOptions
     contents = f"{RECORDING}, and the images that it names, with depth"

@@ -158,14 +158,14 @@ def _kitti_carla(folder: Path, camera: int, names: list[str]) -> tuple[Float64, 
     stamps, path, mount = folder / "full_ts_camera.txt", folder / LIDAR_POSES, folder / f"lidar_to_cam{camera}.txt"
     by_number = {int(row[0]): row[1] for row in read_table(stamps, 2, "frame_id timestamp") if np.isfinite(row[0])}
     if lost := [name for name in names if not (name.isdecimal() and int(name) in by_number)]:
-        raise DataError(f"{stamps}: has no row of image {lost[0][:40]}; get it anew, or remove the image")
+        raise DataError(f"{stamps}: has no row of image {lost[0][:40]}; get it again, or remove the image")
     times = np.array([by_number[int(name)] for name in names])
     rows = read_table(path, 13, "R(0,0) R(0,1) R(0,2) t(0) ... timestamp")
     near = np.abs(rows[:, 12] - times[:, None]).argmin(axis=1)
     apart = np.abs(rows[near, 12] - times)
     if (far := ~(apart <= SAME_TIME)).any():
         k = int(far.argmax())
-        raise DataError(f"{path}: has no pose at {times[k]:g} s, of image {names[k]}; get it anew")
+        raise DataError(f"{path}: has no pose at {times[k]:g} s, of image {names[k]}; get it again")
     T_cl = TO_OPENCV @ matrix_of(read_table(mount, 12, "R(0,0) R(0,1) R(0,2) t(0) ...")[0])
     poses = np.array([matrix_of(row) for row in rows[near, :12]]).reshape(-1, 4, 4)
     return poses @ rigid_inverse(T_cl, str(mount)), times

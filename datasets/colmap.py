@@ -51,7 +51,7 @@ class Colmap(FileDataset[ColmapOptions]):
     """{name} is the image's name in the model without suffix: 0012, or cam0/0012.
 
     Depth maps in .bin files are in the model's unit, others in metres, unless depth_scale says so; with
-    metres_per_unit both become metric. Models that the mapper left beside each other, sparse/0, sparse/1, share no
+    metres_per_unit both become metric. Models that the mapper left next to each other, sparse/0, sparse/1, share no
     coordinates: one is read, or with `model: all` each is a scene, NAME-0, NAME-1.
     """
 
@@ -87,7 +87,7 @@ class Colmap(FileDataset[ColmapOptions]):
         """Return a frame for each image of the only model.
 
         Raises:
-            DataError: For several models where none is wanted, and what `read_model` raises.
+            DataError: For several models without a setting that selects one, and what `read_model` raises.
         """
         return self._frames(folder, self._only(folder))
 
@@ -174,7 +174,7 @@ MODELS: Mapping[str, tuple[int, int]] = {
     "OPENCV_FISHEYE": (8, 0), "FULL_OPENCV": (12, 2), "FOV": (5, 0), "SIMPLE_RADIAL_FISHEYE": (4, 0),
     "RADIAL_FISHEYE": (5, 0), "THIN_PRISM_FISHEYE": (12, 0), "RAD_TAN_THIN_PRISM_FISHEYE": (16, 0),
 }  # fmt: skip
-"""Number of parameters, and of focal lengths among them; 0 where it distorts even if all coefficients are zero."""
+"""Number of parameters, and of focal lengths among them, or 0 for a model that distorts with zero coefficients."""
 
 MAX_SIDE = 2**24
 MAX_NAME = 1000

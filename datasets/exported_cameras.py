@@ -60,7 +60,7 @@ def read_nvm(path: Path, size_of: SizeOf) -> list[Shot]:
 
 
 def read_bundle(path: Path, size_of: SizeOf) -> list[Shot]:
-    """Return the shots of a file whose names stand in list_rNNN.out beside it. Poses are from the world to the camera.
+    """Return the shots of a file, with names from list_rNNN.out next to it. Poses are from the world to the camera.
 
     Cameras that were not reconstructed, of focal length 0, do not count.
 

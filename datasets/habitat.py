@@ -40,7 +40,7 @@ class HabitatOptions(FileOptions):
     ground_truth: opt.GroundTruth = "semantic/{name}"
     quaternion: Literal["wxyz", "xyzw"] = Field("wxyz", description=f"order in {POSES}, after x y z")
     semantic_info: Path | None = Field(
-        None, description=f"{INFO} of the scene, where it is not in its folder, in habitat/ there, or above"
+        None, description=f"{INFO} of the scene, unless its folder, habitat/ in it, or a folder above has it"
     )
 
 

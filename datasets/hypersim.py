@@ -47,7 +47,7 @@ class HypersimOptions(FileOptions):
     metres_per_unit: opt.MetresPerUnit = None
     intrinsics: opt.FourIntrinsics = None
     camera: str = Field("", pattern=r"^(cam_\d\d|)$", description="cam_00, ...; the first one of the scene by default")
-    camera_parameters: Path | None = Field(None, description=f"{CAMERAS}, where it is not in the scene or above")
+    camera_parameters: Path | None = Field(None, description=f"{CAMERAS}, unless the scene or a folder above has it")
 
 
 class Hypersim(FileDataset[HypersimOptions]):
@@ -92,7 +92,7 @@ class Hypersim(FileDataset[HypersimOptions]):
             yield replace(frame, depth_reader=_depth)
 
     def _camera(self, folder: Path) -> str | None:
-        """Return the camera that is asked for, or the first that has poses and depth; None where none has."""
+        """Return the camera of the options, else the first camera with poses and depth, else None."""
         there = (
             [self.options.camera] if self.options.camera else subfolders(folder / "_detail") if folder.is_dir() else []
         )

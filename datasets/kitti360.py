@@ -44,7 +44,7 @@ class Kitti360(ScanDataset[Kitti360Options]):
         return (folder / "velodyne_points/data").is_dir()
 
     def scans(self, entry: SceneEntry) -> Iterator[ScanSource]:
-        """Yield a scan for each file of points, with NaN for its pose where there is none.
+        """Yield a scan for each file of points; the pose of a scan without a pose is NaN.
 
         Raises:
             DataError: If poses or calibration are missing or damaged.
@@ -75,7 +75,7 @@ def camera_in_imu(folder: Path, camera: str) -> Float64:
     path = folder / "calib_cam_to_pose.txt"
     cameras = read_matrices(path)
     if camera not in cameras:
-        raise DataError(f"{path}: has no line {camera}; get KITTI-360's calibration anew")
+        raise DataError(f"{path}: has no line {camera}; get KITTI-360's calibration again")
     rigid_inverse(cameras[camera], str(path))
     return cameras[camera]
 

@@ -126,7 +126,7 @@ def _rectified(path: Path, camera: str) -> tuple[Intrinsics, Float64]:
     P, R = numbers.get(f"P_rect_{number}", []), numbers.get(f"R_rect_{number}", [])
     if len(P) != 12 or len(R) != 9:
         raise DataError(
-            f"{path}: needs lines P_rect_{number} and R_rect_{number}, of 12 and 9 numbers; get the calibration anew"
+            f"{path}: needs lines P_rect_{number} and R_rect_{number}, of 12 and 9 numbers; get the calibration again"
         )
     T = matrix_of(np.hstack([np.reshape(R, (3, 3)), np.zeros((3, 1))]))
     return pinhole(path, np.reshape(P, (3, 4))[:, :3]), T

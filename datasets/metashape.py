@@ -39,7 +39,7 @@ class MetashapeOptions(PhotographOptions):
 
 
 class Metashape(Photographs[MetashapeOptions]):
-    """Cameras that are aligned and enabled. Those of a georeferenced chunk are brought into its projection.
+    """Cameras that are aligned and enabled. The cameras of a georeferenced chunk are brought into its projection.
 
     A chunk with a geographic reference system has geocentric coordinates; its cameras are brought into the zone of UTM,
     or into `crs`, in which the mesh has to be exported, too. The coordinates of a local chunk stay as they are.
@@ -71,7 +71,7 @@ def read_chunk(path: Path, wanted: int | None = None) -> tuple[list[Shot], str |
     Poses are from the camera to the chunk's world, in metres.
 
     Raises:
-        DataError: For a damaged file, several chunks where none is wanted, a camera model that is not known.
+        DataError: For a damaged file, several chunks without a setting that selects one, an unknown camera model.
     """
     try:
         document = ElementTree.fromstring(read_bytes(path))

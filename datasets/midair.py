@@ -31,7 +31,7 @@ USUAL = (512.0, 512.0, 511.5, 511.5)
 """Images of 90 degrees."""
 
 ROWS = 4
-"""Rows of the ground truth, of which there are 100 a second, from an image to the next one."""
+"""Rows of the ground truth, 100 a second, from an image to the next one."""
 
 MOST = 10**7
 """Rows of a flight: more is a damaged number."""

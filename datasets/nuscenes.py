@@ -35,7 +35,7 @@ CHALLENGE = {
     "vehicle.trailer": 9, "vehicle.truck": 10, "flat.driveable_surface": 11, "flat.other": 12, "flat.sidewalk": 13,
     "flat.terrain": 14, "static.manmade": 15, "static.vegetation": 16,
 }  # fmt: skip
-"""The challenge's class of a category; that of all others is 0, which is ignored."""
+"""The challenge's class of a category; the class of all other categories is 0, which is ignored."""
 
 OF_CHALLENGE = np.full(1 << 16, NO_ID, np.uint16)
 OF_CHALLENGE[1:17] = np.arange(1, 17)
@@ -58,8 +58,8 @@ class NuScenesOptions(ScanOptions):
 class NuScenes(ScanDataset[NuScenesOptions]):
     """{name} is the token of the LiDAR's sample_data, as in the challenge.
 
-    Ids of predictions are the challenge's, 1 to 16. Those of the ground truth become these by the names in
-    category.json.
+    Ids of predictions are the challenge's ids, 1 to 16. Ids of the ground truth become the challenge's ids by the
+    names in category.json.
     """
 
     Options: type[BaseModel] = NuScenesOptions
@@ -127,7 +127,7 @@ class NuScenes(ScanDataset[NuScenesOptions]):
             for row in _rows(path):
                 index = int(number(row, "index", f"{path}: {_text(row, 'name', path)}"))
                 if not 0 <= index <= IGNORE_8BIT:
-                    raise DataError(f"{path}: {row['name']}: the index {index} is none of a byte")
+                    raise DataError(f"{path}: {row['name']}: the index {index} does not fit in a byte")
                 table[index] = CHALLENGE.get(row["name"], IGNORE_16BIT)
         return table
 
@@ -159,7 +159,7 @@ class NuScenes(ScanDataset[NuScenesOptions]):
             token, sample, ego = (_text(row, key, path) for key in ("token", "sample_token", "ego_pose_token"))
             if sample not in scene_of or ego not in moved:
                 lost = f"sample.json: sample {sample}" if sample not in scene_of else f"ego_pose.json: pose {ego}"
-                raise DataError(f"{tables / lost} is missing, which {token} in {path.name} names; get the tables anew")
+                raise DataError(f"{tables / lost} is missing, which {token} in {path.name} names; get the tables again")
             points = inside(tables.parent, tables.parent, _text(row, "filename", path), str(path))
             inside(tables.parent, tables.parent, token, str(path))
             pose = moved[ego] @ mounted[row["calibrated_sensor_token"]]

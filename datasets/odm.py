@@ -36,7 +36,7 @@ UNDISTORTED = "undistorted/reconstruction.json"
 DISTORTED = "reconstruction.json"
 NVM = ("undistorted/reconstruction.nvm", "reconstruction.nvm")
 BUNDLES = ("bundler/bundle*.out", "bundle*.out")
-"""What OpenSfM exports, where a project has no reconstruction.json any more."""
+"""Files that OpenSfM exports, for a project without reconstruction.json."""
 
 MESHES = (
     "odm_meshing/odm_mesh.ply", "odm_meshing/odm_25dmesh.ply", "odm_texturing*/odm_textured_model_geo.obj",
@@ -51,7 +51,7 @@ NPZ_MAPS = ("undistorted/depthmaps", "depthmaps")
 """Folders of OpenSfM's depth maps in opensfm/; the last one is that of versions before 0.5."""
 
 NPZ_SUFFIXES = (".clean.npz", ".raw.npz")
-"""Of OpenSfM's own depth maps those that were checked against their neighbours first."""
+"""Suffixes of OpenSfM's own depth maps; depth maps that were checked against their neighbours come first."""
 
 Kind = Literal["mesh", "dsm", "mve", "openmvs", "opensfm", "files"]
 
@@ -71,9 +71,9 @@ class Project:
 
 
 def find_project(folder: Path, wanted: int | None = None) -> Project | None:
-    """Return the project in a folder, of OpenDroneMap or of OpenSfM; None where there is no reconstruction.
+    """Return the project in a folder, of OpenDroneMap or of OpenSfM, or None without a reconstruction.
 
-    Of several bundles that is taken whose number is `wanted`, else the first.
+    Of several bundles, the bundle with the number `wanted` is taken, else the first bundle.
     """
     for opensfm in (folder / "opensfm", folder):
         for name in (UNDISTORTED, DISTORTED, *NVM):
@@ -119,7 +119,7 @@ LOCATIONS: dict[Kind, str] = {
 
 
 def find_depth(project: Project, kind: Kind, template: str) -> Path | None:
-    """Return the file or folder of a source of depth, None where the project has none; `template` names depth files."""
+    """Return the file or folder of a source of depth, or None without this source; `template` names depth files."""
     if kind == "mesh":
         return next((path for pattern in MESHES for path in sorted(project.folder.glob(pattern))), None)
     if kind == "mve":
@@ -134,7 +134,7 @@ def find_depth(project: Project, kind: Kind, template: str) -> Path | None:
 
 
 def depth_files(project: Project, kind: Kind | None, names: Mapping[str, str], template: Template) -> dict[str, Path]:
-    """Return the depth map of each shot, there or not, by its name; `names`: those of frames by those of shots."""
+    """Return the depth map, even if missing, of each shot by its name; `names` maps names of shots to frames' names."""
     if kind == "mve":
         return _mve_files(project.folder / VIEWS, names)
     if kind == "openmvs":
@@ -157,14 +157,14 @@ def depth_files(project: Project, kind: Kind | None, names: Mapping[str, str], t
 
 
 def _npz_maps(project: Project) -> Path | None:
-    """Return the folder of OpenSfM's depth maps, None where it has none."""
+    """Return the folder of OpenSfM's depth maps, or None without depth maps."""
     folders = (project.opensfm / name for name in NPZ_MAPS)
     there = (maps for maps in folders if any(True for suffix in NPZ_SUFFIXES for _ in maps.glob(f"*{suffix}")))
     return next(there, None)
 
 
 def _mve_files(views: Path, names: Mapping[str, str]) -> dict[str, Path]:
-    """Return the depth map of each shot by the image that its view names, or by the view's number where it names none.
+    """Return the depth map of each shot by the image that its view names, or else by the view's number.
 
     MVE calls a view after its image, or '0007' after its own number, which then counts shots.
 
@@ -191,7 +191,7 @@ def _mve_files(views: Path, names: Mapping[str, str]) -> dict[str, Path]:
 
 
 def _view_name(path: Path) -> str | None:
-    """Return the name in the part [view] of a meta.ini; None where there is none."""
+    """Return the name in the part [view] of a meta.ini, or None without a name."""
     lines = [text for _, text in records(path)] if path.is_file() else []
     start = lines.index("[view]") + 1 if "[view]" in lines else len(lines)
     part = itertools.takewhile(lambda line: not line.startswith("["), lines[start:])
@@ -303,8 +303,8 @@ class Odm(FileDataset[OdmOptions]):
         """Return a frame for each shot, in natural order of names.
 
         Raises:
-            DataError: For a damaged file of poses, several reconstructions where none is wanted, or no image where its
-                size is needed.
+            DataError: For a damaged file of poses, several reconstructions without a setting that selects one, or a
+                missing image whose size is needed.
         """
         project = self._project(folder)
         shots, contents, where = self._shots_of(project), Folders(), str(project.poses)

@@ -37,7 +37,8 @@ def read_reconstruction(path: Path, wanted: int | None = None) -> list[Shot]:
     Poses are from the world to the camera.
 
     Raises:
-        DataError: For a damaged file, several reconstructions where none is wanted, or an unknown camera model.
+        DataError: For a damaged file, several reconstructions without a setting that selects one, or an unknown camera
+            model.
     """
     reconstructions = read_content(path, MAX_BYTES)
     if not isinstance(reconstructions, list) or {type(one) for one in reconstructions} != {dict}:
@@ -92,9 +93,9 @@ def _vector(values: Mapping[str, Any], key: str, where: str) -> list[float]:
 
 
 def _lens(values: Mapping[str, Any], where: str) -> tuple[Camera, Lens | None]:
-    """Return the pinhole that stands for a camera, and its lens where it distorts.
+    """Return the pinhole that stands for a camera, and its lens if it distorts.
 
-    The pinhole is that of OpenSfM's own undistorted images: the mean focal length, the centre of the image.
+    OpenSfM's own undistorted images have this pinhole: the mean focal length, the centre of the image.
     """
     kind = values.get("projection_type", "perspective")
     if not isinstance(kind, str) or kind not in COEFFICIENTS:

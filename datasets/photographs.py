@@ -72,7 +72,7 @@ class Shot:
 
     Attributes:
         pose: In the convention of the dataset's options.
-        lens: None where nothing distorts.
+        lens: Lens of the photograph, or None without distortion.
     """
 
     name: str
@@ -83,7 +83,7 @@ class Shot:
 
 @dataclass(frozen=True, eq=False)
 class Reconstruction:
-    """The shots that a file holds, and the georeference of their coordinates where it is known.
+    """The shots that a file holds, and the georeference of their coordinates, if known.
 
     Attributes:
         mesh_origin: Where meshes that the program exports count from, in the projection; None: as the shots do.
@@ -98,7 +98,7 @@ class Reconstruction:
 class PosedImageOptions(FileOptions):
     """Options of photographs that a program has posed."""
 
-    images: Path | None = Field(None, description="folder of the posed images, where it is not the usual one")
+    images: Path | None = Field(None, description="folder of the posed images, if not the usual one")
     depth: str = Field("depth/{name}", description="template of depth files in the scene's folder")
     labels_on: Literal["undistorted", "original"] | None = Field(
         None, description="images that labels were predicted on; by default the posed ones"
@@ -168,7 +168,7 @@ class Photographs(FileDataset[Options], Generic[Options]):
         return self._reconstruction(folder).georeference or super().georeference(folder, options)
 
     def mesh_origin(self, folder: Path, surface: Path) -> tuple[float, float, float] | None:
-        """Return the origin of a mesh's coordinates in the projection, None where they are the shots'."""
+        """Return the origin of a mesh's coordinates in the projection, or None if they are the shots' coordinates."""
         return self.options.mesh_origin or self._reconstruction(folder).mesh_origin
 
     def frames(self, folder: Path) -> list[FrameSource]:
@@ -228,7 +228,7 @@ def from_geocentric(poses: Float64, crs: str, wanted: str | None, where: str) ->
     Args:
         poses: (n, 4, 4) in metres from the Earth's centre, x to the meridian of Greenwich, z to the north pole.
         crs: Reference system on whose ellipsoid they are: geographic or projected, in any words that pyproj reads.
-        wanted: Projection; by default `crs` where it is one, else the zone of UTM of the first camera.
+        wanted: Projection; by default `crs` if it is a projection, else the zone of UTM of the first camera.
         where: File, for messages.
 
     Raises:

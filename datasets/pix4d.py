@@ -32,7 +32,7 @@ class Pix4dOptions(PhotographOptions):
 
 
 class Pix4d(Photographs[Pix4dOptions]):
-    """Coordinates are those of the projection less the offset, as those of the meshes that Pix4D exports are."""
+    """Coordinates are the projection's coordinates minus the offset, as in the meshes that Pix4D exports."""
 
     Options: type[BaseModel] = Pix4dOptions
     contents = f"PROJECT{SUFFIX} of Pix4D (1_initial/params)"
@@ -43,7 +43,7 @@ class Pix4d(Photographs[Pix4dOptions]):
         return True
 
     def reconstruction(self, path: Path, folder: Path) -> Reconstruction:
-        """Read the file, and those of the georeference beside it. Raises DataError for a damaged one."""
+        """Read the file, and the files of the georeference next to it. Raises DataError for a damaged file."""
         shots, project = read_cameras(path), path.name.removesuffix(SUFFIX)
         projection, shift = (path.with_name(f"{project}_{name}") for name in ("wkt.prj", "offset.xyz"))
         if self.options.crs is not None or not projection.is_file():
@@ -90,7 +90,7 @@ def _shot(path: Path, number: int, head: Sequence[str], lines: Sequence[tuple[in
     rows = [[to_number(word, path, line) for word in words] for line, words in lines]
     K, (r1, r2, r3), (t1, t2), position, R = np.array(rows[:3]), rows[3], rows[4], rows[5], np.array(rows[6:])
     if abs(K[0, 1]) > 1e-6 or (K[2] != (0, 0, 1)).any():
-        raise DataError(f"{where}: its matrix K is none of a camera without skew; export the parameters again")
+        raise DataError(f"{where}: its matrix K has skew, which is not supported; export the parameters again")
     T = np.eye(4)
     T[:3, :3], T[:3, 3] = R, -R @ np.array(position)
     size, centre = (width, height), ((width - 1) / 2, (height - 1) / 2)

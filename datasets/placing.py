@@ -87,7 +87,7 @@ class _Known:
     exact: bool = False
 
     def apart(self, cameras: Mapping[str, Float64]) -> float | None:
-        """Return the median distance of cameras (2,) to them in metres, None where none can be compared."""
+        """Return the median distance of cameras (2,) to these positions in metres, or None without a common camera."""
         if self.named:
             both = [name for name in cameras if name in self.named]
             return float(np.median([np.hypot(*(cameras[name] - self.named[name])) for name in both])) if both else None
@@ -365,7 +365,7 @@ def _spread(items: list[Any]) -> list[Any]:
 
 
 def _exif_position(path: Path) -> tuple[float, float] | None:
-    """Return longitude and latitude in degrees of an image's EXIF data, None where it has none."""
+    """Return longitude and latitude in degrees of an image's EXIF data, or None without a position."""
     from PIL import Image
     from PIL.ExifTags import IFD
 

@@ -93,12 +93,12 @@ class PosedFolder(FileDataset[PosedOptions]):
             )  # fmt: skip
 
     def _trajectory(self, folder: Path) -> Path | None:
-        """Return the file of all poses: that of the options, else of scene.yaml; None where each has its own."""
+        """Return the file of all poses from the options, else from scene.yaml, or None if each frame has a file."""
         stated = self.options.trajectory or _scene_settings(folder / SETTINGS_FILE).trajectory
         return None if stated is None else inside(self.options.root, folder, stated, "option trajectory")
 
     def settled(self, folder: Path) -> FileOptions:
-        """Return scene.yaml, where there is one, with the options on top.
+        """Return the options on top of scene.yaml, if there is one.
 
         Raises:
             ConfigError: If that fails, with the file and the setting.

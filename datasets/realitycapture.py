@@ -34,7 +34,7 @@ class RealityCaptureOptions(PhotographOptions):
     """Options with the defaults of the format."""
 
     camera_axes: opt.CameraAxes = "opengl"
-    image_size: opt.Size = Field(None, description="[width, height] of the images; that of the files by default")
+    image_size: opt.Size = Field(None, description="[width, height] of the images; the size of the files by default")
 
 
 class RealityCapture(Photographs[RealityCaptureOptions]):

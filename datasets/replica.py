@@ -1,4 +1,4 @@
-"""Replica in its two exports: that of NICE-SLAM (results/, traj.txt) and that of Semantic-NeRF (rgb/, depth/, ...).
+"""Replica in its two exports: by NICE-SLAM (results/, traj.txt) and by Semantic-NeRF (rgb/, depth/, ...).
 
 Sources: Zhu et al., NICE-SLAM, CVPR 2022; Zhi et al., Semantic-NeRF, ICCV 2021; Straub et al., Replica, 2019.
 """
@@ -22,7 +22,7 @@ from semstab.errors import DataError
 
 @dataclass(frozen=True)
 class Export:
-    """The paths of one of the two exports, and its camera where no file says it."""
+    """The paths of one of the two exports, and its camera if no file has it."""
 
     trajectory: str
     depth: str

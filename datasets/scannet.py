@@ -32,8 +32,8 @@ class ScanNetOptions(FileOptions):
     up_axis: opt.UpAxis = "z"
     ground_truth: opt.GroundTruth = "label-filt/{name}.png"
     void_ids: opt.VoidIds = opt.ZERO_IS_VOID
-    intrinsics: Which = Field("depth", description="whose intrinsics the depth images have: those of depth or colour")
-    label_camera: Which = Field("color", description="whose field of view label maps have: that of colour or depth")
+    intrinsics: Which = Field("depth", description="intrinsics of the depth images: of the depth or the colour camera")
+    label_camera: Which = Field("color", description="field of view of label maps: of the colour or the depth camera")
     color_size: opt.Size = (1296, 968)
     class_table: Path | None = Field(None, description="scannetv2-labels.combined.tsv, for ids of the ground truth")
     class_column: str = Field("nyu40id", description="column of that table with the ids of the taxonomy")
@@ -60,7 +60,7 @@ class ScanNet(FileDataset[ScanNetOptions]):
         return frames_of(folder, depth, camera, pose="pose/{name}.txt", color="color/{name}", label_camera=label_camera)
 
     def truth(self, folder: Path) -> Truth:
-        """Return the ids of the ground truth as those of the class table's column, where a table is given."""
+        """Return the ground truth with ids of the class table's column, or with its own ids without a table."""
         table = self.options.class_table
         return Truth(ids=None if table is None else read_class_table(table, self.options.class_column))
 
@@ -70,7 +70,7 @@ class ScanNet(FileDataset[ScanNetOptions]):
 
 
 def read_class_table(path: Path, column: str) -> UInt16:
-    """Return (65536,) the column's id for each ScanNet id; `IGNORE_16BIT` where it is empty, `NO_ID` where no row is.
+    """Return (65536,) the column's id for each ScanNet id: `IGNORE_16BIT` for an empty cell, `NO_ID` without a row.
 
     Raises:
         DataError: For a file without the columns, or an id that is no whole number.

@@ -35,9 +35,9 @@ class Filtering:
     """Filters between a model and a label source.
 
     Attributes:
-        model: The label source without them; the source itself where that is not there.
-        filters: 'ema:0.6+guided:8'; '' where there are none.
-        milliseconds: CPU time that they took for a frame so far, in the median.
+        model: The label source without filters, or the source itself if the scene has no source without filters.
+        filters: 'ema:0.6+guided:8'; '' without filters.
+        milliseconds: Median CPU time of the filters for a frame so far.
     """
 
     model: str
@@ -57,16 +57,16 @@ class Scene(ABC):
         ground_truth: Whether `frame(i, "gt")` works too.
         further: Label sources that are read by name only, none of 'all'.
         regions: Maps of regions without classes, which `frame` reads by name and nothing fuses.
-        up: (3,) unit vector of the world's up axis, or None where it is not known.
-        georeference: Georeference, or None where that is not known.
+        up: (3,) unit vector of the world's up axis, or None if unknown.
+        georeference: Georeference, or None if unknown.
         placed: The source of the georeference and its fit, in words, or None.
-        folder: Folder of its files, where label maps are looked for, or None where it has none.
+        folder: Folder of its files, where label maps are looked for, or None for a scene without a folder.
         label_paths: Paths where the first frame's label maps are looked for, with MODEL for any name.
-        settings_file: The file with further settings, or None where there is no such file.
-        labels_like_depth: Whether its label maps have the pixels of the depth, not those of the colour images.
-        surface: The file of the surface that depth is cast at, or None where it is not cast.
-        depth_from: Source of depth, in words, where that is not a file a frame.
-        sources: Where its parts come from, in words, a line each, where that was found and could be another.
+        settings_file: The file with further settings, or None without such a file.
+        labels_like_depth: Whether its label maps have the pixels of the depth, not the pixels of the colour images.
+        surface: The file of the surface from which depth is cast, or None without casting.
+        depth_from: Source of depth, in words, if depth does not come from one file a frame.
+        sources: Sources of its parts that were chosen among several, in words, a line each.
         on_photographs: Whether `image` is a distorted photograph, which `color` shows undistorted.
         skips_incomplete: Whether selected frames without a file are left out; else they are an error.
         images_elsewhere: Whether option images may name another folder of images, and does not.
@@ -74,10 +74,10 @@ class Scene(ABC):
         made: Whether it is simulated, so that each frame has the pose that it was rendered from.
         posed: Whether its frames have depth and a pose, so that they can be fused.
         replaced: Label sources in its files that predictions stand for, and that are not read.
-        unread: The images in a folder of label maps of which none is read, and what reads them; None if there are none.
-        in_program: Whether its frames are those of a program, and not in files.
+        unread: The images in a folder of label maps that nothing reads, and the setting that reads them; None without.
+        in_program: Whether its frames come from a program, and not from files.
         with_features: Models whose frames have features.
-        usual: Values of options that the format's own data have where nothing is said, as they are typed.
+        usual: Default values of options for the format's own data, as they are typed.
     """
 
     name: str
@@ -152,7 +152,7 @@ class Scene(ABC):
 
     @property
     def timestamps(self) -> Float64 | None:
-        """Return (len,) seconds on the scene's own clock, ascending; None where it has none. Reads no image."""
+        """Return (len,) seconds on the scene's own clock, ascending, or None without a clock. Reads no image."""
         return None
 
     def require_one_size(self, indices: Sequence[int]) -> None:  # noqa: B027  of files only
@@ -173,7 +173,7 @@ class Scene(ABC):
 
     @property
     def depth_scale(self) -> float | None:
-        """Return units of stored depth in a metre, None where depth is not stored."""
+        """Return units of stored depth in a metre, or None if depth is not stored."""
         return None
 
     def frame_name(self, index: int) -> str:
@@ -185,7 +185,7 @@ class Scene(ABC):
         return Filtering(model)
 
     def prediction_seconds(self, index: int, model: str) -> float:
-        """Return the seconds that a model took to predict on a frame; NaN where it did not, as labels are read."""
+        """Return the seconds of a model's prediction on a frame, or NaN if labels are read from files."""
         return math.nan
 
     def reading(self, indices: Sequence[int], model: str) -> contextlib.AbstractContextManager[None]:
@@ -222,7 +222,7 @@ class Scene(ABC):
         return self.geometry(index).intrinsics
 
     def color(self, index: int) -> UInt8 | None:
-        """Return the colour (H, W, 3) uint8 RGB, None where the frame has none."""
+        """Return the colour (H, W, 3) uint8 RGB, or None for a frame without colour."""
         return self.geometry(index, color=True).color
 
     def image(self, index: int) -> UInt8:
@@ -278,7 +278,7 @@ class Dataset(ABC):
     """A set of scenes. Its class has `Options`, a pydantic model, and is made with an instance of it.
 
     Attributes:
-        run_folder: Folder of the run that reads it, for what it makes on the way; None where nobody runs.
+        run_folder: Folder of the run that reads it, for files that it writes meanwhile; None without a run.
     """
 
     Options: type[BaseModel]

@@ -89,7 +89,7 @@ def _camera(folder: Path, name: str) -> tuple[Intrinsics, Float64]:
     path, key = folder / "calib.txt", f"P{name[-1]}"
     Tr = lidar_to_camera(path)
     if (P := read_matrices(path).get(key)) is None:
-        raise DataError(f"{path}: has no line {key} of 12 numbers, of the camera of {name}/; get calib.txt anew")
+        raise DataError(f"{path}: has no line {key} of 12 numbers, of the camera of {name}/; get calib.txt again")
     K = pinhole(path, P[:3, :3])
     T = np.eye(4)
     T[:3, 3] = np.linalg.solve(K.matrix, P[:3, 3])
@@ -118,7 +118,7 @@ def _classes(frame: FrameSource, path: Path, read: Read, *, K: Intrinsics, T_cl:
     data = frame.depth.read_bytes()
     stored, count = ids_of(path, read(path)), len(floats_of(frame.depth, data, 4))
     if len(stored) != count:
-        raise DataError(f"{path}: has {len(stored)} labels, but {frame.depth.name} has {count} points; get both anew")
+        raise DataError(f"{path}: has {len(stored)} labels, but {frame.depth.name} has {count} points; get both again")
     seen = _seen(frame.depth, frame.color, lambda _: data, K, T_cl)
     ids = np.full(seen.shape, IGNORE_16BIT, np.uint16)
     ids[seen.v, seen.u] = stored[seen.points]

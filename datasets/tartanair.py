@@ -24,7 +24,7 @@ V2 = tuple(f"{side}cam_{face}" for side in "lr" for face in ("front", "back", "l
 
 @dataclass(frozen=True)
 class Version:
-    """What differs between the versions: the size of images, the usual intrinsics, suffixes of depth and labels."""
+    """Properties of a version: the size of images, the usual intrinsics, suffixes of depth and labels."""
 
     size: tuple[int, int]
     intrinsics: tuple[float, float, float, float]
@@ -88,7 +88,7 @@ class TartanAir(FileDataset[TartanAirOptions]):
         )
 
     def _camera(self, folder: Path) -> str | None:
-        """Return the camera that is asked for, or the first that a folder has; None where it has none."""
+        """Return the camera of the options, else the first camera of a folder, else None."""
         wanted = (self.options.camera,) if self.options.camera else VERSIONS
         there = (side for side in wanted if (folder / f"pose_{side}.txt").is_file())
         return next((side for side in there if self.has_depth(folder / f"depth_{side}")), None)

@@ -23,10 +23,10 @@ FORMS = "TUM: seconds x y z qx qy qz qw; EuRoC: nanoseconds,x,y,z,qw,qx,qy,qz,..
 
 
 def poses_by_name(path: Path, names: Sequence[str], max_difference: float) -> tuple[Poses, Float64 | None]:
-    """Return the poses (n, 4, 4) of frames of these names, NaN where none is near, and the seconds of their names.
+    """Return the poses (n, 4, 4) of frames of these names, NaN without a near pose, and the seconds of their names.
 
-    Matrices go in the order of the frames, and frames have no time then; of a file with more of them than frames the
-    number in a frame's name is that of its row, from 0.
+    Matrices go in the order of the frames, and the frames have no time. If a file has more matrices than frames, the
+    number in a frame's name is the number of its row, from 0.
 
     Raises:
         DataError: For a file of another form, or poses that do not belong to the frames.

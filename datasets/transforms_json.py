@@ -48,7 +48,7 @@ class TransformsJson(FileDataset[TransformsOptions]):
 
     Depth is read as the programs do: integers and floats are millimetres, unless the file has integer_depth_scale or
     depth_unit_scale_factor (metres in a unit). Poses that the file says to be scaled (applied_scale) are divided by
-    that. Frames go in the natural order of their images. The size of an image is its file's where no w and h are given.
+    that. Frames go in the natural order of their images. Without w and h, the size of an image is its file's size.
     """
 
     Options: type[BaseModel] = TransformsOptions
@@ -124,7 +124,7 @@ def read_transforms(path: Path, root: Path, folder: Path, depth: Template | None
 
 
 def _named(entry: Mapping[str, Any], keys: tuple[str, ...], path: Path, root: Path, where: str) -> Path | None:
-    """Return the path that the first of the keys holds; None where there is none."""
+    """Return the path that the first present key holds, or None without the keys."""
     value = next((entry[key] for key in keys if entry.get(key) is not None), None)
     if value is None:
         return None
@@ -151,7 +151,7 @@ def _camera(values: Mapping[str, Any], where: str) -> Camera:
 
 
 def _focal(values: Mapping[str, Any], axis: str, where: str) -> float | None:
-    """Return focal length in pixels, from fl_x or the angle of the field of view; None where neither is given."""
+    """Return focal length in pixels, from fl_x or the angle of the field of view, or None without both."""
     if values.get(f"fl_{axis}") is not None:
         return number(values, f"fl_{axis}", where)
     if values.get(f"camera_angle_{axis}") is None:

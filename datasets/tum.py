@@ -44,10 +44,10 @@ class TumOptions(FileOptions):
 
 
 class Tum(FileDataset[TumOptions]):
-    """{name} is the colour image's name without suffix, 1305031102.175304; of the depth's where there is no rgb.txt.
+    """{name} is the colour image's name without suffix, 1305031102.175304, or the depth image's without rgb.txt.
 
-    A depth image and a colour image form a frame where each is the other's nearest in time. Intrinsics not given are
-    those of the sequence's name (freiburg1, 2, 3).
+    A depth image and a colour image form a frame if each is the other's nearest in time. By default, the sequence's
+    name (freiburg1, 2, 3) selects the intrinsics.
     """
 
     Options: type[BaseModel] = TumOptions
@@ -58,7 +58,7 @@ class Tum(FileDataset[TumOptions]):
         return (folder / self._list(folder)).is_file()
 
     def frames(self, folder: Path) -> list[FrameSource]:
-        """Return a frame for each depth image that has a colour image; where no pose is near, its pose is NaN.
+        """Return a frame for each depth image that has a colour image; its pose is NaN without a near pose.
 
         If a surface gives the depth and no depth.txt is there, there is one frame for each colour image.
 

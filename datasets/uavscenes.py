@@ -110,14 +110,14 @@ def _named(entry: SceneEntry) -> SceneEntry:
 
 
 def _map_of(folder: Path) -> Path | None:
-    """Return the mesh of the place that a flight is over, None where it is not there."""
+    """Return the mesh of the place of a flight, or None without the mesh."""
     flight = FLIGHT.fullmatch(folder.name)
     candidates = [] if flight is None else _above(folder, MAPS, f"{flight['place']}/Mesh.ply")
     return next((path for path in candidates if path.is_file()), None)
 
 
 def _truth_of(folder: Path) -> Path | None:
-    """Return the folder of a flight's label maps, None where they are not there."""
+    """Return the folder of a flight's label maps, or None without label maps."""
     flight = FLIGHT.fullmatch(folder.name)
     archive = "" if flight is None else f"interval{flight['step']}_CAM_label"
     candidates = _above(folder, archive, f"{folder.name}/{archive}_id") if archive else []

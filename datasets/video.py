@@ -65,7 +65,7 @@ class VideoFrame:
     """A frame of a video.
 
     Attributes:
-        name: Name in path templates: that of its image, or its number from 0 in a video file, 000012.
+        name: Name in path templates: the name of its image, or its number from 0 in a video file, 000012.
         image: Its image; None in a video file.
     """
 
@@ -77,8 +77,7 @@ class VideoFrame:
 class Video(Dataset):
     """Folders of images, and video files; label maps lie in labels/MODEL/ in a scene's folder.
 
-    The folder of a video file is the one that is called as it without its suffix: clip/labels/MODEL/000012.png beside
-    clip.mp4.
+    The folder of a video file has its name without the suffix: clip/labels/MODEL/000012.png next to clip.mp4.
     """
 
     Options: type[BaseModel] = VideoOptions
@@ -139,7 +138,7 @@ def find_videos(root: Path) -> Iterable[tuple[SceneEntry, Path]]:
 
 
 def _images_of(folder: Path) -> Path | None:
-    """Return the folder with a scene's images: itself, or one that is called so; None where there are none."""
+    """Return the folder with a scene's images: the folder itself, or one of `IMAGE_FOLDERS`; None without images."""
     there = {*subfolders(folder)}
     for images in (folder, *(folder / name for name in IMAGE_FOLDERS if name in there)):
         if len(files_by_stem(images, COLOR_SUFFIXES)) >= LEAST:
@@ -153,7 +152,7 @@ class Film:
     Attributes:
         path: The file.
         size: (width, height) of its frames.
-        rate: Frames a second; NaN where the file does not say.
+        rate: Frames a second; NaN if unknown.
 
     Raises:
         DataError: If OpenCV cannot decode it.
@@ -197,7 +196,7 @@ class Film:
                 self._next = index
             there = all(self._capture.grab() for _ in range(index - self._next))
             done, image = self._capture.read() if there else (False, None)
-            self._next = index + 1 if done else -NEAR  # what follows is looked up anew
+            self._next = index + 1 if done else -NEAR  # the next read seeks again
         if not done or image is None:
             raise DataError(
                 f"{self.path}: frame {index} cannot be decoded; leave it and what follows out (--frames :{index}), or"
@@ -233,7 +232,7 @@ class VideoScene(Scene):
 
     @cached_property
     def timestamps(self) -> Float64 | None:
-        """Return (len,) seconds from the first frame; None where nothing says how many frames a second has."""
+        """Return (len,) seconds from the first frame, or None if the number of frames a second is unknown."""
         rate = self.options.frames_per_second or (math.nan if self._film is None else self._film.rate)
         return None if math.isnan(rate) else np.arange(len(self), dtype=np.float64) / rate
 

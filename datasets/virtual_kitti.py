@@ -1,4 +1,4 @@
-"""Virtual KITTI 2: KITTI's sequences rendered anew, a folder a variation with frames/ and two tables of cameras.
+"""Virtual KITTI 2: rendered copies of KITTI's sequences, a folder a variation with frames/ and two tables of cameras.
 
 Sources: Cabon et al., Virtual KITTI 2, 2020; europe.naverlabs.com/proxy-virtual-worlds-vkitti-2 (formats, colors.txt).
 """
@@ -96,6 +96,6 @@ def _rows(path: Path, header: str, values: int, camera: int, frames: list[int]) 
     rows = {int(row[0]): row[2:] for row in table[np.isfinite(table[:, :2]).all(axis=1)] if row[1] == camera}
     if lost := [frame for frame in frames if frame not in rows]:
         raise DataError(
-            f"{path}: has no row of frame {lost[0]} and camera {camera}; unpack vkitti_*_textgt.tar.gz anew"
+            f"{path}: has no row of frame {lost[0]} and camera {camera}; unpack vkitti_*_textgt.tar.gz again"
         )
     return np.array([rows[frame] for frame in frames]).reshape(-1, values)

@@ -93,9 +93,9 @@ class Prediction:
     """The prediction of a model for one image.
 
     Attributes:
-        labels: (H, W) uint8 or uint16: ids of its label space, 255 (65535) where it has no prediction; of a model
-            without classes, region ids from 1, `UNASSIGNED` where there is no region.
-        scores: (H, W, K) float32 that sum to 1 over the classes, or None where only labels are wanted.
+        labels: (H, W) uint8 or uint16: ids of the model's label space, 255 (65535) for pixels without a prediction. A
+            model without classes gives region ids from 1, `UNASSIGNED` for pixels without a region.
+        scores: (H, W, K) float32 that sum to 1 over the classes, or None if only labels are requested.
         features: (h, w, D) float16 or float32 of a grid that covers the image evenly, of a model that gives features.
     """
 
@@ -109,9 +109,10 @@ class Streamed:
     """A prediction whose scores come class by class, so that they never are in memory at once.
 
     Attributes:
-        labels: Those of a `Prediction`.
-        maps: A function that gives the scores (H, W) float32 of each class in order, anew at each call.
-        features: Those of a `Prediction`.
+        labels: Labels, as a `Prediction` has them.
+        maps: A function that returns an iterator over the scores (H, W) float32 of each class, in order of the
+            classes; each call returns a new iterator.
+        features: Features, as a `Prediction` has them.
     """
 
     labels: Labels
@@ -123,13 +124,13 @@ class Model(Protocol):
     """Images in, label maps or scores out. Its class has `Options`, a pydantic model, and is made with one of it.
 
     Attributes:
-        label_space: The classes of its labels and scores, or None where it predicts regions without classes.
+        label_space: The classes of its labels and scores, or None if it predicts regions without classes.
         gives_scores: Whether `predict` can give scores.
         fit_frames: Number of images that `fit` wants, 0 for most.
         sequential: Whether its prediction on an image depends on the images before: it then gets the selected frames of
             a sequence in order, all of them, from the first one after `reset`.
         wants_geometry: Whether `predict` is also given `geometry=`, one `Frame` an image: its depth, intrinsics and
-            pose at the image's own pixels, depth 0 where it is not known; labels are all 0, there is no colour.
+            pose at the image's own pixels, depth 0 if unknown. Labels are all 0, and there is no colour.
         gives_features: Whether its predictions have features; without labels its label space is
             `semstab.data.features.OF_FEATURES`, and all labels are 0.
         streams: Whether `stream` needs less memory than `predict`: it is called where scores are many.
@@ -151,7 +152,7 @@ class Model(Protocol):
         return self
 
     def reset(self) -> None:
-        """Forget all images: the next one is the first of a sequence. Called where it is `sequential`."""
+        """Forget all images: the next image is the first of a sequence. Called if the model is `sequential`."""
         return
 
     def predict(self, images: Sequence[Image], *, scores: bool = False) -> list[Prediction]:
@@ -175,7 +176,7 @@ class Model(Protocol):
 
 
 def streamed(prediction: Prediction) -> Streamed:
-    """Return a prediction whose scores, where it has any, are handed out class by class."""
+    """Return the prediction with its scores, if any, as an iterator over classes."""
     scores = prediction.scores
     maps = lambda: iter(() if scores is None else np.moveaxis(scores, 2, 0))  # noqa: E731
     return Streamed(prediction.labels, maps, prediction.features)
@@ -184,7 +185,7 @@ def streamed(prediction: Prediction) -> Streamed:
 def ask(
     model: Model, images: Sequence[Image], *, scores: bool = False, geometry: Sequence[Frame] = ()
 ) -> list[Prediction]:
-    """Return the predictions of a model, which gets the geometry of the images where it wants it."""
+    """Return the predictions of a model; a model that wants geometry gets the geometry of the images."""
     more = {"geometry": geometry} if model.wants_geometry else {}
     return model.predict(images, scores=scores, **more)
 
@@ -245,7 +246,7 @@ def image_digest(image: Image) -> str:
 
 
 def narrowed(ids: npt.NDArray[Any], classes: int) -> Labels:
-    """Return the class ids as the narrowest type that holds so many classes and the ignore id."""
+    """Return the class ids in the narrowest type that holds this number of classes and the ignore id."""
     return ids.astype(np.uint8) if classes <= IGNORE_8BIT else ids.astype(np.uint16)
 
 

@@ -39,12 +39,12 @@ class ModelOptions(Settings):
     """The settings that name a pretrained model and say how it runs."""
 
     checkpoint: str = Field(description="a folder that save_pretrained wrote, or an id on the Hugging Face hub")
-    revision: str | None = Field(None, description="branch, tag or commit on the hub; the newest where not given")
+    revision: str | None = Field(None, description="branch, tag or commit on the hub; the newest by default")
     device: str = Field("cpu", description="cpu, cuda, cuda:1, mps")
     dtype: Literal["float32", "bfloat16", "float16"] = Field(
         "float32", description="of the computation; lower precision flips labels, which counts as flicker"
     )
-    threads: int | None = Field(None, ge=1, description="threads on a CPU; torch's own number where not given")
+    threads: int | None = Field(None, ge=1, description="threads on a CPU; torch's own number by default")
 
     def identity(self) -> dict[str, Any]:
         """Return the options that its output depends on; the model itself is named by `Checkpoint.revision`."""
@@ -90,7 +90,7 @@ class Checkpoint:
         return cls(options.checkpoint, fetched, fetched.name)
 
     def preprocessing(self) -> dict[str, Any]:
-        """Return the content of preprocessor_config.json, empty where it is not there.
+        """Return the content of preprocessor_config.json, empty without the file.
 
         Raises:
             DataError: If it is damaged.
@@ -177,7 +177,7 @@ def _cached(options: ModelOptions) -> Path | None:
 def _download(options: ModelOptions) -> Path:
     name, revision = options.checkpoint, options.revision
     try:
-        # Asked first, because it fails at once where there is no network; the download would try for half a minute.
+        # Asked first, because it fails at once without a network; the download would try for half a minute.
         about = huggingface_hub.HfApi().model_info(name, revision=revision, timeout=HUB_TIMEOUT)
         files = [sibling.rfilename for sibling in about.siblings or ()]
         weights = next((pattern for pattern in WEIGHTS if any(Path(file).match(pattern) for file in files)), WEIGHTS[0])
@@ -198,8 +198,8 @@ def _download(options: ModelOptions) -> Path:
     except Exception as error:  # no network has many faces
         raise DataError(
             f"model '{name}': there is no such folder, it is not in the hub's cache, and the hub cannot be reached"
-            f" ({first_sentence(error)}); where there is a network 'hf download {name} --local-dir FOLDER', then name"
-            " the folder"
+            f" ({first_sentence(error)}); with a network, run 'hf download {name} --local-dir FOLDER', then name the"
+            " folder"
         ) from error
     _require_model(folder)
     return folder
@@ -277,7 +277,7 @@ class SegmenterOptions(ImageModelOptions):
     engine: Literal["torch", "onnx"] = Field("torch", description="torch, or ONNX Runtime on the CPU")
     prompts: tuple[str, ...] | None = Field(None, description="of a CLIPSeg model: its prompts, which are its classes")
     threshold: float | None = Field(
-        None, gt=0, lt=1, description="of a CLIPSeg model: pixels where no prompt is as likely are ignored"
+        None, gt=0, lt=1, description="of a CLIPSeg model: pixels at which every prompt is less likely are ignored"
     )
 
     _sides = field_validator("image_size", mode="before")(sides)

@@ -31,7 +31,7 @@ class OwnOptions(BaseModel):
     classes: list[str] | str | None = Field(
         None, description="names in the order of ids; or a file: a name a line, or a taxonomy's YAML; the code's own"
     )
-    threads: int | None = Field(None, ge=1, description="of torch on a CPU; the code's own where it has such an option")
+    threads: int | None = Field(None, ge=1, description="of torch on a CPU; of the code, if it has such an option")
 
     @property
     def of_labels(self) -> dict[str, Any]:
@@ -86,10 +86,10 @@ class OfCode(Wrapped):
 class OwnModel(Model):
     """A function of an image (H, W, 3) uint8 RGB, or an object with such a method `predict`, or that is called so.
 
-    It gives labels (H, W), whole numbers in the order of its classes, 255 (of more than 255 classes 65535) or less than
-    0 where it has no prediction; or scores (H, W, K) that sum to 1. A tensor is as good as an array. It may say
-    `classes`, `gives_scores`, `sequential` (then it has `reset`) and `wants_geometry` (then it is called with image and
-    frame). With `gives_features = True` it gives a mapping with `features` (h, w, D), float, and labels or scores;
+    It gives labels (H, W), whole numbers in the order of its classes, 255 (65535 with more than 255 classes) or less
+    than 0 for pixels without a prediction; or scores (H, W, K) that sum to 1. A tensor is as good as an array. It may
+    say `classes`, `gives_scores`, `sequential` (then it has `reset`) and `wants_geometry` (then it is called with image
+    and frame). With `gives_features = True` it gives a mapping with `features` (h, w, D), float, and labels or scores;
     without classes it gives features alone, as a mapping or an array.
     """
 
@@ -206,7 +206,7 @@ def _ids(labels: npt.NDArray[Any], classes: int, who: str) -> Labels:
 
 
 def _label_space(code: Code, made: Any, classes: Sequence[str] | str | None, *, alone: bool = False) -> LabelSpace:
-    """Return the classes that are stated; those of a model that gives features `alone` if none are."""
+    """Return the stated classes; without them, the label space `OF_FEATURES` of a model of features `alone`."""
     names = class_names(classes) if classes is not None else None
     for owner in (made, code.module):
         for attribute in ("label_space", "classes", "names", "CLASSES"):

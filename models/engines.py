@@ -111,7 +111,7 @@ class TorchFile:
         except Exception as error:
             raise DataError(
                 f"{path}: torch cannot load it as {'an exported program' if path.suffix == '.pt2' else 'TorchScript'}"
-                f" ({summarize_error(error)[:80]}); where it holds weights alone, name the code that loads"
+                f" ({summarize_error(error)[:80]}); if it holds weights alone, name the code that loads"
                 " them: FILE.py:CLASS, or smp,checkpoint=FILE for segmentation_models_pytorch"
             ) from error
 

@@ -260,7 +260,7 @@ INSTALL = "pip install 'semstab[onnx]'"
 class OnnxEngine:
     """Pixels (N, 3, h, w) to logits (N, K, h', w') on the CPU in float32, an image at a time.
 
-    The export of that version of a model is stored in the cache folder, where it can be written.
+    The export of this version of the model is stored in the cache folder, if the folder can be written to.
 
     Raises:
         ConfigError: For another device or dtype.

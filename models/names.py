@@ -48,7 +48,7 @@ class Vocabulary:
         return {name_key(name) for name in self.recognised_by} <= own
 
     def target_of(self, name: str, leniency: Leniency) -> str | None:
-        """Return the class of UAVid that a name is, None where it is none."""
+        """Return the class of UAVid with this name, or None if the name is not a class of UAVid."""
         tables = (self.strict, self.lenient) if leniency == "lenient" else (self.strict,)
         targets = {name_key(each): target for table in tables for target, names in table.items() for each in names}
         return next((targets[key] for key in map(name_key, _names(name)) if key in targets), None)
@@ -65,9 +65,9 @@ def vocabularies() -> Mapping[str, Vocabulary]:
 def class_mapping(source: LabelSpace, target: LabelSpace, leniency: Leniency = "strict") -> LabelMapping:
     """Map a model's classes to a taxonomy by name.
 
-    A class goes to that of its vocabulary, or to the class of `target` with its name or among whose members it is; one
-    of which the vocabulary says nothing else goes to its rest. If `target` knows none of these, strict raises
-    ConfigError and names the class, lenient leaves the class out, and warns where these are most.
+    A class goes to the class that its vocabulary names, or to the class of `target` with its name or with it as a
+    member. Another class of a vocabulary goes to the vocabulary's rest. If `target` has none of these, strict raises
+    ConfigError and names the class; lenient leaves the class out, and warns if most classes are left out.
     """
     vocabulary = next((entry for entry in vocabularies().values() if entry.matches(source)), None)
     known, rows, lost = target.row_of, [], []
@@ -84,8 +84,8 @@ def class_mapping(source: LabelSpace, target: LabelSpace, leniency: Leniency = "
         )
     if 2 * len(lost) > len(source):
         logger.warning(
-            "taxonomy %s: %d of the %d classes of %s are none of its classes and are left out, among them %s; does the"
-            " taxonomy fit? Its members and its ignored list take names",
+            "taxonomy %s does not have %d of the %d classes of %s; they are left out, among them %s; does the taxonomy"
+            " fit? Its members and its ignored list take names",
             target.name, len(lost), len(source), source.name, ", ".join(lost[:3]),
         )  # fmt: skip
     return LabelMapping(source, target, tuple(rows))

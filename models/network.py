@@ -27,7 +27,7 @@ class NetworkOptions(Settings):
         None, description="names in the order of its output; or a file: a name a line, or a taxonomy's YAML"
     )
     size: PositiveInt | tuple[PositiveInt, PositiveInt] | None = Field(
-        None, description="[height, width] that it sees, or one number for a square; the image's own where not given"
+        None, description="[height, width] that it sees, or one number for a square; the image's own by default"
     )
     resize: Literal["pillow", "antialias", "bilinear"] = Field(
         "pillow",
@@ -43,7 +43,7 @@ class NetworkOptions(Settings):
     )
     output: int = Field(0, ge=0, description="which of its outputs, counted from 0")
     gives: Literal["logits", "probabilities", "labels"] | None = Field(
-        None, description="kind of its output; where not given labels if whole numbers, else logits"
+        None, description="kind of its output; by default labels if whole numbers, else logits"
     )
     device: str = Field("cpu", description="cpu, cuda, ...; ONNX and TFLite files run on the cpu")
     threads: int | None = Field(None, ge=1, description="threads on a CPU")
@@ -75,7 +75,7 @@ class Network(Model):
         """See `Model`.
 
         Raises:
-            DataError: For an output that is none of these classes.
+            DataError: For an output that does not fit these classes.
         """
         return [self._prediction(image, scores) for image in images]
 

@@ -93,7 +93,9 @@ CACHE_VERSION = 2
 class SamOptions(ImageModelOptions):
     """The settings that name a checkpoint, and say which of its masks are taken."""
 
-    points_per_side: int = Field(32, ge=1, le=256, description="masks are proposed at a grid of so many points a side")
+    points_per_side: int = Field(
+        32, ge=1, le=256, description="points on a side of the grid at which masks are proposed"
+    )
     points_per_batch: int = Field(64, ge=1, description="points at a time; it changes speed and memory, not the masks")
     pred_iou: float = Field(0.88, ge=0, le=1, description="masks that the model itself rates lower are dropped")
     stability: float = Field(0.95, ge=0, le=1, description="masks that change more with the threshold are dropped")
@@ -226,7 +228,7 @@ def stability_score(logits: torch.Tensor, offset: float) -> float:
 
 
 class SamRaw(Model):
-    """Regions 1, 2, ... from the largest mask to the smallest, smaller ones over larger ones, 0 where there is none.
+    """Regions 1, 2, ... from the largest mask to the smallest, smaller masks over larger masks, 0 without a mask.
 
     Ids mean nothing across frames: `semstab.metrics.matched_region_flicker` compares such maps.
     """
@@ -250,7 +252,7 @@ class SamRaw(Model):
 
 
 def region_map(masks: Iterable[Mask], shape: tuple[int, ...]) -> UInt16:
-    """Return (H, W) regions 1, 2, ...: masks painted one over the other; UNASSIGNED where there is none."""
+    """Return (H, W) regions 1, 2, ...: masks painted one over the other, UNASSIGNED for pixels without a mask."""
     regions = np.full(shape, UNASSIGNED, dtype=np.uint16)
     for k, mask in enumerate(itertools.islice(masks, MOST_REGIONS), start=1):
         regions[mask] = k

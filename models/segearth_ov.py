@@ -75,7 +75,7 @@ class Prompts(Settings):
 
     name: str = Field("prompts", description="of the taxonomy that the classes make")
     classes: list[str] = Field(min_length=2, description="a class an entry; after commas its other names")
-    background: str | None = Field(None, description="the class of a pixel where no class is likely")
+    background: str | None = Field(None, description="the class of pixels at which every class is unlikely")
     prob_threshold: float = Field(0.0, ge=0, le=1, description="likelihood below which a pixel is background")
     templates: list[str] = Field(["a photo of a {}."], min_length=1, description="sentences; {} stands for the name")
 
@@ -96,7 +96,7 @@ class Prompts(Settings):
     @model_validator(mode="after")
     def _background_is_a_class(self) -> Self:
         if self.background is not None and self.background not in self.names:
-            raise ValueError(f"the background '{self.background}' is none of the classes")
+            raise ValueError(f"the background '{self.background}' is not a class")
         if self.background is None and self.prob_threshold > 0:
             raise ValueError("prob_threshold needs a background class")
         return self
@@ -121,7 +121,7 @@ class Prompts(Settings):
 
 
 def read_prompts(path: Path | None) -> Prompts:
-    """Return the prompts of a file, those for UAVid where none is named.
+    """Return the prompts of a file, or the prompts for UAVid without a file.
 
     Raises:
         ConfigError: If that fails; the message names file and setting.
@@ -294,10 +294,12 @@ class SegEarthOptions(ModelOptions):
     )
     prompts: Path | None = Field(None, description="YAML file like configs/models/segearth_uavid.yaml, the default")
     upsampler: Path | None = Field(
-        None, description="a SimFeatUp checkpoint (jbu_one); where not given, features are upsampled bilinearly"
+        None, description="a SimFeatUp checkpoint (jbu_one); without one, features are upsampled bilinearly"
     )
     resize: int = Field(448, ge=1, description="the longer side at which the image is shown, pixels")
-    window: int | None = Field(None, ge=1, description="side of a window, pixels; that of CLIP's training by default")
+    window: int | None = Field(
+        None, ge=1, description="side of a window, pixels; the image size of CLIP's training by default"
+    )
     stride: int | None = Field(None, ge=1, description="from window to window, pixels; half a window by default")
     bias: float = Field(-0.3, description="weight of the whole image's likeness to a class: global bias alleviation")
     sharpness: float = Field(50.0, gt=0, description="factor of the likeness before the softmax")

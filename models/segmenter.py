@@ -79,7 +79,8 @@ def _shares(
 ) -> Iterator[Float32]:
     """Yield the share (H, W) of each class's upsampled map in all: the softmax where the largest is given.
 
-    It is 0 where no class has any, or where the label is not sure. Each map is upsampled twice, and none is stored.
+    The share is 0 at pixels that are 0 for all classes, or whose label is not sure. Each map is upsampled twice, and
+    not stored.
     """
 
     def weight(k: int) -> torch.Tensor:

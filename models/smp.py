@@ -20,10 +20,10 @@ from semstab.models.names import class_names
 from semstab.models.network import Network, NetworkOptions
 
 MULTIPLE = 32
-"""Of which height and width are multiples where an encoder does not say: the stride of the deepest features."""
+"""Divisor of height and width for an encoder that does not state one: the stride of the deepest features."""
 
 PREFIXES = ("module.", "model.", "net.", "network.")
-"""What trainers put before the names of weights: DataParallel, Lightning, ..."""
+"""Prefixes that trainers put before the names of weights: DataParallel, Lightning, ..."""
 
 
 class SmpOptions(NetworkOptions):

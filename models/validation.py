@@ -24,8 +24,8 @@ from semstab.models import Image, Model, Prediction, Streamed, ask
 class Wrapped(Model):
     """A model that changes the predictions of another one; all that is not overridden is the inner one's.
 
-    If it leaves scores as they are, it may set `streams` to the inner one's. The memory of a sequence belongs into
-    attributes that `reset` makes anew: copies for other sequences (`fit`) share them until then.
+    If it leaves scores as they are, it may set `streams` to the inner model's. The memory of a sequence belongs into
+    attributes that `reset` replaces: copies for other sequences (`fit`) share the attributes until `reset`.
     """
 
     def __init__(self, inner: Model) -> None:
@@ -55,7 +55,7 @@ class Wrapped(Model):
         return self.ask(images, scores, geometry)
 
     def ask(self, images: Sequence[Image], scores: bool, geometry: Sequence[Frame]) -> list[Prediction]:
-        """Return the predictions of the inner model, which gets the geometry where it wants it."""
+        """Return the predictions of the inner model; a model that wants geometry gets the geometry."""
         inner = geometry if self.inner.wants_geometry else ()
         return ask(self.inner, images, scores=scores, geometry=inner)
 
@@ -165,7 +165,7 @@ class Checked(Wrapped):
             known[[id_ for id_ in (*self.label_space.ids, ignore_id(labels)) if id_ < len(known)]] = True
             if not (fine := known[labels]).all():
                 raise self._wrong(
-                    f"gave the id {labels[~fine][0]}, which is none of its {len(self.label_space)} classes"
+                    f"gave the id {labels[~fine][0]}, which is not an id of its {len(self.label_space)} classes"
                 )
 
     def _check_scores(self, scores: Any, shape: tuple[int, ...]) -> None:

@@ -1,4 +1,4 @@
-"""Tables of times and memory: what is timed, over what, beside which baseline."""
+"""Tables of times and memory: the timed code, its data, and its baseline."""
 
 from __future__ import annotations
 

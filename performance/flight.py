@@ -21,7 +21,7 @@ def frame(index: int, width: int, height: int, K: int, at: tuple[float, float] |
     ray = np.stack([(u - width / 2) / f, (v - height / 2) / f, np.ones((height, width))], axis=-1) @ R.T
     start = np.array([*(at or (0.2 * index, STEP * index)), ALTITUDE])
     z = ALTITUDE / -ray[..., 2]
-    for _ in range(2):  # relief, near enough: where the ray meets the height of where it was before
+    for _ in range(2):  # two fixed-point steps: the ray meets the height of the relief at its last point
         x, y = (start[axis] + ray[..., axis] * z for axis in (0, 1))
         house = (np.floor(x / 15) + np.floor(y / 15)) % 2 == 0
         z = (ALTITUDE - 1.5 * np.sin(x / 9) * np.cos(y / 7) - 4 * house) / -ray[..., 2]
@@ -101,7 +101,8 @@ def street(
     Facades with windows, trees, roofs, ground, and sky without depth.
 
     - `noise`: standard deviation of depth, as a share of it
-    - `salt`: share of single pixels with a random label, beside 12 % of the blocks of 24x24 pixels; none if clean
+    - `salt`: share of single pixels with a random label, in addition to 12 % of the blocks of 24x24 pixels; none if
+      clean
     """
     rng = np.random.default_rng(index)
     depth, label, T_wc = _street(index, width, height)

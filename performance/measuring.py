@@ -1,4 +1,4 @@
-"""What the cases share: clocks, memory, processes, tables, and sequences in a folder."""
+"""Shared parts of the cases: clocks, memory, processes, tables, and sequences in a folder."""
 
 from __future__ import annotations
 
@@ -50,7 +50,7 @@ def wall_ms(work: Callable[..., object], *arguments: Any) -> float:
 
 
 def in_turns(works: Mapping[str, Callable[[], Any]], rounds: int, *, warm: int = 1) -> dict[str, list[Any]]:
-    """What each work returns in each round, after rounds that warm up: what else the machine does meets all alike."""
+    """Return the results of each work in each round, after `warm` rounds; works take turns, to share any other load."""
     found: dict[str, list[Any]] = {name: [] for name in works}
     for _ in range(rounds + warm):
         for name, work in works.items():
@@ -65,7 +65,7 @@ def medians(rows: Iterable[Mapping[str, float]]) -> dict[str, float]:
 
 
 def use_cores(count: int) -> None:
-    """Bind this process, and those that it starts, to so many cores."""
+    """Bind this process and its children to `count` cores."""
     os.sched_setaffinity(0, sorted(os.sched_getaffinity(0))[:count])
 
 
@@ -101,11 +101,11 @@ class Watch:
 
 @dataclasses.dataclass(frozen=True)
 class Process:
-    """What a process and those that it waited for took.
+    """Time and memory of a process and of the children that it waited for.
 
     Attributes:
         wall_s, cpu_s: Seconds by the clock; user and system time.
-        peak_gb: Resident memory of the largest one.
+        peak_gb: Resident memory of the largest process.
     """
 
     wall_s: float
@@ -163,7 +163,7 @@ def to_and_fro(frames: int, size: tuple[int, int], K: int) -> Iterator[semstab.F
 
 
 def posed(root: Path, count: int, frames: Iterable[semstab.Frame], K: int, scale: float | None = None) -> Path:
-    """Write so many frames as a posed folder."""
+    """Write the `count` frames as a posed folder."""
     from posed_writer import write_posed
 
     names, classes = [f"{index:05d}" for index in range(count)], [f"class{k}" for k in range(K)]
@@ -171,7 +171,7 @@ def posed(root: Path, count: int, frames: Iterable[semstab.Frame], K: int, scale
 
 
 def same(one: Path, other: Path) -> bool:
-    """Whether two runs found the same: each column of their maps to the last bit, their summaries to 1e-12."""
+    """Return whether two runs agree: each column of their maps to the last bit, their summaries to 1e-12."""
     from compare_summaries import differences
 
     found = []

@@ -1,6 +1,6 @@
 """Frames: a camera that walks round a furnished room, 640x480, and sees each place again and again.
 
-Depth has noise, labels err in patches, anew in each frame, and at the edges of things.
+Depth has noise. Labels are wrong in patches, which are different in each frame, and at the edges of things.
 """
 
 from __future__ import annotations
@@ -52,7 +52,7 @@ def frame(index: int, width: int = 640, height: int = 480, K: int = 7, step: int
 
 
 def smaller(index: int, width: int, height: int, K: int, times: float) -> semstab.Frame:
-    """Frame `index` of a walk round a room that is so many times as large."""
+    """Return frame `index` of a walk round a room that is `times` as large."""
     made = frame(index, width, height, K)
     pose = made.T_wc.copy()
     pose[:3, 3] *= times

@@ -24,10 +24,10 @@ in smaller voxels, and would make a scene take minutes."""
 
 @dataclasses.dataclass(frozen=True)
 class Scene:
-    """What is drawn of a scene; metres and degrees. `far` is where depth ends, `step` the way from frame to frame.
+    """Random settings of a scene, in metres and degrees. `far` is the largest depth, `step` the way between frames.
 
     Attributes:
-        wrong: Share of the blocks of `patch` pixels whose label is that of another class.
+        wrong: Share of the blocks of `patch` pixels that have the label of another class.
         salt: Share of single pixels with any label.
         pixels_a_voxel: Edge of a voxel, in pixels at the median depth.
     """

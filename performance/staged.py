@@ -28,7 +28,7 @@ inside = ["beside"]
 
 
 def of(stage: str) -> dict[str, float]:
-    """What is known of a stage."""
+    """Return the entry of a stage, which begins with zeros."""
     return found.setdefault(stage, {"own_s": 0.0, "all_s": 0.0, "peak_gb": 0.0})
 
 

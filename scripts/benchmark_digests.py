@@ -45,7 +45,7 @@ def write_hashes(file: Path, data: Path | None) -> None:
 
 
 def write_geometry(file: Path, data: Path | None) -> None:
-    """Write the spots of the scenes beside a definition."""
+    """Write the spots of the scenes next to a definition."""
     own = load_benchmark(file)
     own.require_data(data)
     save_geometry(geometry_file(file), own.geometry_of(data), own.data_digest)

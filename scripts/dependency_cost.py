@@ -1,4 +1,4 @@
-"""What each dependency of the base install costs: its own files, and what would go with it if it went (MB).
+"""Print the size of each dependency of the base install: its own files, and what would go with it (MB).
 
 Run in the environment to measure: python scripts/dependency_cost.py
 """
@@ -13,7 +13,7 @@ from packaging.requirements import Requirement
 
 
 def megabytes(name: str) -> float:
-    """Of the installed files of a distribution."""
+    """Return the size of the installed files of a distribution."""
     paths = (Path(str(file.locate())) for file in metadata.distribution(name).files or ())
     return sum(path.stat().st_size for path in paths if path.is_file()) / 1e6
 

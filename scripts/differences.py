@@ -1,7 +1,7 @@
-"""What differs between two folders of outputs: numbers, words, columns and files, whatever their format.
+"""Differences between two folders of outputs: numbers, words, columns and files, whatever their format.
 
-For `freeze.py`. Only what differs between two runs of one revision is left out: see `IGNORED`; what has another name
-now: see `RENAMED`.
+For `freeze.py`. Only what differs between two runs of one revision is left out, see `IGNORED`. `RENAMED` has the names
+that changed.
 """
 
 from __future__ import annotations
@@ -54,7 +54,7 @@ FOLDERS = (*EXACT, "sums", "columns")
 
 @dataclass
 class Comparison:
-    """What differs between the two folders of a case, what is new, and the verdicts."""
+    """Differences between the two folders of a case, new outputs, and the verdicts."""
 
     differences: list[str] = field(default_factory=list)
     new: Counter[str] = field(default_factory=Counter)
@@ -159,7 +159,7 @@ def listing(folder: Path) -> dict[str, Path]:
 
 
 def renamed(name: str, parent: str = "") -> str | None:
-    """What a name of the kept revision is now; X_low, X_high and X_3 follow X."""
+    """Return the present name for a name of the kept revision; X_low, X_high and X_3 follow X."""
     for key in (f"{parent}.{name}", name):
         if key in RENAMED:
             return RENAMED[key]

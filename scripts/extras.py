@@ -1,4 +1,4 @@
-"""Each extra of setup.cfg, installed alone beside the base install, does what it is for; before, a line names it.
+"""Check that each extra of setup.cfg, alone with the base install, does its work; without it, a line names it.
 
     python scripts/extras.py [EXTRA ...] [--constraint torch==2.13.0]
 
@@ -21,7 +21,7 @@ from pathlib import Path
 import fresh
 
 SCENE = ("--data", "scene", "--frames", "::8", "--backend", "numpy", "--check", "none")
-"""Of the built-in city, as a folder of files."""
+"""Options of a run on the built-in city as a folder of files."""
 
 TINY = """
 import sys
@@ -123,16 +123,16 @@ class TestMine(BackendConformance):
 
 @dataclass(frozen=True)
 class Use:
-    """What an extra is for.
+    """The use of an extra, and its proof.
 
     Attributes:
-        shown: In the table.
-        commands: Each without the extra one line that names it, and with it the exit code 0; 'OUT' is a folder of its
-            own.
-        said: What the last command prints.
+        shown: The use in the table.
+        commands: Without the extra, each prints one line that names the extra; with the extra, each has the exit code
+            0. 'OUT' is a new folder.
+        said: Text that the last command prints.
         prepare: Code that makes what the commands need, run with the extra.
         proof: Code that looks at what they wrote.
-        files: That the commands need.
+        files: Files that the commands need.
         over: Another extra without which nothing would ask for this one.
     """
 

@@ -127,7 +127,7 @@ def main() -> None:
     parser.add_argument("name")
     parser.add_argument("scale", type=float)
     parser.add_argument("--groups", action="store_true", help="name the groups of classes, not the classes")
-    parser.add_argument("-o", "--out", type=Path, required=True, help="a .yaml; embeddings lie beside it")
+    parser.add_argument("-o", "--out", type=Path, required=True, help="a .yaml; embeddings are written next to it")
     options = parser.parse_args()
     network = load(options.networks, options.name, options.scale)
     names, order = list(network.classes), list(range(len(network.classes)))

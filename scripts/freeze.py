@@ -4,9 +4,9 @@
     python scripts/freeze.py compare DIR [--source CHECKOUT] [--case NAME ...] [--quick]
 
 Every case runs through the command line in processes of its own, so nothing of the product's inside is used. `compare`
-prints a line for each case and exits with 1 if anything differs: numbers, intervals, verdicts, words, columns and files
-alike. Only what differs between two runs of one revision is left out: `differences.py` says what, and what has another
-name now. SEMSTAB_DATA is the folder of the real scenes.
+prints a line for each case and exits with 1 if any number, interval, verdict, word, column or file differs. Only what
+differs between two runs of one revision is left out: `differences.py` lists it, and the names that changed.
+SEMSTAB_DATA is the folder of the real scenes.
 """
 
 from __future__ import annotations
@@ -141,7 +141,7 @@ for i in range(4):
     cv2.imwrite(str(out / f"wall/labels/regions/{i:04d}.png"), np.tile(ids, (6, 1)))
 settings("regions", {**posed, "voxel_size": 0.25, "region_maps": ["regions"], "backends": ["numpy"]})
 """
-"""Run beside the tests of the kept revision: scenes in the formats of several programs, and settings of studies."""
+"""Run next to the tests of the kept revision: scenes in the formats of several programs, and settings of studies."""
 
 
 def write_scores(folder: Path, K: int) -> None:
@@ -224,7 +224,7 @@ def write_inputs(root: Path, tree: Path, inputs: Path) -> None:
 
 
 def compare_case(case: Case, kept: Path, out: Path) -> tuple[bool, str]:
-    """Whether nothing differs, and the line of the case with what does."""
+    """Return whether the outputs are equal, and the line of the case with the differences."""
     comparison = Comparison()
     comparison.folders(kept, out)
     if case.same:
@@ -262,7 +262,7 @@ def main() -> int:
     keeps, source, folder = given.action == "keep", given.source.resolve(), given.folder.resolve()
     wanted = tuple(given.case or [""])
     chosen = [case for case in cases() if case.name.startswith(wanted) and (case.quick or not given.quick)]
-    data = folder / "data"  # where the real scenes were when outputs were kept: worktrees have none beside them
+    data = folder / "data"  # where the real scenes were when outputs were kept: worktrees have none next to them
     if keeps:
         folder.mkdir(parents=True, exist_ok=True)
         data.unlink(missing_ok=True)

@@ -1,4 +1,4 @@
-"""Environments made anew from a wheel of this source: what users have, not what a developer has installed beside it."""
+"""New environments with a wheel of this source: what users have, without what a developer has also installed."""
 
 from __future__ import annotations
 
@@ -53,7 +53,7 @@ def make_venv(folder: Path, base: str = sys.executable) -> Path:
 
 
 def pip(python: Path, *words: str) -> None:
-    """Run pip of an environment. Raises SystemExit with its last lines where it fails."""
+    """Run pip of an environment. Raises SystemExit with its last lines if it fails."""
     done = run([str(python), "-m", "pip", *words, "--quiet", "--disable-pip-version-check"], code=None)
     if done.returncode:
         raise SystemExit(f"pip {' '.join(words)}: {done.stderr[-2000:]}")
@@ -105,7 +105,7 @@ def lowest_versions(requirements: Iterable[str]) -> list[str]:
 
 
 def run(words: Sequence[str], cwd: Path | None = None, code: int | None = 0) -> Done:
-    """Run a program that sees no package but its environment's. Raises SystemExit where it ends with another code."""
+    """Run a program that sees its environment's packages only. Raises SystemExit if it ends with another code."""
     hidden = ("PYTHONPATH", "PYTHONHOME", "VIRTUAL_ENV")
     environment = {key: value for key, value in os.environ.items() if key not in hidden} | {"COLUMNS": "120"}
     done = subprocess.run(words, cwd=cwd, env=environment, capture_output=True, text=True, check=False)

@@ -1,4 +1,4 @@
-"""Write all conformance cases anew, fused by the reference: python scripts/make_conformance.py conformance/cases."""
+"""Write all conformance cases, fused by the reference: python scripts/make_conformance.py conformance/cases."""
 
 from __future__ import annotations
 
@@ -85,7 +85,7 @@ def _mixed() -> list[Frame]:
 
 
 def _small_scores() -> list[list[tuple[float, tuple[float, ...]]]]:
-    """Scores below .001 beside large ones, down to 1e-7, and pixels whose scores are all small."""
+    """Scores below .001 next to large scores, down to 1e-7, and pixels whose scores are all small."""
     return [
         [(0.5, (0.9985, 0.0005, 0.0007, 0.0003)), (1.5, (1.0, 1e-5, 1e-6, 1e-7))],
         [(0.5, (0.9, 0.0995, 0.0004, 0.0001)), (0.6, (1e-4, 2e-4, 3e-4, 4e-4)), (1.5, (1e-7, 1.0, 0.0, 1e-4))],

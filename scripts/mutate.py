@@ -147,7 +147,7 @@ def mutants(file: Path) -> list[Mutant]:
 
 
 def drawn(files: Iterable[Path], lines: int, rng: random.Random) -> list[Mutant]:
-    """Return one mutant for each of so many lines, all lines alike."""
+    """Return one mutant for each of `lines` random lines; each line has the same probability."""
     by_line: dict[tuple[Path, int], list[Mutant]] = {}
     for mutant in itertools.chain.from_iterable(map(mutants, files)):
         by_line.setdefault((mutant.file, mutant.line), []).append(mutant)
@@ -175,7 +175,7 @@ class Copy:
         os.utime(self.folder / file, (stamp := next(self._stamps), stamp))
 
     def first_failure(self, tests: list[str], seconds: float) -> str | None:
-        """Return the first test that fails; None where none does, OPEN where some did not start in so many seconds."""
+        """Return the first test that fails, None if all pass, OPEN if some did not start within `seconds`."""
         command = [sys.executable, "-m", "pytest", "-x", "-q", "--tb=no", "-rfE", "-p", "no:cacheprovider", *tests]
         until = time.time() + seconds
         own = {"PYTHONPATH": str(self.folder / "src"), "SEMSTAB_TESTS_UNTIL": str(until), "COLUMNS": "300"}
@@ -198,7 +198,7 @@ OPEN = "open: the time was over before all tests had started"
 
 
 def met(mutant: Mutant, copies: queue.Queue[Copy], seconds: float) -> str | None:
-    """Return the test that kills a mutant; None where it survives, OPEN where time was over."""
+    """Return the test that kills a mutant, None if the mutant survives, OPEN if time was over."""
     module = module_of(mutant.file)
     assert module is not None
     own = f"src/{module.replace('.', '/')}"

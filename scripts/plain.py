@@ -2,7 +2,7 @@
 
 It reads docstrings, comments and texts of Python files, and the prose of Markdown pages: of the named files, or of all
 files in git without the tests. Code, tables and texts in backticks are left out. CONTRIBUTING.md says what to write
-instead; a sentence that a rule meets is written again, the word is not replaced.
+instead; a sentence that a rule meets is written again, the word is not replaced. This file is left out: it lists them.
 """
 
 from __future__ import annotations
@@ -27,13 +27,16 @@ RULES = {
     "is none of: is not a": r"\b(?:is|are|be) none of\b",
     "that of, those of: repeat the noun": rf"{START}(?i:that|those) of\b|\bas (?:that|those) of\b",
     "None where: None if, None without": r"\b(?:None|NaN) where\b",
-    "where it, there, no: if": r"\bwhere (?:it|there|no|none|not)\b(?! are on\b)",
+    "where it, there, no: if": r"\bwhere (?:it|there|no|none|not)\b(?! are on\b| (?:is|was|lies)[.,;:)\n])",
     "less: minus": r"\b(?:1|one) less (?:the|its|what)\b",
     "anew: again": r"\banew\b",
     "alike: the same, similar": r"\balike\b",
     "of one's own: custom": r"\bof (?:one's|your) own\b",
 }
 """Habits, with what to write, and their patterns."""
+
+INDENTED = re.compile(r"(?<=\n)\n(?: {4}.*(?:\n|$))+")
+"""A paragraph of a module's docstring in which every line is indented: commands or a table."""
 
 BEGINS = re.compile(r"(?:What|Of|Whether|Which|Those|That)\b")
 BEGIN, LONG = "a docstring begins with What, Of, Whether, Which, Those, That", f"more than {MOST_WORDS} words"
@@ -64,14 +67,25 @@ def python_texts(source: str) -> Iterator[Text]:
     for node in ast.walk(tree):
         if isinstance(node, ast.Expr) and isinstance(node.value, ast.Constant) and isinstance(node.value.value, str):
             seen.add(id(node.value))
-            yield Text(node.lineno, node.value.value, docstring=True)
+            content = node.value.value
+            if node is tree.body[0]:
+                content = INDENTED.sub(lambda found: "\n" * found.group().count("\n"), content)
+            yield Text(node.lineno, content, docstring=True)
     for node in ast.walk(tree):
         text = node.value if isinstance(node, ast.Constant) and id(node) not in seen else None
-        if isinstance(text, str) and " " in text:
+        if isinstance(text, str) and " " in text and not is_code(text):
             yield Text(node.lineno, text)
     for token in tokenize.generate_tokens(io.StringIO(source).readline):
         if token.type == tokenize.COMMENT:
             yield Text(token.start[0], token.string.lstrip("# "))
+
+
+def is_code(text: str) -> bool:
+    """Return whether a text of several lines is a Python program, which a test or a script writes to a file."""
+    try:
+        return "\n" in text and bool(ast.parse(text).body)
+    except (SyntaxError, ValueError):
+        return False
 
 
 def page_texts(source: str) -> Iterator[Text]:
@@ -117,6 +131,7 @@ def files() -> list[str]:
         for name in listed
         if name.endswith((".py", ".md"))
         and not name.startswith(("tests/", "docs/reference/", "src/"))
+        and name != "scripts/plain.py"
         and not (ROOT / name).is_symlink()
     ]
 

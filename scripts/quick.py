@@ -3,8 +3,9 @@
     python scripts/quick.py             # since HEAD; where nothing changed, the core alone
     python scripts/quick.py HEAD~3      # since another commit
 
-A test file is near a changed file where it changed itself, where it has its name (test_readers_odm.py that of odm.py),
-or by how few imports it leads to the changed module. `make test` runs all.
+A test file is near a changed file if the test file changed itself, or if it has the name of the changed file
+(test_readers_odm.py for odm.py). Else the fewest imports from the test file to the changed module count. `make test`
+runs all.
 """
 
 from __future__ import annotations

@@ -6,9 +6,9 @@
     python scripts/real_networks.py run --networks EdgeNets --data DATA --work WORK
     python scripts/real_networks.py show
 
-It needs semstab, torch and, for the networks, an hour on two cores. `run` goes on where it was stopped, and computes no
-finished condition again; `--only livingroom` runs the conditions whose names begin so. `show` computes nothing: it
-prints the tables and draws docs/real-networks.png from results/.
+It needs semstab, torch and, for the networks, an hour on two cores. `run` continues a run that was stopped, without
+computing a finished condition again; `--only livingroom` runs the conditions whose names begin so. `show` computes
+nothing: it prints the tables and draws docs/real-networks.png from results/.
 
 Networks. EdgeNets (github.com/sacmehta/EdgeNets, MIT): ESPNetv2 and DiCENet in several widths, with weights and the
 mIoU that their authors publish in model/segmentation/model_zoo/README.md. Ten are trained on PASCAL VOC (384x384), ten
@@ -30,6 +30,7 @@ Conditions. Label maps are predicted once a sequence (`semstab-bench predict`) a
 (`semstab-bench run`): a voxel size, every n-th frame, labels or scores (softmax, predicted within the run).
 
 Numbers. results/real-networks.csv has a row for each network in each condition:
+
     published_miou         percent, by the authors, on photographs of the dataset that the network was trained on
     alpha, _low, _high     agreement of two views of the same spot beyond chance, with its 95 % interval; empty where
                            every sampled observation is of one class
@@ -42,12 +43,14 @@ Numbers. results/real-networks.csv has a row for each network in each condition:
     largest_class, _share  the class with most observations
     voxels, mean_op, recurrent_share     of the map; recurrent: OP >= 3
     spots, views           what alpha rests on
+
 results/real-networks.json has versions, commands, digests (SHA-256) of weights and sequences, and for each condition
 Spearman's rank correlation of a measure with the published mIoU, and with the effective number of classes, over
 `networks` networks. Its 95 % interval comes from 9,999 bootstrap samples of networks (scipy.stats.bootstrap, percentile
-method). The digest of a folder is that of the lines that `sha256sum` prints for its files, sorted by name. `wrapper`
-has the digest of the nets.py that was run, and under `same_scores` that of scripts/nets.py where it is another text: it
-gave the same scores and labels, bit for bit, in two frames of each sequence for each network.
+method). The digest of a folder is the digest of the lines that `sha256sum` prints for its files, sorted by name.
+`wrapper` has the digest of the nets.py that was run. If the text of scripts/nets.py is different, `same_scores` has the
+digest of scripts/nets.py: it gave the same scores and labels, bit for bit, in two frames of each sequence for each
+network.
 """
 
 from __future__ import annotations
@@ -121,7 +124,7 @@ DENSEST = {scene: min(c.stride for c in CONDITIONS if c.scene == scene) for scen
 
 @dataclass(frozen=True)
 class Network:
-    """A file of weights, and the published mIoU in percent, NaN where there is none."""
+    """A file of weights, and the published mIoU in percent, or NaN without a published mIoU."""
 
     family: str
     scale: str
@@ -435,8 +438,8 @@ def with_miou(rows: Sequence[Row]) -> dict[str, dict[str, Any]]:
 def spearman(x: Sequence[float], y: Sequence[float]) -> dict[str, Any]:
     """Return Spearman's rank correlation, its bootstrap interval over pairs, and the number of pairs.
 
-    None where it is not defined: with fewer than three pairs, or where all values are the same. Samples of the
-    bootstrap in which that happens are left out.
+    The correlation is None if it is not defined: with fewer than three pairs, or if all values are the same. Samples
+    of the bootstrap in which that happens are left out.
     """
     from scipy.stats import DegenerateDataWarning, bootstrap
 
@@ -454,7 +457,7 @@ def spearman(x: Sequence[float], y: Sequence[float]) -> dict[str, Any]:
 
 
 def _rank_correlation(x: Any, y: Any, axis: int = -1) -> Any:
-    """Pearson's correlation of ranks, ties sharing theirs; NaN where all are one tie."""
+    """Return Pearson's correlation of ranks, with the mean rank for ties, or NaN if all values are tied."""
     from scipy.stats import rankdata
 
     x, y = (rankdata(each, axis=axis) for each in (x, y))

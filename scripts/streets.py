@@ -20,6 +20,7 @@ of the LiDAR's points, read by `semantickitti_images`; things that move are mask
 Networks: scripts/street_nets.py; fourteen of four families, and eight variants that are worse by construction.
 
 results/streets.csv has a row for each network on each street, in each condition; others than `main` have alpha and VSS:
+
     accuracy, miou          of the labels of single frames at the LiDAR's pixels; mIoU over the classes of the truth
     alpha, _low, _high      agreement of two views of a spot beyond chance, with its 95 % interval
     meaning                 alpha by the distance between Cityscapes' categories
@@ -163,7 +164,7 @@ def _predicted(
 
 
 def file_name(network: str) -> str:
-    """Return a network's name as that of a folder and of a model."""
+    """Return a network's name as the name of a folder and of a model."""
     return network.replace("/", "-")
 
 

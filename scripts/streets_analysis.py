@@ -1,4 +1,4 @@
-"""What results/streets.csv says: tables and figures of docs/real-networks.md, for `scripts/streets.py show`.
+"""Tables and figures of docs/real-networks.md from results/streets.csv, for `scripts/streets.py show`.
 
 An interval of 95 % counts networks, families and streets: 2,000 samples draw streets, families, and networks within a
 drawn family, each with replacement (a two-way bootstrap; percentiles). Networks of one family have much in common, so
@@ -35,7 +35,7 @@ APART = 0.02
 
 
 def load(path: Path) -> list[dict[str, Any]]:
-    """Return the rows of a file of results: numbers where a text is one, NaN where it is empty."""
+    """Return the rows of a file of results; texts of numbers become numbers, empty texts become NaN."""
     with path.open(newline="", encoding="utf-8") as file:
         return [{key: _number(key, text) for key, text in row.items()} for row in csv.DictReader(file)]
 

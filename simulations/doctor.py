@@ -165,7 +165,7 @@ def one(change: Callable[[Frame], Frame]) -> Callable[[Frames], Frames]:
 
 
 def camera(factor: float = 1.0, right: float = 0.0) -> Callable[[Frames], Frames]:
-    """Return a mistake that states other intrinsics: focal lengths times a factor, cx so many pixels to the right."""
+    """Return a mistake that states other intrinsics: focal lengths times `factor`, cx plus `right` pixels."""
     K = Intrinsics(CAMERA.fx * factor, CAMERA.fy * factor, CAMERA.cx + right, CAMERA.cy)
     return lambda frames: [replace(f, intrinsics=K) for f in frames]
 
@@ -288,7 +288,7 @@ class Situation(Mistake):
     """A situation, and how the line names its frames.
 
     Attributes:
-        frames: Those that are to be named; none where it is all of them.
+        frames: Frames that are to be named; empty for all frames.
         where: A pattern with one group, the frames in a line, behind commas.
     """
 

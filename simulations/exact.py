@@ -77,7 +77,7 @@ class Condition:
 
     @property
     def name(self) -> str:
-        """What a row begins with."""
+        """First words of a row."""
         usual = 6 if PATHS[self.path][0] is yard else 8
         parts = {
             f"{self.K} classes": usual != self.K,
@@ -154,7 +154,7 @@ def alpha_of(unit: Ints, label: Ints) -> Exact:
 
 
 def exact(flown: Flight, labeller: Labeller, points: int, rng: np.random.Generator) -> Exact:
-    """Return alpha of the surface: draw until so many points have two labels."""
+    """Return alpha of the surface: draw until `points` points have two labels."""
     units, labels, drawn, twice, n = [], [], 0, 0, points
     for _ in range(DRAWS):
         point, face = flown.scene.draw(n, rng)
@@ -195,7 +195,7 @@ def frames(flown: Flight, labeller: Labeller, condition: Condition, rng: np.rand
 
 
 def _hit(camera: Pinhole, seen: Seen) -> npt.NDArray[np.bool_]:
-    """Return the pixels (n,) that rays of a scanner beside the camera hit."""
+    """Return the pixels (n,) that rays of a scanner next to the camera hit."""
     up, aside = np.meshgrid(np.arange(-np.pi / 4, np.pi / 4, RING), np.arange(-np.pi / 4, np.pi / 4, STEP))
     ways = np.stack([np.cos(up) * np.sin(aside), -np.sin(up), np.cos(up) * np.cos(aside)], axis=-1).reshape(-1, 3)
     u, v = (np.rint(x).astype(int) for x in camera.project(ways))

@@ -50,7 +50,7 @@ def smooth(flight: Flight, blur: float, rng: np.random.Generator) -> Number:
 
 
 def squares(flight: Flight, edge: int, rng: np.random.Generator) -> Number:
-    """Return a uniform number that is the same all over a square of pixels, and anew in each frame."""
+    """Return a uniform number that is the same all over a square of pixels, and independent in each frame."""
     shape = len(flight.poses), -(-flight.sensor.height // edge), -(-flight.sensor.width // edge)
     drawn = rng.random(shape)
 
@@ -196,7 +196,7 @@ ERRORS: dict[str, Errors] = {
 
 
 def unlabelled(labeller: Labeller, share: float, flight: Flight, rng: np.random.Generator) -> Labeller:
-    """Return the labeller without labels in blobs, a share of each image, and where there is no surface."""
+    """Return the labeller without labels in blobs, a share of each image, and at pixels without a surface."""
     field = smooth(flight, BLOB, rng)
 
     def label(seen: Seen) -> Ints:

@@ -24,7 +24,7 @@ class Solid:
         normals, offsets: (m, 3) and (m,): points inside have normals @ point <= offsets.
         polygons: The corners (k, 3) of each face.
         classes: (m,) class of each face.
-        textures: Those of faces with several classes.
+        textures: Textures of faces with several classes.
     """
 
     normals: Array
@@ -147,7 +147,7 @@ class Scene:
         return t, face
 
     def true_class(self, points: Array, face: Ints) -> Ints:
-        """Return the classes (n,) of points (n, 3) of faces (n,); -1 where there is no face."""
+        """Return the classes (n,) of points (n, 3) of faces (n,); -1 without a face."""
         classes = np.where(face >= 0, self.classes[face], -1)
         for own, texture in self.textures.items():
             at = np.flatnonzero(face == own)
@@ -215,7 +215,7 @@ ROAD, LENGTH = 4.0, (-15.0, 85.0)
 def street(K: int, rng: np.random.Generator) -> Scene:
     """Return a street along x: road with marks, pavements, facades with windows, poles and parked cars.
 
-    Its classes are of 8 things, and modulo K where there are fewer.
+    Its classes are of 8 things, modulo K with fewer classes.
     """
     road, mark, pavement, wall, window, pole, car, roof = (kind % K for kind in range(8))
 

@@ -36,7 +36,7 @@ class Sensor(Protocol):
         ...
 
     def project(self, points: Array) -> tuple[Array, Array]:
-        """Return image coordinates of points (n, 3) in the sensor's axes; NaN where there are none."""
+        """Return image coordinates of points (n, 3) in the sensor's axes; NaN for points behind a camera."""
         ...
 
 
@@ -50,7 +50,7 @@ class Pinhole:
 
     @property
     def intrinsics(self) -> Intrinsics:
-        """Those of a view 58 degrees wide."""
+        """Intrinsics of a view 58 degrees wide."""
         f = 0.9 * self.width
         return Intrinsics(f, f, (self.width - 1) / 2, (self.height - 1) / 2)
 
@@ -91,14 +91,14 @@ class Spinning:
 
 @dataclass(frozen=True)
 class Seen:
-    """What one frame sees at image coordinates.
+    """Surface points that one frame sees at image coordinates.
 
     Attributes:
         frame: Its number.
         u, v: (n,) image coordinates; integers are the middles of pixels.
-        t: (n,) along the sensor's rays; of a camera it is depth; inf where there is no surface.
+        t: (n,) along the sensor's rays; of a camera it is depth; inf without a surface.
         point: (n, 3) metres.
-        face, truth: (n,) face and true class; -1 where there is no surface.
+        face, truth: (n,) face and true class; -1 without a surface.
         distance: (n,) from the sensor, metres.
         angle: (n,) between the ray and the surface's normal, degrees: 90 is a grazing view.
     """
@@ -154,7 +154,7 @@ class Flight:
 
     @cached_property
     def images(self) -> list[Seen]:
-        """What each frame sees in the middles of its pixels, row by row."""
+        """Surface points that each frame sees in the middles of its pixels, row by row."""
         v, u = np.mgrid[: self.sensor.height, : self.sensor.width].reshape(2, -1).astype(float)
         return [self.look(frame, u, v) for frame in range(len(self.poses))]
 

@@ -30,16 +30,16 @@ class Flight:
         reach: Of errors, in voxels: the correlation of places d apart is exp(-d^2 / (2 reach^2)).
         ease: Larger means fewer errors.
         frames: Of the flight.
-        observations: Frames that see a place, on average; all of them where it is as many as frames.
-        quality: Of frames: 'alike', 'bad' (one in ten is much worse), 'uneven' (each its own), 'lasting' (AR(1) with
-            0.8), 'regimes' (good and bad stretches of 8 frames on average), 'heavy' (Student's t with 2 degrees of
-            freedom), 'objects' (a square of 5 voxels errs as a whole, for 3 frames on average), 'view' (the farther
-            from the middle of the frame, the worse), 'direction' (each location is hard from a direction of its own,
-            which neighbours have in common).
+        observations: Frames that see a place, on average; the number of frames if every frame sees every place.
+        quality: Model of the quality of frames: `alike`; 'bad' (one in ten is much worse); 'uneven' (each its own);
+            'lasting' (AR(1) with 0.8); 'regimes' (good and bad stretches of 8 frames on average); 'heavy' (Student's t
+            with 2 degrees of freedom); 'objects' (a square of 5 voxels errs as a whole, for 3 frames on average);
+            'view' (the farther from the middle of the frame, the worse); 'direction' (each location is hard from a
+            direction of its own, which neighbours have in common).
         city: Whether the floor is one of boxes with walls, in three dimensions.
         coin: Whether labels are drawn at random instead.
         K: Classes.
-        soft: Whether frames give scores: as much for the label as the place is easy, the rest for all alike.
+        soft: Whether frames give scores: the label gets more if the place is easy, and all classes share the rest.
     """
 
     side: int = 48

@@ -1,13 +1,13 @@
-"""How often does a frame stand out where none is bad, and are the bad ones found?
+"""How often does a frame stand out if no frame is bad, and are bad frames found?
 
     python simulations/simulate.py frames [--trials 100] [--seed 0]
 
 Each trial makes a scene of its own: a floor of 2 to 12 classes, which a camera flies over on a random course, at a
-random height and tilt, 12 to 40 times. Labels are wrong in blobs: at places that are hard for all frames, and anew in
-each frame, in 1 to 30 % of the pixels, and depth has noise of up to 1 %. Prints a table in Markdown: numbers of trials,
-with frames of the same quality, and with frames whose quality differs: the log odds of an error have a standard
-deviation of 0.2 or 0.6. Without bad frames, and with labels that are wrong in 15 % of the blocks of 24 x 24 pixels of
-every third frame (`simulations/planted.py`).
+random height and tilt, 12 to 40 times. Labels are wrong in blobs: at places that are hard for all frames, and at other
+places in each frame, in 1 to 30 % of the pixels, and depth has noise of up to 1 %. Prints a table in Markdown: numbers
+of trials, with frames of the same quality, and with frames whose quality differs: the log odds of an error have a
+standard deviation of 0.2 or 0.6. Without bad frames, and with labels that are wrong in 15 % of the blocks of 24 x 24
+pixels of every third frame (`simulations/planted.py`).
 """
 
 from __future__ import annotations

@@ -3,7 +3,7 @@
     python simulations/simulate.py gate [--trials 200] [--seed 0] [--only TEXT] [--scope "these frames"]
 
 Two models on the same frames of the same scene find the same places hard, with --scope "other scenes" each its own.
-Scenes, frames and errors are drawn anew for each trial. Prints a table in Markdown of the rule 'alpha drop < margin' at
+Scenes, frames and errors are independent in each trial. Prints a table in Markdown of the rule 'alpha drop < margin' at
 the 5 % level: without a difference, which must not fail, and with a true loss of the margin, which must not pass. The
 margin is the loss that all trials of the second pair have together.
 """

@@ -33,7 +33,7 @@ FLIGHTS = 8
 
 @dataclasses.dataclass(frozen=True)
 class Row:
-    """What became of the trials of one condition: for each its value, interval and target, and the spread of values."""
+    """Results of the trials of one condition: for each its value, interval and target, and the spread of values."""
 
     name: str
     key: str

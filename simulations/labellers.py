@@ -1,4 +1,4 @@
-"""What do verdicts make of labellers that agree with themselves for the wrong reasons?
+"""Verdicts on labellers that agree with themselves for the wrong reasons.
 
     python simulations/simulate.py labellers [--scene scene0] [--frames 20] [--width 384]
 
@@ -28,7 +28,7 @@ REASONS = {
     "not that they are right": "no truth",
     "covers": "one class",
 }
-"""What a warning says, and its name in the table."""
+"""Words of a warning, and its name in the table."""
 
 
 def rows(scene: str, frames: int, width: int) -> Iterator[list[str]]:

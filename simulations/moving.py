@@ -76,7 +76,7 @@ class Box:
 
 @dataclass(frozen=True)
 class Street:
-    """What is there, and from where it is seen."""
+    """Objects of a street, and the views of them."""
 
     boxes: list[Box]
     poses: np.ndarray
@@ -152,7 +152,7 @@ class Street:
 
 
 def _part(low: np.ndarray, high: np.ndarray, T_wc: np.ndarray) -> tuple[slice, slice] | None:
-    """Return the rows and columns in which a box may be seen; all of them if it is beside the camera."""
+    """Return the rows and columns in which a box may be seen; all of them if it is next to the camera."""
     corners = np.stack(np.meshgrid(*zip(low, high, strict=True), indexing="ij"), axis=-1).reshape(8, 3)
     x, y, z = ((corners - T_wc[:3, 3]) @ T_wc[:3, :3]).T
     if z.max() <= 0:

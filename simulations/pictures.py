@@ -108,8 +108,8 @@ def predicted(views: Views, kind: str, rate: float, model: int, flight: int) -> 
         views: What the camera sees.
         kind: One of KINDS.
         rate: Share of wrong pixels, or of what errs.
-        model: Seed of what a model does alike on every flight.
-        flight: Seed of what is new on each.
+        model: Seed of the errors that a model repeats on every flight.
+        flight: Seed of the errors that are new on each flight.
     """
     own, new = np.random.default_rng([model, 1]), np.random.default_rng([model, flight, 2])
     wrong = _WRONG[kind](views, rate, own, new)

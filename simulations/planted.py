@@ -2,10 +2,12 @@
 
     python simulations/simulate.py planted SCENE OUT [--source fcn] [--class bunny_book] [--to kleenex]
 
-Writes OUT/third (the class is labelled as another one in every third frame), OUT/first (in the first third of the
-frames), OUT/flip (2 % of the pixels, drawn at random, have a random class) and OUT/blocks (in every third frame, from
-the first on, 15 % of the blocks of 24 x 24 pixels have another class each), each with the scene's own depth, poses and
-ground truth.
+Writes four folders, each with the scene's own depth, poses and ground truth:
+
+- OUT/third: the class is labelled as another one in every third frame
+- OUT/first: the same in the first third of the frames
+- OUT/flip: 2 % of the pixels, drawn at random, have a random class
+- OUT/blocks: in every third frame, from the first on, 15 % of the blocks of 24 x 24 pixels have another class each
 """
 
 from __future__ import annotations

@@ -1,9 +1,9 @@
-"""How many frames does it take to find a loss, and how often is one found where there is none?
+"""How many frames does it take to find a loss, and how often is a loss found without a loss?
 
     python simulations/simulate.py power [--trials 100] [--only TEXT]
 
 Two models fly the same frames over the same scene (flights.py) and err independently of each other, at the same hard
-places or at places half of which are others; the new one agrees less by so many points of PSA in the mean of scenes.
+places or at places half of which are others; the new model agrees less by a given loss of PSA in the mean of scenes.
 `compare` finds a loss where p < 0.05, `gate` where the rule 'psa drop < 0.01' fails.
 Prints a table in Markdown: the share of flights in which each does.
 """
@@ -62,7 +62,7 @@ def ease_of(kind: str, loss: float) -> float:
 
 
 def found(flight: Flight, ease: float, trials: int, *, elsewhere: bool) -> list[str]:
-    """In which share of the trials compare and the gate find a loss; with errors elsewhere no two models are alike."""
+    """Return the shares of trials in which compare and gate find a loss; empty for equal models, errors elsewhere."""
     if elsewhere and ease == EASE:
         return ["", ""]
     hits = np.zeros(2)

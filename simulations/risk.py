@@ -53,7 +53,7 @@ SEEN = (5, 10, 20)
 """OP: below each, and from the last one on."""
 
 SIMULATED = ("sim-steady", "sim-flicker", "sim-soft", "trick-two-class", "trick-blur-81", "trick-coarse-16")
-"""Models of the city: their errors last, are drawn anew, or come from the way they label."""
+"""Models of the city: their errors last, are independent in each frame, or come from the way they label."""
 
 WEIGHT = 20
 """Places of a class that count as much as all classes together."""
@@ -108,7 +108,7 @@ class Places:
 
     @property
     def auroc(self) -> float:
-        """How well disagreement tells wrong places; NaN where all are right, or wrong."""
+        """AUROC of disagreement for wrong places; NaN if all places are right, or all wrong."""
         return auroc(self.disagreement, self.wrong)
 
 

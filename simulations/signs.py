@@ -54,7 +54,7 @@ def to_border(labels: np.ndarray) -> np.ndarray:
 
 
 def unsure(scores: np.ndarray) -> np.ndarray:
-    """Return 1 less the largest of the scores (H, W, K) of each pixel, which are normalised."""
+    """Return 1 minus the largest of the normalised scores (H, W, K) of each pixel."""
     total = scores.sum(axis=2, dtype=np.float64)
     return 1 - scores.max(axis=2) / np.where(total > 0, total, 1)
 
@@ -130,7 +130,7 @@ def of_run(run: str, scores: str | None) -> tuple[str, list[Mapping[str, float]]
 
     Args:
         run: FOLDER:MODEL.
-        scores: The label source of the same folder whose scores tell how sure the model is; where not given, its own.
+        scores: The label source of the same folder whose scores tell how sure the model is; by default its own.
     """
     own, numbers = open_run(run), []
     assert own.source is not None

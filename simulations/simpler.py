@@ -11,7 +11,7 @@ times as wide.
 - `frames`: jackknife over frames; of other scenes the two-way variance by frames and cubes (Cameron, Gelbach and Miller
   2011, Journal of Business and Economic Statistics 29)
 - `within`: the same without the means of locations, which the same scene flown again has again
-- `blocks`: the first with blocks of about sqrt(F) successive frames, which may be alike
+- `blocks`: the first with blocks of about sqrt(F) successive frames, which may be correlated
 - `bootstrap`: of cubes and of blocks of frames, each drawn with replacement (Owen 2007, Annals of Applied Statistics 1)
 """
 
@@ -50,7 +50,7 @@ def blocks(grid: Influences, scope: Scope) -> Spread:
 
 
 def bootstrap(grid: Influences, scope: Scope) -> Spread:
-    """The variance over cubes and blocks of frames that are drawn anew."""
+    """Return the variance over resampled cubes and blocks of frames."""
     rng, cell = np.random.default_rng(0), _blocked(grid.cell)
     G, B = cell.shape
     by_block = rng.multinomial(B, np.full(B, 1 / B), REPLICATES) - 1.0

@@ -192,7 +192,7 @@ def test_a_flight_straight_ahead_over_flat_ground_hides_mistakes():
         assert {"depth_scale", "pose_convention: world_to_camera", "camera_axes: opengl"} <= set(undetermined)
         assert "depth_kind: ray" not in undetermined
         assert "the same motion: the map is only turned" in " ".join(verdict.undetermined)
-        assert verdict.reason == "the camera hardly turns and all depths are alike"
+        assert verdict.reason == "the camera hardly turns and all depths are similar"
 
 
 @pytest.mark.parametrize("factor", [1, 1000])

@@ -171,8 +171,8 @@ def test_a_predictor_is_called_as_its_file(folder, monkeypatch):
         ("two.onnx", {"classes": CLASSES}, r"has 2 inputs \(image, image1\); export it with the image as its only one"),
         ("words.onnx", {"classes": CLASSES}, r"its input is a tensor\(string\); a network of images takes"),
         ("text.onnx", {"classes": CLASSES}, "ONNX Runtime cannot load it .*; is it an ONNX file"),
-        ("text.pt", {"classes": CLASSES}, "cannot load it as TorchScript .*; where it holds weights alone, name the"),
-        ("text.pth", {"classes": CLASSES}, "cannot load it as TorchScript .*; where it holds weights alone, name the"),
+        ("text.pt", {"classes": CLASSES}, "cannot load it as TorchScript .*; if it holds weights alone, name the"),
+        ("text.pth", {"classes": CLASSES}, "cannot load it as TorchScript .*; if it holds weights alone, name the"),
         ("text.pt2", {"classes": CLASSES}, "cannot load it as an exported program"),
     ],
 )

@@ -410,7 +410,7 @@ SOFT = np.full((48, 80, 2), 0.5, np.float32)
         ([FINE], "gave a ndarray of uint8; give a semstab.models.Prediction"),
         ([Prediction(FINE.astype(int))], "gave labels that are a ndarray of int64"),
         ([Prediction(FINE[1:])], r"gave labels of shape \(47, 80\) for an image of \(48, 80\)"),
-        ([Prediction(FINE - 9)], "gave the id 0, which is none of its 2 classes"),
+        ([Prediction(FINE - 9)], "gave the id 0, which is not an id of its 2 classes"),
         ([Prediction(FINE)], "gave scores that are nothing"),
         ([Prediction(FINE, SOFT[..., :1])], r"gave scores of shape \(48, 80, 1\); give \(48, 80, 2\)"),
         ([Prediction(FINE, SOFT * 2)], "gave scores that are no shares"),

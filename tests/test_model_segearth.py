@@ -246,7 +246,7 @@ def test_the_shipped_prompts_are_those_for_uavid():
         ({"classes": ["a"]}, "classes: "),
         ({"classes": ["a,", "b"]}, "classes: 'a,' has an empty name"),
         ({"classes": ["a", "b"], "templates": ["a photo"]}, "templates: 'a photo' must hold {} once"),
-        ({"classes": ["a", "b"], "background": "c"}, "the background 'c' is none of the classes"),
+        ({"classes": ["a", "b"], "background": "c"}, "the background 'c' is not a class"),
         ({"classes": ["a", "b"], "prob_threshold": 0.3}, "prob_threshold needs a background class"),
         ({"classes": ["a", "b"], "clases": []}, "unknown setting 'clases'; did you mean 'classes'?"),
     ],

@@ -101,7 +101,7 @@ def test_conform_takes_it_by_its_file(folder) -> None:
 def test_conform_stops_where_a_program_fails_alike(folder) -> None:
     done = bench("conform", "fusion.py:Yours", cwd=folder, code=2)
     assert done.stderr.count("\n") == 3
-    assert "in the first 3 cases alike" in done.stderr.splitlines()[-1]
+    assert "in each of the first 3 cases" in done.stderr.splitlines()[-1]
 
 
 def test_other_processes_know_it(folder) -> None:

@@ -44,6 +44,27 @@ def test_code_and_tables_of_a_page_are_left(source):
     assert rules("a.md", source) == []
 
 
+@pytest.mark.parametrize(
+    "source",
+    [
+        '"""Print a table:\n\n' + "    name  one column and another\n" * 10 + '\nIt has ten rows.\n"""\n',
+        'PROGRAM = """\n' + "first = second + third\n" * 20 + '"""\n',
+    ],
+)
+def test_indented_paragraphs_of_a_module_and_programs_in_texts_are_left(source):
+    assert rules("a.py", source) == []
+
+
+def test_a_text_of_many_lines_that_is_no_program_is_read():
+    assert rules("a.py", 'TEXT = """\nA line.\nIt is drawn anew.\n"""\n') == ["anew"]
+    assert rules("a.py", 'def f():\n    """Return a.\n\n    It is drawn anew.\n    """\n') == ["anew"]
+
+
+@pytest.mark.parametrize("sentence", ["It is seen where it was.", "The folder where it lies, and the file."])
+def test_a_place_is_no_condition(sentence):
+    assert rules("a.md", sentence) == []
+
+
 def test_the_line_of_a_finding_is_that_of_the_word():
     found = list(plain.findings("a.py", '"""Return a.\n\nDrops so many.\n"""\n'))
     assert [each.line for each in found] == [3]

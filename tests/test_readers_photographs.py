@@ -247,7 +247,7 @@ def test_damaged_cameras_of_pix4d(tmp_path) -> None:
         (lines[:7], "holds no photograph"),
         (lines[:-1], r"line 29: 'DJI_0002.JPG': expected lines of 3, 3, 3, 3, 2, 3, 3, 3, 3 numbers"),
         ([*lines[:17], *lines[18:]], "line 18: 'DJI_0001.JPG' is not a number"),
-        ([line.replace("50.0 0.0", "50.0 1.0") for line in lines], "matrix K is none of a camera without skew"),
+        ([line.replace("50.0 0.0", "50.0 1.0") for line in lines], "matrix K has skew, which is not supported"),
     ):
         path.write_text("\n".join(changed))
         fails(DataError, said, open_frames, "pix4d", tmp_path)

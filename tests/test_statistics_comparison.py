@@ -40,7 +40,7 @@ def test_shared_rows_are_the_voxels_that_all_maps_hold():
     assert [rows.tolist() for rows in shared_rows(a, b, c)] == [[1, 3], [0, 2], [1, 3]]
     assert [rows.tolist() for rows in shared_rows(a, table_of([(1, 1, 1)]))] == [[], []]
     a = table_of([(0, 0, 0)])
-    with pytest.raises(DataError, match="fuse both alike"):
+    with pytest.raises(DataError, match="fuse both with the same settings"):
         shared_rows(a, dataclasses.replace(a, voxel_size=0.4))
 
 

@@ -1,4 +1,4 @@
-"""Observations, one a voxel, from the pixels or points of a frame: labels by tiles of the image, scores likewise."""
+"""Observations, one a voxel, from the pixels or points of a frame: labels and scores by tiles of the image."""
 
 from __future__ import annotations
 
@@ -87,7 +87,7 @@ class Aggregator:
     # --- Labels -------------------------------------------------------------------------------------------------------
 
     def _labels(self, frame: Frame, origin: Int64) -> Observed | None:
-        """Return the observations of labels, None where the frame reaches too far or a label is no class."""
+        """Return the observations of labels, or None if the frame reaches too far or a label is not a class."""
         assert frame.labels is not None
         corner = tile_loops.corner_of(fixed(frame.T_wc), self.voxel_size, origin)
         if min(corner.tolist()) < 0 or max(corner.tolist()) > 2 * (HALF - NEAR):
@@ -122,7 +122,7 @@ class Aggregator:
         return total, room, words
 
     def _room_for_words(self, bands: int, rows: int, width: int) -> tuple[int, tuple[Any, Any, Any], Words]:
-        """Return the room of a band of so many rows, work space for the threads, and the room of all bands."""
+        """Return the room of a band of `rows` rows, work space for the threads, and the room of all bands."""
         space, threads = self._space, nb.get_num_threads()
         columns, table = tile_loops.COLUMNS, 1 << tile_loops.TABLE_BITS
         tables = space.room("table", threads, table)
@@ -141,7 +141,7 @@ class Aggregator:
         return room, (stretches, tables, space.room("table_count", threads, table, dtype=np.int32)), words
 
     def _merged_labels(self, total: int, room: int, words: Words, corner: Int64) -> Observed:
-        """Sort the entries of the bands, of which there are so many, by partition and word, and add up equal ones."""
+        """Sort the `total` entries of all bands by partition and word, and add up equal entries."""
         space = self._space
         pairs = [(space.room(f"words {i}", total), space.room(f"counts {i}", total, dtype=np.int32)) for i in (0, 1)]
         word, count, partition, *bands = words
@@ -194,9 +194,9 @@ class Aggregator:
     # --- Scores -------------------------------------------------------------------------------------------------------
 
     def _scores(self, frame: Frame, origin: Int64) -> Observed | ObservedScores | None:
-        """Return the observations of scores, or None where a pixel with depth is out of reach.
+        """Return the observations of scores, or None if a pixel with depth is out of reach.
 
-        They are dense rows where the voxels have evidence for most of the classes, else entries.
+        The observations are dense rows if the voxels have evidence for most of the classes, else entries.
 
         Voxels outside the extent are left out at the end: all voxels of the frame decide how sums are rounded.
         """
@@ -258,7 +258,7 @@ class Aggregator:
 def _by_rows(frame: Frame, columns: int) -> tuple[Float32, Float32, tuple[Float64, Float64]]:
     """Return depth (H, W), points (H, W, 3) and the rays of an image, which has no points.
 
-    The points of a scan come as rows of so many columns, the last one filled up by points without depth.
+    The points of a scan come as rows of equal length; points without depth fill up the last row.
     """
     if frame.points is None:
         return fixed(frame.depth), fixed(np.zeros((0, 0, 3), np.float32)), frame.rays

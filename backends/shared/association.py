@@ -31,7 +31,7 @@ CHECKED = 2**12
 """Pixels of a depth map, about, that the check of its unit reads; of one as large some must be finite."""
 
 FAR, DISTINCT = 100.0, 8
-"""Depth whose values are all whole numbers, so many different ones, and mostly above FAR metres, is in millimetres."""
+"""Depth is in millimetres if all values are whole numbers, at least DISTINCT differ, and most exceed FAR metres."""
 
 FEW = 1 << 15
 """Pixels that are back-projected together, about: the results stay in a core's cache."""
@@ -132,7 +132,8 @@ def back_project(frame: Frame, pixels: Mask | None = None) -> Float64:
 
     x_w = T_wc d ((u - cx) / fx, (v - cy) / fy, 1), of a scan T_wc p.
 
-    The order of operations is the protocol's, so that every backend decides alike at a voxel's face.
+    The order of operations is the protocol's, so that every backend assigns a point on a voxel's face to the same
+    voxel.
     """
     return np.concatenate([*_points(frame, frame.valid if pixels is None else pixels)], axis=1)
 

@@ -203,11 +203,19 @@ def js_term(p, q):
 def observe_row(evidence, sums, pixels, op, dominant, plogp_before, out):
     """Add one observation to a voxel's dense evidence, seen `op` times before.
 
-    - `evidence`, `sums`: as `observe_eights` takes them; sums are those of the normalised scores of its pixels
+    - `evidence`, `sums`: as `observe_eights` takes them; `sums` adds up the normalised scores of the frame's pixels
 
     `dominant` and `plogp_before` are out[4] and out[7] of the observation before, which spares the search for them.
-    Leaves in `out` the change of VSS, that of the entropy in bits, the drift in bits, the dominant class before and
-    after, the squared length of s_bar, its entropy in bits, and the sum of p log2 p over the classes.
+    `out` receives eight numbers, in this order:
+
+    - the change of VSS
+    - the change of the entropy, bits
+    - the drift, bits
+    - the dominant class before the observation
+    - the dominant class after the observation
+    - the squared length of s_bar
+    - the entropy of s_bar, bits
+    - the sum of p log2 p over the classes
     """
     before, after = 1.0 / max(op, 1), 1.0 / (op + 1)
     top_before = evidence[dominant] * before

@@ -77,7 +77,7 @@ def partition_of(key):
 
 @serial
 def bounds_of(number):
-    """Return the first of each part (n + 1,) of what comes part after part, so many in each (n,); and the end."""
+    """Return the bounds (n + 1,) of consecutive parts with `number` (n,) elements: each part's first, and the end."""
     bounds = np.zeros(number.shape[0] + 1, np.int64)
     for part in range(number.shape[0]):
         bounds[part + 1] = bounds[part] + number[part]

@@ -18,7 +18,7 @@ DIGIT_BITS = 10
 
 @serial
 def offsets_of(spread):
-    """Return where entries go that are ordered by partition, then by band, of so many (bands, PARTITIONS).
+    """Return where entries go in order of partition, then band, from their numbers `spread` (bands, PARTITIONS).
 
     Returns the first of each band in each partition (bands, PARTITIONS), and of each partition, and the end.
     """

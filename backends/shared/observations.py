@@ -71,7 +71,7 @@ class ObservedScores:
         return ObservedScores(self.key[some], self.pixels[some], self.row[some], self.sums, bounds, self.K)
 
     def sparse(self) -> Observed:
-        """Return the same by entries, of which there are none for classes without evidence."""
+        """Return the same as entries; classes without evidence have no entry."""
         sums = self.rows()
         voxel, label = np.nonzero(sums)
         start = np.searchsorted(voxel, np.arange(len(self.key) + 1))
@@ -105,7 +105,7 @@ class WorkSpace:
 
 
 def _in_small_pages(length: int) -> npt.NDArray[np.uint8]:
-    """Return bytes of which only pages that are written to take memory; numpy asks for pages of 2 MB where it can."""
+    """Return bytes that take memory only for the pages written to; numpy would ask for pages of 2 MB if available."""
     own = {"flags": mmap.MAP_PRIVATE | mmap.MAP_ANONYMOUS} if hasattr(mmap, "MAP_ANONYMOUS") else {}
     pages = mmap.mmap(-1, length, **own)
     if hasattr(mmap, "MADV_NOHUGEPAGE"):
@@ -137,9 +137,9 @@ class Change:
     Attributes:
         points: Pixels that it counted.
         voxels: Voxels that it touched.
-        new: Those of the voxels that were seen for the first time.
-        drift: D_JS(p^(t), p^(t-1)) of the others, bits.
-        vss: VSS after the frame, less VSS before it; a new voxel had none.
+        new: Voxels that were seen for the first time.
+        drift: D_JS(p^(t), p^(t-1)) of the other voxels, bits.
+        vss: VSS after the frame minus VSS before it; a new voxel had no VSS.
         entropy: Likewise entropy, bits.
         recurrent: Voxels that it made recurrent.
     """
@@ -204,7 +204,7 @@ class MapTotal:
             frame: Its index.
             change: Its effect on the map.
             started: `time.perf_counter()` when its fusion began.
-            associated: The same when its pixels had become observations; NaN where that is not measured separately.
+            associated: `time.perf_counter()` when its pixels had become observations; NaN if not measured separately.
         """
         finished = time.perf_counter()
         self.voxels += change.new

@@ -77,7 +77,7 @@ def exact_keys_of_points(points, depth, labels, T, size, ox, oy, oz, ignore, out
 
 @serial
 def packed_near(a, b, c):
-    """Return the packed key of a voxel, whole numbers from the origin; -1 where it is out of reach."""
+    """Return the packed key of a voxel given as whole numbers from the origin, or -1 if it is out of reach."""
     low, high = -float(HALF), float(HALF - 1)
     near = (a >= low) & (a <= high) & (b >= low) & (b <= high) & (c >= low) & (c <= high)
     i = np.int64(np.int32(a if near else 0.0)) + HALF
@@ -191,5 +191,5 @@ def ask_for(builder: Any, pointer: Any) -> None:
 
 @intrinsic
 def bits_of(_typing: Any, _value: Any) -> Any:
-    """Return the bits of a double, as int64; those of numbers from 0 on sort like the numbers."""
+    """Return the bits of a double as int64; the bits of non-negative numbers sort like the numbers."""
     return types.int64(types.float64), lambda _, builder, __, given: builder.bitcast(given[0], ir.IntType(64))

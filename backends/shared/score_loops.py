@@ -37,7 +37,8 @@ def scale_eight(_typing: Any, scores: Any, _at: Any, _K: Any, keys: Any, scale: 
     """Invert the sum of each of eight pixels' scores, from scores[at] on.
 
     Arguments: scores, at, K, keys, scale, u.
-    Leaves it in scale[u : u + 8]; keys[u : u + 8], int64, become -1 where it is not a positive number.
+    Leaves the result in scale[u : u + 8]; a key in keys[u : u + 8], int64, becomes -1 if the sum is not a positive
+    number.
     """
 
     def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
@@ -68,10 +69,10 @@ def add_two(
     """Add u's scores and the next pixel's to their voxel.
 
     Arguments: scores, at, K, scale, u, end, sums, to, fresh.
-    sums[to : to + K] += scale[u] * scores[at + u * K : at + (u + 1) * K], or = where `fresh`, and likewise of u + 1 if
-    that is below `end`; it is read in any case, as nobody can predict whether it is, and must be there.
+    sums[to : to + K] += scale[u] * scores[at + u * K : at + (u + 1) * K], or = if `fresh`, and the same for u + 1 if
+    u + 1 is below `end`. Pixel u + 1 is read in any case, without a branch, and must exist.
 
-    `sums` is float64, and has room for a multiple of `LANES` values at `to`: those beyond K get 0 added.
+    `sums` is float64, and has room for a multiple of `LANES` values at `to`: values beyond K get 0 added.
     """
 
     def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
@@ -176,9 +177,9 @@ def spread(builder: Any, value: Any, vector: Any) -> Any:
 # Compiled loops from the scores of a frame to the sums of its voxels, by tiles of the image.
 #
 # The image is cut into bands of `ROWS` rows, and each band into tiles so narrow that the sums of their voxels stay in a
-# core's cache. Scores are read from memory once, in the order in which they lie there; those of eight invalid pixels
-# are not. A voxel's pixels are added up band by band, in an order that depends on the image only: the same numbers for
-# any number of threads.
+# core's cache. Scores are read from memory once, in the order of their addresses; the scores of eight invalid pixels
+# in a row are not read. A voxel's pixels are added up band by band, in an order that depends on the image only: the
+# same numbers for any number of threads.
 
 ROWS, COLUMNS = 16, 512
 """Pixels of a tile; its rows are those of a band."""
@@ -244,11 +245,11 @@ def sum_scores(
 
 @serial
 def _add_stretch(scores, at, K, stride, words, scale, run_word, run_end, table, table_row, key, count, sums, n):
-    """Add a stretch of pixels to their voxels, of which there are n; how many then, or -1 where there is no room.
+    """Add a stretch of pixels to their n voxels; return the number of voxels after it, or -1 without room.
 
     - `scores`, `at`: their scores begin at scores[at]
-    - `words`: their keys, and at least LANES times -1 behind the last one, up to a multiple of LANES; those of pixels
-      without a prediction become -1
+    - `words`: their keys, and at least LANES times -1 behind the last one, up to a multiple of LANES; the keys of
+      pixels without a prediction become -1
     """
     pixels = words.shape[0] - LANES
     for u in range(0, pixels, LANES):

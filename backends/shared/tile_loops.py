@@ -1,8 +1,8 @@
 """Compiled loops from the labels of a frame to entries, by tiles of the image, or stretches of a scan.
 
-A pixel is one word: its voxel, counted from 2^15 below the camera's along each axis, and its label, 16 bits each; -1
-where it does not count. Pixels become runs of equal words along rows, runs of a tile entries in a small table that
-gives way on a collision; `merge_loops` sorts entries and adds them up.
+A pixel is one word: its voxel, counted from 2^15 below the camera's voxel along each axis, and its label, 16 bits each;
+-1 for a pixel that does not count. Pixels become runs of equal words along rows. Runs of a tile become entries in a
+small table, which gives way on a collision; `merge_loops` sorts entries and adds them up.
 """
 
 from __future__ import annotations
@@ -60,8 +60,8 @@ SHIFT = np.uint64(64 - TABLE_BITS)
 def _words_fused(depth, labels, ignore, ray_a, ray_b, ray_c, a0, b0, c0, ta, tb, tc, face, out):
     """Return the words of pixels; and any doubt, see `keys_fused`.
 
-    Coordinates are counted from -2^16, half the width of a face included (`face_terms`): the bits of such a number are
-    those of 2^16, with the coordinate and a binary fraction in their positions, where it is within reach.
+    Coordinates are counted from -2^16, half the width of a face included (`face_terms`). If a coordinate is within
+    reach, the bits of its number are the bits of 2^16, with the coordinate and a binary fraction in their positions.
     """
     doubt = outside = 0
     for u in range(depth.shape[0]):
@@ -336,9 +336,9 @@ def find_words_of_points(
 
 @serial
 def _finish(table, table_count, word, count, n, lost, corner, partition, spread, low, high):
-    """Empty the table into a band's entries, of which there are n; return how many are left, see `_describe`.
+    """Empty the table into a band's n entries; return the number of entries that remain, see `_describe`.
 
-    Returns -1 where a pixel is `lost`.
+    Returns -1 if a pixel is `lost`.
     """
     n = _flush(table, table_count, word, count, n)
     n = _describe(word, count, n, corner, partition, spread, low, high)

@@ -27,34 +27,34 @@ UNSEEN, SEEN = 0.02, 0.5
 
 CONTRADICTS = 0.02
 APART = 4.0
-"""Two frames contradict each other where the error is this, so many times that of frames beside them, and so many
-times the usual one."""
+"""Two frames contradict each other if their error is at least CONTRADICTS, APART times the error of neighbouring
+frames, and APART times the usual error."""
 
 FITS = 0.05
-"""Frames fit each other up to this error, where it is not so many times the usual one."""
+"""Frames fit each other up to this error, if it is not APART times the usual error."""
 
 DISAGREE = 0.25
-"""Share of the points by which labels of a frame agree less with those beside it than these with each other."""
+"""Share of the points by which labels of a frame agree less with its neighbours' than these with each other."""
 
 SEVERAL = 3
 """Classes of the maps around one that looks wrong."""
 
 SAME_RATIO, ANOTHER_UNIT = 0.05, 1.2
-"""Spread of the ratio of two depths, relative, up to which one of them is that many times too long, and the least
-ratio: a pose that is a little off looks alike."""
+"""One of two depths is too long by their ratio if the relative spread of the ratio is at most SAME_RATIO, and the ratio
+at least ANOTHER_UNIT: a small error of a pose looks like a smaller ratio."""
 
 MOST_BESIDE = 2
 """Frames side by side that do not fit those around them, which fit each other."""
 
 SHIFTED, STRIKING_SHIFT, LEAST_SHIFTED = 1.6, 2.5, 0.005
 WON_LINKS = 0.8
-"""Poses also shift where frames on both sides of a place have so many times the usual error of frames as far apart, and
-of those just before and after, and this much; from the second number on the scene is unsound. Last the share of them in
-which it is larger than in any 95 of 100 others."""
+"""Poses also shift if the error of frames on both sides of a place is large: SHIFTED times the usual error of frames as
+far apart and of frames just before and after, and at least LEAST_SHIFTED. From STRIKING_SHIFT times on, the scene is
+unsound. WON_LINKS is the least share of the pairs whose error is larger than 95 of 100 other errors."""
 
 GOES_ON, ALIKE = 1.5, 0.5
-"""The view goes on from one frame to the next where depth, pixel by pixel, changes at most so many times as much as
-between the frames before and after, and at most by this part of what it does between distant frames."""
+"""The view goes on from one frame to the next if the change of depth, pixel by pixel, is small. It is at most GOES_ON
+times the change between the frames before and after, and at most ALIKE times the change between distant frames."""
 
 TINY = 1e-6
 """Errors below this are none."""
@@ -71,7 +71,7 @@ class Link:
     """The agreement of two frames.
 
     Attributes:
-        error: Median relative depth error of the points that are seen again, NaN where too few are.
+        error: Median relative depth error of the points that are seen again, NaN with too few points.
         share: Share of the points that are seen again.
         ratio: Median of the depth that the second frame has there to the depth that it should have.
         steady: Whether that ratio is nearly the same at all points.
@@ -94,10 +94,10 @@ class Chain:
     """Frames in order, each compared with those that are `GAPS` before it.
 
     Attributes:
-        positions: Those of the frames, ascending.
+        positions: Positions of the frames, ascending.
         links: Agreement by two positions.
-        usual: The median error of frames that follow each other; NaN where none sees another.
-        maps: What the label maps hold, by position; empty without labels.
+        usual: The median error of frames that follow each other; NaN if no frame sees another.
+        maps: Contents of the label maps, by position; empty without labels.
     """
 
     positions: Sequence[int]
@@ -106,7 +106,7 @@ class Chain:
     maps: Mapping[int, MapContent] = dataclasses.field(default_factory=dict)
 
     def error(self, a: int, b: int) -> float:
-        """Return the error of two frames; NaN where they were not compared."""
+        """Return the error of two frames, or NaN if they were not compared."""
         link = self.links.get((a, b))
         return math.nan if link is None else link.error
 
@@ -115,7 +115,7 @@ class Chain:
         return self.error(a, b) <= min(FITS, max(CONTRADICTS, APART * self.usual))
 
     def contradicts(self, pair: Pair, *neighbours: Pair) -> bool:
-        """Return whether two frames contradict each other, and those beside them do not."""
+        """Return whether two frames contradict each other, and their neighbours do not."""
         if not all(self.fits(*one) for one in neighbours):
             return False
         least = max(CONTRADICTS, *(APART * error for error in (self.usual, *(self.error(*one) for one in neighbours))))
@@ -130,7 +130,7 @@ class Chain:
     def misfits(self) -> list[tuple[int, Pair]]:
         """Return the positions of frames that contradict both neighbours, which fit each other; with these.
 
-        Neighbours are the nearest frames on both sides, or those beside two such frames.
+        Neighbours are the nearest frames on both sides, or the frames next to two such frames.
         """
         found = dict[int, Pair]()
         for a, between, c in self._around():
@@ -145,7 +145,7 @@ class Chain:
                 yield self.positions[k], self.positions[k + 1 : k + 1 + width], self.positions[k + 1 + width]
 
     def _strange(self, pair: Pair, neighbour: Pair) -> bool:
-        """Return whether two frames contradict each other, or see nothing of each other where those beside them do."""
+        """Return whether two frames contradict each other, or see nothing of each other while their neighbours do."""
         if self.contradicts(pair, neighbour):
             return True
         share = self.links[pair].share if pair in self.links else 1.0
@@ -161,9 +161,9 @@ class Chain:
         return not self.fits(a, c) and not self.fits(b, d)
 
     def shift(self) -> tuple[Pair, float, float] | None:
-        """Return the two successive frames between which poses shift; None where they do not.
+        """Return the two successive frames between which poses shift, or None without a shift.
 
-        Errors of frames on both sides are compared with the usual ones of frames as far apart.
+        Errors of frames on both sides are compared with the usual errors of frames as far apart.
 
         Returns:
             The frames, the median error of frames on both sides, and the usual one of frames as far apart.
@@ -196,7 +196,7 @@ class Chain:
     def departures(self) -> list[Pair]:
         """Return two successive frames that see nothing of each other by their poses, though the view goes on.
 
-        Those beside them on each side see each other.
+        Their neighbours on each side see each other.
         """
         far = [link.still for (a, b), link in self.links.items() if self._gap(a, b) == GAPS[-1]]
         runs = zip(self.positions, self.positions[1:], self.positions[2:], self.positions[3:], strict=False)
@@ -226,19 +226,19 @@ class Chain:
         return sorted(found.items())
 
     def agreement(self, a: int, b: int) -> float:
-        """Return the agreement of two frames' labels; NaN where they were not compared."""
+        """Return the agreement of two frames' labels, or NaN if they were not compared."""
         link = self.links.get((a, b))
         return math.nan if link is None else link.agreement
 
 
 @dataclass(frozen=True)
 class MapContent:
-    """What a label map holds: the share of its pixels that have a label, and their classes.
+    """Content of a label map: the share of its pixels that have a label, and their classes.
 
     Attributes:
         labelled: Share of the pixels, 0 to 1.
-        single: Whether all of these have one class.
-        classes: Number of the classes that 0.5 % or more of these have.
+        single: Whether all labelled pixels have one class.
+        classes: Number of the classes that 0.5 % or more of the labelled pixels have.
         name: Id of the most frequent class; -1 without labels.
     """
 
@@ -304,7 +304,7 @@ def linked(first: View, second: View, configured: Convention) -> Link:
 
 
 def _still(first: View, second: View) -> float:
-    """Return the median relative change of depth from image to image, pixel by pixel; NaN where they cannot be."""
+    """Return the median relative change of depth from image to image, pixel by pixel, or NaN without common pixels."""
     if first.depth.shape != second.depth.shape:
         return math.nan
     with np.errstate(all="ignore"):

@@ -1,4 +1,4 @@
-"""Frames that do not fit their neighbours, and poses that jump: each frame beside those before and after it."""
+"""Frames that do not fit their neighbours, and poses that jump: each frame against the frames before and after it."""
 
 from __future__ import annotations
 
@@ -24,13 +24,14 @@ from semstab.errors import DataError
 
 MOST_FRAMES, LEAST_FRAMES = 300, 44
 MOST_PIXELS = 300 * 640 * 480
-"""Frames that are read one after the other: so many, of large images as many as have so many pixels, of no size fewer
-than the second number, which a quick check reads."""
+"""Frames that are read one after the other: at most MOST_FRAMES, with at most MOST_PIXELS pixels together, but at least
+LEAST_FRAMES, which is also the number for a quick check."""
 
 STRIKING_STEP = 4.0
 AROUND = 15
 MOST_STEPS = 3
-"""Steps of the camera that are looked at: so many times the median of so many on each side; the largest ones."""
+"""Steps of the camera that are looked at: the MOST_STEPS largest steps of at least STRIKING_STEP times the median of
+AROUND steps on each side."""
 
 MOST_NAMED = 5
 MOST_BAD = 0.1
@@ -110,7 +111,7 @@ class Neighbours:
 
     @functools.cached_property
     def _poses(self) -> list[Float64]:
-        """The poses (4, 4) of all frames; NaN where there is none."""
+        """Poses (4, 4) of all frames; NaN for a frame without a pose."""
         return [self._pose(index) for index in self.indices]
 
     def _pose(self, index: int) -> Float64:
@@ -138,7 +139,7 @@ class Neighbours:
         return None
 
     def located(self, pair: Pair) -> tuple[int, Chain] | None:
-        """Return the first frame after a jump between two positions, and the chain around it; None where it is none."""
+        """Return the first frame after a jump between two positions, and the chain around it; None without a jump."""
         before, after = pair
         while after - before > 1:
             middle = (before + after) // 2
@@ -161,7 +162,7 @@ class Neighbours:
         return self.scene.frame_name(self.indices[position])
 
     def said_of_jumps(self, chain: Chain) -> str | None:
-        """Return the line on the first frame at which poses jump; None where they do not."""
+        """Return the line on the first frame at which poses jump, or None without a jump."""
         broken = next(filter(None, map(self.located, chain.breaks())), None)
         if broken is not None:
             return self.said_of_break(broken)
@@ -204,7 +205,7 @@ class Neighbours:
         )
 
     def said_of_lost(self) -> str | None:
-        """Return the line on frames whose tracking was lost; None where it was not."""
+        """Return the line on frames whose tracking was lost, or None without lost tracking."""
         if type(self.scene).T_wc is Scene.T_wc or len(self.indices) < LEAST_CHAIN:
             return None
         poses = self._poses
@@ -228,7 +229,7 @@ class Neighbours:
         return [linked(told[a], told[b], self._configured) if a in told and b in told else None for a, b in pairs]
 
     def said_of_many(self, chain: Chain, misfits: Sequence[int]) -> str:
-        """Return the line on frames that do not fit those beside them, where they are many."""
+        """Return the line on frames that do not fit their neighbours, if there are many."""
         return (
             f"{len(misfits)} of {len(chain.positions)} frames do not fit the frames beside them, which fit each other:"
             f" {self._list(misfits, MOST_LOST)}; their poses or depth are wrong: correct them, or leave them out:"
@@ -236,7 +237,7 @@ class Neighbours:
         )
 
     def said_of_misfits(self, chain: Chain, misfits: Sequence[tuple[int, Pair]]) -> Iterator[str]:
-        """Yield a line on frames that do not fit those beside them."""
+        """Yield a line on frames that do not fit their neighbours."""
         for position, beside in misfits[:MOST_NAMED]:
             yield f"{self._misfit(chain, position, beside)}; correct it, or leave the frame out ({LEAVE_OUT})"
         if len(misfits) > MOST_NAMED:
@@ -282,7 +283,7 @@ class Neighbours:
 
 
 def _step(first: Float64, second: Float64) -> float:
-    """Return how far a camera moves and turns, which only tells a step from those beside it."""
+    """Return how far a camera moves and turns; the number only compares a step with its neighbours."""
     R, t = motion(first, second)
     return float(np.linalg.norm(t) + np.linalg.norm(R - np.eye(3)))
 

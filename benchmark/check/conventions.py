@@ -96,19 +96,19 @@ def alternatives(configured: Convention, ratios: tuple[Ratio, ...]) -> Iterator[
 
 @dataclass(frozen=True)
 class Reading:
-    """The configured convention, and how a change of it is written down.
+    """The configured convention, and the lines of configuration that change it.
 
-    depth_scale is units of stored depth in a metre, None where only the dataset's own files know.
+    depth_scale is units of stored depth in a metre, or None if only the dataset's own files have it.
 
     Attributes:
-        said: Values by name of setting, those of scene.yaml and the dataset's options together.
+        said: Values by name of setting, from scene.yaml and from the dataset's options.
         options: Names and values of the dataset's options.
         size: (width, height) of the depth images.
         median: Median of their depth as configured, of one of them; metres.
-        ratios: Sizes that the intrinsics may be for, relative to what is said.
-        file: The scene.yaml with further settings, where the dataset has one.
-        names: Names of all settings, those that are not set too.
-        in_program: Whether the frames are those of a program, where no file and no option sets anything.
+        ratios: Sizes that the intrinsics may be for, relative to the configured size.
+        file: The scene.yaml with further settings, or None without one.
+        names: Names of all settings, including settings without a value.
+        in_program: Whether a program gives the frames, without files and options.
     """
 
     said: Mapping[str, Any]
@@ -143,7 +143,7 @@ class Reading:
         return any(abs(known / scale - 1) < USUAL for known in KNOWN_SCALES)
 
     def size_after(self, ratio: Ratio) -> list[int]:
-        """Return [width, height] of the image of the intrinsics where it is `ratio` times the configured one."""
+        """Return [width, height] of the image of the intrinsics, `ratio` times the configured size."""
         said = self.said.get("intrinsics_size", self.size)
         return [round(side * share) for side, share in zip(said, ratio, strict=True)]
 

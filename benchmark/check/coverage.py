@@ -43,7 +43,7 @@ SHARED = 0.6
 """The suggested frame stride leaves this share of a frame's points in view of the next one."""
 
 FRAMES_LEFT = 20
-"""The least number of frames that it leaves, where there are so many: intervals need them to tell how frames differ."""
+"""The least number of frames that it leaves, if there are enough: intervals need them to tell how frames differ."""
 
 BINS = ((1, 1), (2, 2), (3, 8), (9, 27))
 """Distances between frames that are reported together."""
@@ -116,7 +116,7 @@ class Noise:
 
 @dataclass(frozen=True)
 class Suggestion:
-    """Settings that suit the data, each with the reason; None where the data do not tell."""
+    """Settings that suit the data, each with the reason; None if the data do not tell."""
 
     voxel_size: float | None
     voxel_size_reason: str
@@ -197,14 +197,11 @@ class Coverage:
         )
 
     def stays(self, voxel_size: float) -> float:
-        """Return the share of the points that fall into the same voxel when another frame sees them.
-
-        NaN where none does.
-        """
+        """Return the share of the points that fall into the same voxel when another frame sees them, or NaN."""
         return _mean(np.all(self._same_along(voxel_size, np.zeros(3)), axis=1))
 
     def faces(self, voxel_size: float) -> Faces | None:
-        """Return the axes along which faces of voxels lie in a surface; None where they do not, or most points stay.
+        """Return the axes along which faces of voxels lie in a surface, or None without an axis or if most points stay.
 
         Along them far fewer points stay than with the grid a quarter, a half or three quarters of a voxel off.
         """
@@ -287,7 +284,7 @@ def plane_residuals(view: View) -> Float64:
 def persistence(frames: Iterable[Frame], coverage: Covers, voxel_size: float) -> Persistence | None:
     """Fuse frames and count how often each voxel is seen.
 
-    None where points lie so far out that voxels of that size cannot be counted.
+    Returns None if points lie so far out that voxels of this size cannot be counted.
     """
     backend = create("numba", voxel_size=voxel_size, num_classes=2)
     with contextlib.suppress(DataError):
@@ -312,10 +309,10 @@ def without_labels(view: View, pixel_stride: int) -> Frame:
 
 
 class Covers(Protocol):
-    """What frames, or scans, share with each other.
+    """The overlap of frames, or scans.
 
     Attributes:
-        reasons: Why a voxel size is suggested, and a frame stride, with a place for the share of the points.
+        reasons: Reasons for the suggested voxel size and frame stride, with a place for the share of the points.
     """
 
     reasons: tuple[str, str]
@@ -327,19 +324,19 @@ class Covers(Protocol):
         """Return how far points are off, between frames and within one."""
 
     def stays(self, voxel_size: float) -> float:
-        """Return the share of the points that stay in their voxel; NaN where no point is seen again."""
+        """Return the share of the points that stay in their voxel, or NaN if no point is seen again."""
 
     def faces(self, voxel_size: float) -> Faces | None:
-        """Return the axes along which faces of voxels lie in a surface; None where they do not."""
+        """Return the axes along which faces of voxels lie in a surface, or None without such an axis."""
 
     def pixel_stride(self, voxel_size: float | None) -> tuple[int | None, str]:
         """Return the pixel stride that suits a voxel size, and the reason."""
 
 
 def suggested_size(coverage: Covers) -> float | None:
-    """Return the smallest voxel size in which points fall again, metres; None where frames do not see the same.
+    """Return the smallest voxel size, in metres, at which points stay in their voxel, or None without overlap.
 
-    Where faces of voxels lie in a surface, the grid is taken half a voxel off: a larger voxel does not mend that.
+    If faces of voxels lie in a surface, the grid is taken half a voxel off: a larger voxel does not mend this.
     """
     return next((size for size in SIZES if _stays_off_faces(coverage, size) >= STAYS), None)
 
@@ -350,7 +347,7 @@ def _stays_off_faces(coverage: Covers, size: float) -> float:
 
 
 def suggest(coverage: Covers, overlaps: Sequence[Overlap], frames: int, stride: int) -> Suggestion:
-    """Return voxel size, pixel stride and frame stride that suit so many frames, whose own stride is `stride`."""
+    """Return voxel size, pixel stride and frame stride that suit the `frames` frames, whose own stride is `stride`."""
     size = suggested_size(coverage)
     shared = {row.apart[0]: row.in_view for row in overlaps}
     times = max((n for n in shared if shared[n] >= SHARED and frames >= FRAMES_LEFT * n), default=1)

@@ -19,8 +19,8 @@ from semstab.data.labels import IGNORE_16BIT
 STATES = {"sound": "green", "imprecise": "yellow", "unsound": "bold red", "unclear": "yellow"}
 NOTHING = "-"
 OF_IMAGES = "predict them (--predict), or put the label maps of a model into its folder"
-OF_SCANS = "put those of a model into predictions/MODEL (docs/tutorials/scans.md), or check the truth, --model gt"
-"""What to do where a scene has no labels."""
+OF_SCANS = "put the labels of a model into predictions/MODEL (docs/tutorials/scans.md), or check the truth, --model gt"
+"""Advice for a scene without labels."""
 
 MOST_UNKNOWN = 4
 MOST_COLUMNS = 100

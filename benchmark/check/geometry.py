@@ -31,7 +31,8 @@ LEAST_PAIRS = 3
 """The least pairs with enough points seen again; where fewer have, an alternative must stand out from all others."""
 
 MOST_ERROR = {3: 0.02, 4: 0.02, 5: 0.02}
-"""The largest error of a convention that changes so many settings at once: of many combinations one fits a little."""
+"""The largest error of a convention, by the number of settings that it changes at once: of many combinations of
+settings, one fits a little by chance."""
 
 STRIKING = 0.02
 """The error that refutes a configured convention without evidence of its own, ..."""
@@ -51,7 +52,7 @@ LEAST_SCALE_ERROR = 1.1
 """Depth that is too long or too short by less is measurement, not a wrong unit."""
 
 MISTAKEN = 0.5
-"""A mistake is named where its mend leaves at most this part of the error; files have to be written anew for it."""
+"""A mistake is named if its mend leaves at most this part of the error; the mend is to write the files again."""
 
 MOST_CANDIDATES = 3
 """Alternatives that are named in addition to the best one, where they fit as well."""
@@ -306,7 +307,7 @@ def shifts_and_turns(sample: Sample) -> tuple[Float64, Float64]:
 
 
 def _typical(sample: Sample, measure: Callable[[Float64], float]) -> float:
-    """Return the median over the views of a measure of their sampled depths; NaN where none has any."""
+    """Return the median over the views of a measure of their sampled depths, or NaN without depths."""
     values = [measure(view.depth[view.v, view.u].astype(np.float64)) for view in sample.views.values() if len(view.u)]
     return float(np.median(values)) if values else math.nan
 
@@ -318,7 +319,7 @@ def _reason(sample: Sample) -> str:
     reasons = {
         "the camera hardly moves": shifts.max() < HARDLY_MOVES,
         "the camera hardly turns": turns.max() < HARDLY_TURNS,
-        "all depths are alike": spread < HARDLY_DEEP,
+        "all depths are similar": spread < HARDLY_DEEP,
     }
     return " and ".join(reason for reason, holds in reasons.items() if holds)
 

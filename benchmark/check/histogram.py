@@ -19,9 +19,9 @@ class Histogram:
     """The labels of a model in some frames.
 
     Attributes:
-        space: Its taxonomy's name, or None where none is known.
+        space: Its taxonomy's name, or None without a taxonomy.
         pixels: Number of pixels that were counted.
-        classes: Share of them by class, in the taxonomy's order; by id where no taxonomy is known.
+        classes: Share of the pixels by class, in the taxonomy's order; by id without a taxonomy.
         ignored: Share with the ignore id, or without usable scores.
         unknown: Share by id that no class has.
         problem: The fault, or None.

@@ -1,4 +1,4 @@
-"""The mistakes of files that are looked for in scenes of cameras and of scans, beside other conventions of a camera.
+"""The mistakes of files that are looked for in scenes of cameras and of scans, in addition to other conventions.
 
 A new one is an entry of `CAMERAS` or `SCANS`: its name, what it changes, and the mend in words.
 """
@@ -23,7 +23,7 @@ LEAST_FOCAL = 8.0
 """Pixels; a shorter focal length is one divided by the image's size."""
 
 TO_CAMERA = np.array([[0.0, -1, 0, 0], [0, 0, -1, 0], [1, 0, 0, 0], [0, 0, 0, 1]])
-"""From the axes of a LiDAR (x forward, y left, z up) to those of a camera beside it (x right, y down, z forward)."""
+"""From a LiDAR's axes (x forward, y left, z up) to the axes of a camera next to it (x right, y down, z forward)."""
 
 PoseChange = Callable[[Float64], Float64]
 
@@ -54,7 +54,7 @@ def quaternions(order: tuple[int, ...]) -> PoseChange:
 
 
 def angles(factor: float) -> PoseChange:
-    """Return the change of poses whose angles are so many times those that were read."""
+    """Return the change that multiplies the rotation angles of poses by `factor`."""
 
     def of(R: Float64) -> Float64:
         from scipy.spatial.transform import Rotation
@@ -65,7 +65,7 @@ def angles(factor: float) -> PoseChange:
 
 
 def positions(factor: float) -> PoseChange:
-    """Return the change of poses whose positions are so many times those that were read."""
+    """Return the change that multiplies the positions of poses by `factor`."""
     scale = np.array([[1.0, 1, 1, factor]] * 3 + [[1.0] * 4])
     return lambda T: T * scale
 
@@ -136,8 +136,8 @@ def _is_off_centre(sample: Sample) -> bool:
     return _in_pixels_already(sample) and all(off)
 
 
-ANEW = "no setting mends it: write the files anew"
-OR_LEFT_HANDED = f"{ANEW}, or convert the poses where these are left-handed (Unity, Unreal), which looks alike"
+ANEW = "no setting mends it: write the files again"
+OR_LEFT_HANDED = f"{ANEW}, or convert the poses if they are left-handed (Unity, Unreal), which looks the same"
 mistake = functools.partial(Hypothesis[Sample], applies=_in_pixels_already)
 CAMERAS: tuple[Hypothesis[Sample], ...] = (
     mistake("depth images mirrored left to right", _mirrored(1), OR_LEFT_HANDED),

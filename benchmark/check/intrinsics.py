@@ -116,7 +116,7 @@ def _is_a_guess(verdict: Verdict, how: Reading) -> bool:
 
 
 def find_camera(sample: Sample) -> CameraFit | None:
-    """Return the intrinsics under which depth reprojects clearly better than as configured; None where none do.
+    """Return the intrinsics under which depth reprojects clearly better than as configured, or None without them.
 
     Focal length and principal point are fitted in turn.
     """
@@ -144,7 +144,7 @@ def _moves() -> Iterator[Callable[[Camera], list[Camera]]]:
 
 
 def _others(name: str, values: Sequence[float], spread: float, best: Camera) -> list[Camera]:
-    """Return cameras with these values of a field, or where there is a spread, with values so far from the best."""
+    """Return cameras with these values of a field; with a spread, `values` are steps from the best camera's value."""
     now = getattr(best, name)
     reach = spread * (FACTOR_NEAR * now if name == "factor" else SHIFT_NEAR)
     return [dataclasses.replace(best, **{name: now + reach * each if spread else each}) for each in values]
@@ -162,6 +162,6 @@ def _simplest(best: Camera, errors: Callable[[Camera], Float64]) -> Camera:
 
 
 def _scaled(sample: Sample, factor: float) -> Float64:
-    """Return (pairs,) median relative error of depth that is so many times as long."""
+    """Return (pairs,) median relative error of depth times `factor`."""
     longer = {at: dataclasses.replace(v, depth=v.depth * np.float32(factor)) for at, v in sample.views.items()}
     return sample.of(longer).by_pair()

@@ -33,18 +33,18 @@ ROLLING = 0.5
 """Share of the places that tell at which ids change: from then on they change from frame to frame."""
 
 MANY = 4
-"""A map of one class is remarkable where those around it have so many, and agree less with it than usual."""
+"""A map of one class is remarkable if the maps around it have this number of classes, and agree less than usual."""
 
 MOST_NAMED = 5
 
 BAND_SHARE = 0.5
 BAND_PAIRS = 2
 BAND_BORDERS = 50
-"""The share of the borders of two classes at which the pixel between has an id between, which shows interpolation
-(real networks: up to 0.1, resized maps from 0.9); in so many pairs of classes, of those with so many border pixels."""
+"""The share of the borders of two classes at which the pixel between has an id between, which shows interpolation (real
+networks: up to 0.1, resized maps from 0.9); BAND_PAIRS pairs of classes with BAND_BORDERS border pixels need it."""
 
 ID_SHARE = 0.75
-"""The share of the ids between the first and the last that are used where ids are suspected to count from 1."""
+"""The share of the ids between the first and the last that are used if ids are suspected to count from 1."""
 
 NOTHINGS = ("background", "clutter", "ignore", "none", "other", "unknown", "unlabeled", "unlabelled", "void")
 """Words in the name of a first class that labels may well lack."""
@@ -178,7 +178,7 @@ def remarks_on_maps(neighbours: Neighbours, chain: Chain) -> Iterator[str]:
 
 
 def _agreement_with_others(chain: Chain, position: int) -> float:
-    """Return the median agreement with maps of several classes; NaN where none was compared."""
+    """Return the median agreement with maps of several classes, or NaN without a comparison."""
     known = [
         link.agreement
         for pair, link in chain.links.items()

@@ -1,4 +1,4 @@
-"""Label maps of frames in a row, as they are and as each hypothesis supposes, beside the edges of depth and colour."""
+"""Label maps of frames in a row, as they are and as each hypothesis supposes, against the edges of depth and colour."""
 
 from __future__ import annotations
 
@@ -26,7 +26,8 @@ IN_A_RUN = 5
 
 PIXELS = 2**17
 COLUMNS = 256
-"""Of a larger image every n-th pixel of each axis is used; edges are compared on a grid of at most so many columns."""
+"""The largest number of pixels of an image, else every n-th pixel of each axis is used; and of columns of the grid on
+which edges are compared."""
 
 POINTS = 1000
 LEAST_POINTS = 50
@@ -34,7 +35,7 @@ LEAST_POINTS = 50
 
 MOVES = 0.01
 TURNS = 1.0
-"""The camera moves where it does by this share of the depth, or turns by these degrees, from frame to frame."""
+"""A camera counts as moving from this share of the depth, or from these degrees of rotation, from frame to frame."""
 
 Change = Callable[[Ids, int], Ids]
 
@@ -59,7 +60,7 @@ class Seen:
 
     @functools.cached_property
     def edges(self) -> Float64 | None:
-        """The edges of the labels on the grid, of length 1; None where there are none."""
+        """Edges of the labels on the grid, of length 1, or None without edges."""
         return _edges(self.labels, self.view.ignore_id)
 
     def fit(self, edges: Float64 | None) -> float:
@@ -138,7 +139,7 @@ def shared_of(views: Mapping[int, View], pairs: Sequence[Pair]) -> Common:
 
 
 def agreements(common: Common, maps: Mapping[int, Ids], ignore: int) -> list[float]:
-    """Return for each pair of frames the share of common points whose labels agree; NaN where too few have some."""
+    """Return for each pair of frames the share of common points whose labels agree, or NaN with too few."""
     both = [shared.labels(maps[a], maps[b], ignore) for (a, b), shared in common.items()]
     return [float(np.mean(first == second)) if len(first) >= LEAST_POINTS else math.nan for first, second in both]
 
@@ -151,7 +152,7 @@ class Run:
 
     @functools.cached_property
     def maps(self) -> Mapping[int, tuple[Ids, Float64 | None]]:
-        """The maps; those of the files, where no others were given."""
+        """Label maps with their edges: the maps of the files by default."""
         return self._maps if self._maps is not None else {k: (f.labels, f.edges) for k, f in enumerate(self.frames)}
 
     @functools.cached_property
@@ -161,7 +162,7 @@ class Run:
 
     @functools.cached_property
     def common(self) -> Common:
-        """What each two of the frames see in common."""
+        """Points that each pair of frames has in common."""
         views = {k: seen.view for k, seen in enumerate(self.frames)}
         return shared_of(views, [*itertools.combinations(views, 2)])
 
@@ -171,7 +172,7 @@ class Run:
         return [(each, each.change(self)) for each in MAPS if each.applies(self)]
 
     def otherwise(self, step: int, change: Change | None = None) -> Run:
-        """Return the run in which each frame has the map of another, so many frames on, changed."""
+        """Return the run in which each frame has the map of the frame `step` further on, changed."""
         maps = dict[int, tuple[Ids, Float64 | None]]()
         for k, seen in enumerate(self.frames):
             if 0 <= k + step < len(self.frames):

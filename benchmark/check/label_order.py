@@ -17,11 +17,11 @@ FEWER = 0.85
 """The part of the disagreement that remains in the right order."""
 
 MOST_ORDERED, ORDER_COLUMNS, ORDER_PIXELS = 200, 64, 200 * 640 * 480
-"""Frames whose maps are looked for among those of all others, their edges on a grid of so many columns; the pixels of
-all of them, ..."""
+"""Bounds of the search for a frame's map among the maps of all frames: frames, columns of the grid of edges, and pixels
+of all frames, ..."""
 
 QUICK_PIXELS = 44 * 640 * 480
-"""... and those of a quick check."""
+"""... and pixels of all frames in a quick check."""
 
 SAME_ORDER = 0.8
 """Share of the maps that an order explains."""

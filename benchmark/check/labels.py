@@ -55,7 +55,7 @@ class LabelFindings:
     Attributes:
         wrong: Lines on label maps that do not belong to the frames as they are, each with the mend.
         remarks: Lines on ids that look wrong, but may be right.
-        open: Line on what these frames cannot tell; None where they tell it all.
+        open: Line on what these frames cannot tell, or None.
     """
 
     model: str
@@ -164,7 +164,7 @@ def check_labels(
 
 @dataclass(frozen=True)
 class _Findings:
-    """What some runs show.
+    """Findings of some runs of frames.
 
     Attributes:
         clear: Whether maps as they are fit clearly better than any other way.

@@ -1,4 +1,4 @@
-"""Lost tracking that was written as a pose: the identity, or the last known pose once more, while the view moves on."""
+"""Lost tracking that was written as a pose: the identity, or the last known pose again, while the view moves on."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ DIGITS = 9
 """Decimals to which poses are equal."""
 
 CONTRADICTS, APART = 0.02, 4.0
-"""Two frames contradict each other where the error is this, and so many times that of frames around them."""
+"""Two frames contradict each other if the error is CONTRADICTS, and APART times the error of frames around them."""
 
 UNSEEN = 0.02
 """A frame that sees less of both neighbours is elsewhere, too."""
@@ -38,7 +38,7 @@ class Run:
 
     Attributes:
         first, last: Positions of its first and last frame.
-        before, after: Positions of the nearest frames that are in no run; None where there is none.
+        before, after: Positions of the nearest frames that are in no run, or None without such a frame.
     """
 
     first: int
@@ -64,9 +64,9 @@ def lost_tracking(poses: Sequence[Float64], configured: Convention, compare: Com
     A camera that stands still has one pose, too; there depth stays as it is. A trajectory may begin with the identity.
 
     Args:
-        poses: (4, 4) camera-to-world of all frames, OpenCV axes; NaN where there is none.
-        configured: How the files are read.
-        compare: Returns how pairs of frames agree; None where they cannot be compared.
+        poses: (4, 4) camera-to-world of all frames, OpenCV axes; NaN for a frame without a pose.
+        configured: The convention in which the files are read.
+        compare: Returns the agreement of pairs of frames, or None for frames that cannot be compared.
     """
     runs = runs_of_one_pose(poses, configured)
     if not runs:
@@ -130,7 +130,7 @@ def _lost_of(run: Run, links: Sequence[Link | None], limit: float) -> Sequence[i
 
 
 def _fits(run: Run, links: Sequence[Link | None], limit: float) -> bool:
-    """Return whether one of its ends fits the frame beside it."""
+    """Return whether one of its ends fits the frame next to it."""
     known = [link for pair, link in zip(run.pairs, links, strict=True) if link is not None and pair not in run.within]
     return any(link.error < limit for link in known)
 

@@ -1,8 +1,8 @@
-"""Whether fy is off beside fx, or the camera stands elsewhere than the poses have it: both hide in the noise of depth.
+"""Search for a wrong ratio of fy to fx, and for an offset of the camera from its poses: both hide in depth noise.
 
-How deep a point lies in another frame changes with the calibration, and with the place of the camera on what was
-tracked. All of it is fitted at once, by least squares over the points of all pairs of frames: a part counts where it is
-the same alone, so that it stands for nothing else.
+How deep a point lies in another frame changes with the calibration, and with the place of the camera on the tracked
+body. All parameters are fitted at once, by least squares over the points of all pairs of frames. A parameter counts if
+a fit of this parameter alone gives the same value, so that it stands for nothing else.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ FX, FY, ARM, ALL = 0, 1, slice(5, 8), 11
 and forward, and radians about the camera's axes."""
 
 ROUNDS = 4
-"""Times that the points are matched anew."""
+"""Number of times that the points are matched."""
 
 SAME = 0.03
 """The relative error of depth up to which a point is taken for the same surface in the other frame."""
@@ -42,7 +42,7 @@ CERTAIN = 6.0
 """Standard errors by which a part is off beyond doubt: pairs share frames, and noise is not all that there is."""
 
 ALIKE = 0.5
-"""A part that is fitted alone differs by less than this share of itself from what it is beside all others."""
+"""Share of itself by which a parameter may differ between a fit of it alone and a fit of all parameters."""
 
 LEAST_ASPECT = 0.03
 """The least difference of the changes of fx and fy that is named."""
@@ -77,7 +77,7 @@ class Change:
 
 
 def with_mounting(verdict: Verdict, sample: Sample) -> Verdict:
-    """Return the verdict, which says that fy is off beside fx, or a lever arm forgotten, where that is beyond doubt."""
+    """Return the verdict with a note on a wrong ratio of fy to fx, or a forgotten lever arm, if beyond doubt."""
     if verdict.mend or verdict.state == "unclear":
         return verdict
     whole = fitted_change(sample, np.eye(ALL))

@@ -27,7 +27,7 @@ LEAST_SHARE = 1e-3
 """The least share of the pixels with depth that have one and the same value, the largest of all."""
 
 GAP = 2.0
-"""A value marks pixels where it is so many times the largest depth below it."""
+"""A value marks pixels without depth if it is at least this multiple of the largest depth below it."""
 
 
 @dataclass(frozen=True)

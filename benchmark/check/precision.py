@@ -1,4 +1,4 @@
-"""Whether depth agrees between frames as well as the noise of the camera lets expect, at each distance of frames."""
+"""Comparison of the error of depth between frames with the error to expect from the camera's noise, by distance."""
 
 from __future__ import annotations
 
@@ -23,10 +23,10 @@ BESIDE = 0.1
 pixel beside its middle, and most surfaces slant little."""
 
 IMPRECISE = 3.0
-"""Depth is imprecise where its error is so many times the one to expect."""
+"""Depth is imprecise from this ratio of its error to the error to expect."""
 
 GROWS = 10.0
-"""Poses drift where the error of distant frames is so many times that of the nearest ones, and no longer a good fit."""
+"""Poses drift from this ratio of the error of distant frames to the error of the nearest frames, without a good fit."""
 
 
 def with_precision(verdict: Verdict, sample: Sample) -> Verdict:
@@ -80,7 +80,7 @@ def _drift(sample: Sample) -> str | None:
 
 
 def _error(sample: Sample, pairs: list[Pair]) -> float:
-    """Return the median error over pairs; NaN where they see too little of each other."""
+    """Return the median error over pairs, or NaN if the frames see too little of each other."""
     if len(pairs) < LEAST_PAIRS:
         return math.nan
     fit = dataclasses.replace(sample, pairs=pairs).fit()

@@ -21,14 +21,14 @@ from semstab.pixels.edges import depth_edges, image_edges, label_edges
 from semstab.pixels.warp import LEAST_DENSITY, density
 
 WIDTH = 192
-"""Edges are compared on a grid of about so many columns."""
+"""Approximate number of columns of the grid on which edges are compared."""
 
 SCALES = np.arange(0.84, 1.17, 0.02)
 REACH = 0.08
 """Other registrations that are tried: enlarged about the image's centre, and moved by this share of the width."""
 
 CLEARLY = 1.1
-"""Another registration has to fit so many times as well, in each half of the frames and in most of them."""
+"""Ratio of fits from which another registration counts, in each half of the frames and in most frames."""
 
 LEAST_FIT = 0.1
 """Correlation of edges from which a fit is one."""
@@ -64,10 +64,10 @@ class Offset:
 
 
 def find_offset(pairs: Sequence[Edges]) -> Offset | None:
-    """Return how far edges (H, W) of labels or images are off those of depth (H, W), frame by frame.
+    """Return the offset of edges (H, W) of labels or images from edges of depth (H, W), frame by frame.
 
-    The result is None where they fit, where the best fit lies on the bound of the search, and is no optimum, and where
-    depth is sparse (`semstab.pixels.warp.density`), whose edges are those of its gaps.
+    The result is None if the edges fit, or if the best fit lies on the bound of the search, and is no optimum. It is
+    also None if depth is sparse (`semstab.pixels.warp.density`), as edges of sparse depth are edges of its gaps.
 
     Both halves of the frames have to agree, so that edges that have nothing to do with each other do not count.
     """
@@ -182,7 +182,7 @@ class ImageMatch:
 
 
 def match_images(scene: Scene, views: Mapping[int, View], pairs: Sequence[Pair]) -> ImageMatch | None:
-    """Compare the images of neighbouring frames; None where there are none, or they have too little in common."""
+    """Compare the images of neighbouring frames; return None without images, or with too little in common."""
     near = sorted((abs(a - b), a, b) for a, b in pairs if a < b)
     closest = [(a, b) for _, a, b in near[:MOST_PAIRS]]
     images = {at: _image(scene, views[at]) for at in {at for pair in closest for at in pair}}

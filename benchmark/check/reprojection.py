@@ -48,7 +48,7 @@ class View:
         depth: (H, W) planar, metres, as configured.
         camera: Intrinsics of the whole image, whose (width, height) is `size`.
         T_wc: (4, 4) camera-to-world, OpenCV axes, as configured.
-        labels: (H, W) class ids, or None where the scene has no labels.
+        labels: (H, W) class ids, or None for a scene without labels.
         u, v: (N,) the sample: pixels with valid depth.
     """
 
@@ -118,12 +118,12 @@ def pairs_within(groups: Sequence[Sequence[int]]) -> list[Pair]:
 
 
 def label_source(scene: Scene) -> str | None:
-    """Return the model with which frames are read where none is named; the ground truth where there is no other."""
+    """Return the model with which frames are read by default: the first model, else the ground truth, else None."""
     return scene.models[0] if scene.models else GROUND_TRUTH if scene.ground_truth else None
 
 
 def reader(scene: Scene, model: str | None, *, color: bool = False) -> Callable[[int], Frame]:
-    """Return how a frame is read: with a model's labels, or where there are none, with all pixels class 0."""
+    """Return a function that reads a frame: with a model's labels, or without a model, with all pixels class 0."""
     if model is None:
         return lambda index: scene.geometry(index, color=color)
     return lambda index: scene.frame(index, model, color=color)
@@ -185,7 +185,7 @@ class Sample:
         return Sample(views, self.pairs, self.configured)
 
     def by_pair(self, convention: Convention | None = None) -> Float64:
-        """Return (pairs,) the median error under a convention, as configured; NaN where few points are seen again."""
+        """Return (pairs,) the median error under a convention, by default as configured; NaN with too few points."""
         convention = convention or self.configured
         errors = self.errors(convention, np.array([convention.factor]))
         return np.array([median_of_seen(e)[0] if np.isfinite(e).sum() >= PAIR_POINTS else np.nan for e in errors])
@@ -302,7 +302,7 @@ def motion(pose: Float64, other: Float64) -> tuple[Float64, Float64]:
 
 
 def median_of_seen(errors: npt.NDArray[Any]) -> Float64:
-    """Return median along the last axis of those that are finite (the lower one of two); NaN where there is none."""
+    """Return the median of finite values along the last axis (the lower one of two), or NaN without finite values."""
     ordered = np.sort(errors, axis=-1)
     seen = np.isfinite(ordered).sum(axis=-1)
     middle = np.take_along_axis(ordered, np.maximum(seen - 1, 0)[..., None] // 2, axis=-1)[..., 0]

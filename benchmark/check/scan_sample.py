@@ -112,7 +112,7 @@ class ScanSample:
         return other
 
     def surfaces(self, pair: Pair, every: int = 1) -> Surfaces:
-        """Seek points of the pair's first scan beside surfaces of its second one."""
+        """Compare points of the pair's first scan with surfaces of its second scan."""
         here, there = (self._clouds[position] for position in pair)
         return Surfaces.of(here.sought[::every], there.points, there.tree, *self._motion(pair))
 
@@ -122,7 +122,7 @@ class ScanSample:
         return [self.surfaces(pair, JUDGED).error for pair in self.pairs]
 
     def by_pair(self) -> Float64:
-        """Return (pairs,) the typical error of each pair; NaN where no point is told."""
+        """Return (pairs,) the typical error of each pair, or NaN without points of known error."""
         return np.array([_typical(own) for own in self._errors])
 
     def fit(self) -> Fit:
@@ -240,6 +240,6 @@ def quick_sample_of_scans(scene: Scene, indices: Sequence[int]) -> ScanSample:
 
 
 def _typical(errors: Float64) -> float:
-    """Return the geometric mean of errors (n,): some points lie on no surface of the other scan; NaN where none is."""
+    """Return the geometric mean of finite errors (n,), or NaN; points without a surface in the other scan are NaN."""
     told = errors[np.isfinite(errors)]
     return float(np.exp(np.log(np.maximum(told, EXACT)).mean())) if len(told) else math.nan

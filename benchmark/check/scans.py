@@ -22,7 +22,7 @@ ALIKE = 1.1
 """Readings whose errors differ by no more cannot be told apart."""
 
 APART = 4.0
-"""They lie so many times as far from each other as the points of one scan do, at least: sparse scans err more."""
+"""Least ratio of the distance between two scans to the distance between points of a scan: sparse scans err more."""
 
 FAR = 20_000.0
 """Metres beyond which no scanner sees half of its points."""

@@ -51,11 +51,11 @@ SCHEMA = 2
 
 CLUSTERS, SCAN_CLUSTERS = 4, 2
 POINTS = 8000
-"""The number of points that are reprojected, from neighbouring frames at so many positions of the sequence; and the
-number of positions of a sequence of scans."""
+"""Positions of the sequence at which neighbouring frames are read, positions of a sequence of scans, and the number of
+points that are reprojected."""
 
 QUICK_POINTS = 2400
-"""The quick check takes so many points from one position, and looks as thoroughly as the check before it refuses."""
+"""Points that the quick check takes, from one position; before it refuses, it looks as thoroughly as the check."""
 
 LABELLED_FRAMES = 8
 """Frames in which the labels of every model but the first are counted."""
@@ -77,11 +77,11 @@ class SceneCheck:
     """All that is known about a scene from its sample; `verdict` alone is about geometry.
 
     `notes` name what looks wrong, but may be right: values that mean 'no depth', labels that are not registered.
-    `depth_from` names the source of depth, where no file holds it;
-    `sources` say where its parts come from, where that was found, a line each;
-    `refused` is what a run refuses besides;
-    `unread` names images in a folder of label maps of which none is read;
-    `placed` says where its georeference comes from and how well it fits.
+    `depth_from` names the source of depth, if no file holds depth;
+    `sources` name the sources of its parts that were found, a line each;
+    `refused` names what a run also refuses;
+    `unread` names images in a folder of label maps from which no image is read;
+    `placed` names the source of its georeference and its fit.
     If the geometry is unsound, overlap, noise and voxels are not measured.
     """
 
@@ -280,7 +280,7 @@ def quick_sample(
 ) -> tuple[Verdict, Sample | None, Ordered]:
     """Return the verdict of `quick_check`, the frames that it looked at, and frames in order by label source.
 
-    There is no sample where there are not two frames. Frames in order have the labels of `model`, whose files are read.
+    The sample is None with fewer than two frames. Frames in order have the labels of `model`, whose files are read.
     """
     verdict, sample = Verdict("unclear", "it takes two frames to tell whether depth and poses agree"), None
     ordered: Ordered = {}
@@ -351,10 +351,7 @@ def _with_coverage(
 
 
 def _motion(sample: Sample) -> Motion | None:
-    """Return how far the camera moves and turns from one compared frame to another.
-
-    The result is None where there is no depth to compare it with.
-    """
+    """Return how far the camera moves and turns from one compared frame to another, or None without pairs of frames."""
     if not sample.pairs:
         return None
     shifts, turns = shifts_and_turns(sample)

@@ -39,5 +39,5 @@ def scene_notes(
 
 
 def stored_labels(scene: Scene, model: str, config: Config) -> str | None:
-    """Return the model where its labels are files; None where the run predicts them, or the scene has no files."""
+    """Return the model if its labels are files, or None if the run predicts them or the scene has no files."""
     return None if scene.folder is None or scene.of_scans or config.dataset.name == PREDICTED else model

@@ -1,4 +1,4 @@
-"""Points of one scan beside the surfaces of another: whether two scans lie on each other.
+"""Points of one scan against the surfaces of another: whether two scans lie on each other.
 
 The nearest point would not tell: the rings of a scanner lie metres apart on the ground and move with the sensor, so
 that the scans of a straight drive meet best, point by point, where their poses stand still.
@@ -23,7 +23,7 @@ WIDE = 0.02
 """... and the middle one at least this part of the largest: the points of one ring make none."""
 
 REACH = 2.0
-"""A point is near to others up to so many times their largest extent, a standard deviation."""
+"""A point is near to others up to this multiple of their largest extent, a standard deviation."""
 
 LEAST_RANGE = 0.1
 """Metres; a point may be at the sensor itself."""
@@ -83,9 +83,9 @@ class Surfaces:
 
     @property
     def error(self) -> Float64:
-        """(n,) the distance as a share of the range: to the surface, to the nearest point where it is not near.
+        """(n,) the distance to the surface as a share of the range; for a point that is not near, to the nearest point.
 
-        NaN where it is near to points that make no surface.
+        NaN for a point near to points that make no surface.
         """
         to_surface = np.where(self.flat, self.distance, np.nan)
         away = np.where(self.near, to_surface, self.nearest)

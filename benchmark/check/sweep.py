@@ -17,12 +17,12 @@ from semstab.core.types import Float64
 from semstab.datasets.geometry.sweeps import SWEEPS, Sweep, carried, motion_in_sweep, share_of_sweep
 
 LEAST = 0.001
-"""A sweep is right where it takes away a millimetre, too."""
+"""A sweep is also right if it reduces the error by a millimetre."""
 
 
 @dataclass(frozen=True, eq=False)
 class Swept:
-    """Points of scans beside surfaces of others, and the motions (6,) of both sensors in a sweep, by pair."""
+    """Points of scans against surfaces of other scans, and the motions (6,) of both sensors in a sweep, by pair."""
 
     pairs: tuple[tuple[Surfaces, Float64, Float64], ...]
 

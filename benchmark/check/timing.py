@@ -31,14 +31,14 @@ MOVES: tuple[Callable[[float], Iterable[float]], ...] = (
 """Shifts that are tried, frames: whole ones, then tenths around the best."""
 
 HALF, STRIKING = 0.5, 0.25
-"""A shift that not all pairs of frames show is remarked where the error falls to the first part, and a fault where it
-falls to the second one."""
+"""A shift that not all pairs of frames show is a remark if the error falls to the share HALF, and a fault if the error
+falls to the share STRIKING."""
 
 DIFFER, LEAST_MOVING = 0.3, 8
 """Change of an error, as a logarithm, from which on a pair tells two shifts apart, and the least such pairs."""
 
 WHOLE = 0.75
-"""A shift of so many frames is a fault of the files, which makes a scene unsound; a smaller one is remarked."""
+"""Shift in frames from which it is a fault of the files, and the scene is unsound; a smaller shift is a remark."""
 
 
 @dataclass(frozen=True)
@@ -46,11 +46,11 @@ class Lateness:
     """The shift under which depth reprojects best.
 
     Attributes:
-        frames: Frames by which the poses are late; negative where they are early.
-        seconds: The same in seconds, None where the frames have no time stamps that poses are looked up by.
-        error: Median relative depth error under it.
-        present: The same without it.
-        sure: Whether enough pairs of frames show it; else it is remarked.
+        frames: Frames by which the poses are late; negative for early poses.
+        seconds: Seconds by which the poses are late, or None if poses are not looked up by time stamps.
+        error: Median relative depth error with the shift.
+        present: Median relative depth error without the shift.
+        sure: Whether enough pairs of frames show the shift; else it is a remark.
     """
 
     frames: float
@@ -84,7 +84,7 @@ class Lateness:
         return f"set {how.change(name, value)}"
 
     def setting(self, how: Reading) -> tuple[str, str] | None:
-        """Return name and value of the setting that mends it; None where there is none."""
+        """Return name and value of the setting that mends it, or None without such a setting."""
         if self.seconds is not None:
             return "time_offset", f"{how.said.get('time_offset', 0.0) + self.seconds:.4g}"
         if self.frames == round(self.frames) and "pose_shift" in how.names:
@@ -103,7 +103,7 @@ def with_lateness(verdict: Verdict, scene: Scene, sample: Sample, how: Reading) 
 
 
 def find_lateness(scene: Scene, sample: Sample, *, stamped: bool) -> Lateness | None:
-    """Return the offset between poses and frames that explains the error of depth; None where none does.
+    """Return the offset between poses and frames that explains the error of depth, or None without one.
 
     Between the poses of two frames the position is linear and the rotation spherically linear.
 
@@ -132,7 +132,7 @@ def _period(scene: Scene) -> float:
 
 
 def _moved(scene: Scene, sample: Sample) -> tuple[list[Pair], Callable[[float], Float64]]:
-    """Return the pairs of frames that have poses within reach, and their errors with the poses so many frames later."""
+    """Return the pairs of frames with poses within reach, and a function from a delay in frames to their errors."""
     known, views = dict(_poses_around(scene, sample)), sample.views
     reach = {at for at, v in views.items() if all(v.index + k in known for k in range(-REACH, REACH + 1))}
     pairs = [pair for pair in sample.pairs if {*pair} <= reach]

@@ -1,7 +1,7 @@
 """Hypotheses on what is wrong with data, tried and ranked: what each changes, and when it is right.
 
-Data say how well their frames agree. They are changed as each hypothesis supposes and asked again, over the same pairs
-of frames: cameras and scans, poses, depth, times, intrinsics and label maps alike.
+The agreement of the frames is measured for the data as they are, and after the change that each hypothesis supposes,
+over the same pairs of frames. This holds for cameras and scans, poses, depth, times, intrinsics and label maps.
 """
 
 from __future__ import annotations
@@ -39,7 +39,7 @@ class Judged(Protocol):
         """Return how well frames agree, over all pairs."""
 
     def by_pair(self) -> Float64:
-        """Return (pairs,) the error of each pair; NaN where it tells nothing."""
+        """Return (pairs,) the error of each pair, or NaN for a pair without information."""
 
 
 T = TypeVar("T")
@@ -55,7 +55,7 @@ class Hypothesis(Generic[T]):
         name: What it is, in words.
         change: From data as they are read to data as they would be without it.
         mend: What to do about it, in words.
-        options: The lines that mend it, by an option's name and value now; where there is one, it is said instead.
+        options: The lines that mend it, by an option's present name and value; such a line replaces `mend`.
         applies: Whether data may have it; of changes that hardly move anything one always looks better.
     """
 
@@ -152,11 +152,11 @@ def clearly_falls(errors: Float64, present: Float64) -> bool:
 
 
 def mean_log(errors: Float64) -> float:
-    """Return the mean logarithm of errors (pairs,) that are known; inf where none is."""
+    """Return the mean logarithm of the known errors (pairs,), or inf without known errors."""
     told = errors[np.isfinite(errors)]
     return float(np.log(np.maximum(told, TINY)).mean()) if len(told) else math.inf
 
 
 def middle(errors: Float64) -> float:
-    """Return the median of errors (pairs,) that are known; inf where none is."""
+    """Return the median of the known errors (pairs,), or inf without known errors."""
     return float(np.nanmedian(errors)) if np.isfinite(errors).any() else math.inf

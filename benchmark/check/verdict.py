@@ -18,7 +18,7 @@ LEAST_OF_OTHER = 0.2
 
 BETTER = 0.75
 MIN_GAIN = 0.001
-"""An error is clearly lower where it is at most this part of the other one, and lower by this (0.1 points)."""
+"""An error is clearly lower if it is at most BETTER times the other error, and lower by MIN_GAIN (0.1 points)."""
 
 GOOD = 0.05
 """A convention with a larger error is not proposed, and as configured it is not called sound."""
@@ -34,9 +34,9 @@ class Fit:
     """The error of points that are carried into other frames under a convention.
 
     Attributes:
-        error: Relative error, typical of the points that are seen again; NaN where none is.
+        error: Typical relative error of the points that are seen again; NaN without such points.
         share: Share of the sampled points that are seen again, 0 to 1.
-        points: Their number.
+        points: Number of points that are seen again.
     """
 
     convention: Convention
@@ -64,11 +64,11 @@ class Verdict:
         state: Sound; imprecise, where depth agrees far worse than its noise explains; unsound; or unclear, where the
             frames do not tell.
         text: The reason, in one line.
-        mend: Lines of configuration that would mend it, where they are known.
-        error, share: Those of the configured convention, see `Fit`.
-        frames, pairs: Numbers of those that were looked at.
-        undetermined: Parts of it that these frames cannot tell, because an alternative fits as well, and the reason
-            where it is known.
+        mend: Lines of configuration that would mend it, if known.
+        error, share: Error and share of the configured convention, see `Fit`.
+        frames, pairs: Numbers of frames and pairs that were looked at.
+        undetermined: Parts of the convention that these frames cannot tell, because an alternative fits as well, and
+            the reason, if known.
         remarks: Lines on what looks wrong but leaves the state.
         fits: The configured convention and the alternatives of interest, by name.
     """

@@ -44,7 +44,7 @@ def with_voxel_size(config: Config, scenes: Mapping[str, Scene]) -> tuple[Config
 
 
 def advise(sample: Sample | None, config: Config) -> VoxelAdvice | None:
-    """Return how the configured voxel size compares with the suggested one; None where the data do not tell."""
+    """Return how the configured voxel size compares with the suggested size, or None if the data do not tell."""
     if sample is None or not sample.pairs or _is_made(config):
         return None
     coverage = Coverage(sample)
@@ -67,7 +67,7 @@ def _is_made(config: Config) -> bool:
 
 
 def _coverage(config: Config, scene: Scene) -> Covers | None:
-    """Return what a scene's frames share; None where they cannot be read."""
+    """Return the overlap of a scene's frames, or None if they cannot be read."""
     models = models_of(scene, config)
     with contextlib.suppress(DataError):
         indices = frame_indices(scene, config, models)

@@ -118,7 +118,7 @@ def _usage(error: Any) -> str:
 
 
 class Group(TyperGroup):
-    """Runs `run` where no command is named, shows its options in the help, and reports every error in one line."""
+    """Group that runs `run` by default, shows the options of `run` in the help, and reports every error in one line."""
 
     def get_params(self, ctx: Any) -> list[Any]:
         """Return the options that stand before the command, and --help."""

@@ -139,7 +139,7 @@ def convert(
     settings: opt.DatasetSettings = None,
     options: opt.DatasetOptions = None,
     depth_error: Annotated[float, typer.Option(
-        min=0, metavar="METRES", help="Store depth in 16 bits where no pixel is off by more.")] = 0.0,
+        min=0, metavar="METRES", help="Store depth in 16 bits if every pixel's error is at most this.")] = 0.0,
     quiet: opt.Quiet = False,
 ) -> None:  # fmt: skip
     """Write any dataset as posed folders. A second start resumes."""

@@ -97,7 +97,7 @@ def executor_of(jobs: int, scheduler: str | None) -> Executor:
 
 @contextlib.contextmanager
 def naming(out: Path) -> Iterator[None]:
-    """Name the folder in which the same command resumes, where it is interrupted."""
+    """Name the folder in which the same command resumes, if it is interrupted."""
     try:
         yield
     except KeyboardInterrupt as error:

@@ -65,9 +65,9 @@ SETTINGS, LABELS, CHECKS, MACHINE = "Settings", "Labels", "Checks", "Machine"
 
 
 def own_defaults() -> Path | None:
-    """Return the file of settings that a user wants everywhere; None where there is none.
+    """Return the file of settings that a user wants everywhere, or None without such a file.
 
-    It is SEMSTAB_CONFIG, where that is set, else semstab/config.yaml in the user's folder of configurations.
+    It is SEMSTAB_CONFIG, if set, else semstab/config.yaml in the user's folder of configurations.
     """
     named = os.environ.get("SEMSTAB_CONFIG")
     if named is not None:

@@ -178,8 +178,8 @@ def conform(
 # The commands export and relabel: files for other programs.
 
 Run = Annotated[Path, typer.Argument(metavar="RUN", help="Folder of a finished run, or FOLDER:MODEL.")]
-Scene = Annotated[str | None, typer.Option("--scene", "-s", help="Scene; needed where the run has several.")]
-Model = Annotated[str | None, typer.Option("--model", "-m", help="Label source; needed where there are several.")]
+Scene = Annotated[str | None, typer.Option("--scene", "-s", help="Scene; needed if the run has several.")]
+Model = Annotated[str | None, typer.Option("--model", "-m", help="Label source; needed if the run has several.")]
 Thresholds = Annotated[Path | None, typer.Option(
     "--thresholds", metavar="FILE", help="Only labels above the thresholds of `semstab-bench calibrate`.")]  # fmt: skip
 Backend = Annotated[
@@ -198,7 +198,7 @@ def export(
     backend: Backend = None,
     measure: Annotated[list[str] | None, typer.Option(
         help="Column to write: vss, sbd, entropy, margin, op, ...; repeatable.")] = None,
-    min_op: Annotated[int, typer.Option(min=1, help="Only voxels that at least so many frames saw.")] = 1,
+    min_op: Annotated[int, typer.Option(min=1, help="Only voxels that at least this many frames saw.")] = 1,
     classes: Annotated[list[str] | None, typer.Option("--class", help="Only voxels of this class; repeatable.")] = None,
     thresholds: Thresholds = None,
     cell: Annotated[int, typer.Option(min=1, help="Edge of a cell of .tif, in voxels.")] = 1,

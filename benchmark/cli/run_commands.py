@@ -68,8 +68,8 @@ def _labelled(prediction: opt.Prediction, config: Path | None, content: dict[str
         return predicted_config(predictors, config, content)
     if prediction.classes is not None:
         raise ConfigError(
-            "--classes names the classes of a model that --predict chooses; those of label maps stand in scene.yaml"
-            " (classes: [name, ...]), or in --option 'classes=[name, ...]'"
+            "--classes names the classes of a model that --predict chooses; name the classes of label maps in"
+            " scene.yaml (classes: [name, ...]), or in --option 'classes=[name, ...]'"
         )
     return filtered_config(filters, config, content) if filters else load_config(config, content)
 

@@ -58,7 +58,7 @@ def show(
     for line in failure_lines(result):
         say(f"failed: {line}")
     if not result.select():
-        raise DataError(f"{run}: no unit finished; {run / 'failures.log'} has more where it exists; run it again")
+        raise DataError(f"{run}: no unit finished; {run / 'failures.log'} has more, if it exists; run it again")
     by_name = {table.name: table for table in tables(result)}
     if any(name.startswith(COMPARISON) for name in what or ()):
         by_name |= {table.name: table for table in own_models(result)}
@@ -105,7 +105,7 @@ def _show_several(
 
 
 NO_WINDOW = "winit"
-"""What the viewer names in its words where no window can be opened: the library that opens one."""
+"""Library that opens windows; the viewer's message names it if it cannot open a window."""
 
 
 def view(
@@ -137,7 +137,7 @@ def view(
         print_lines([str(screenshot)])
         return
     display = sys.platform != "linux" or bool(os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY"))
-    with tempfile.TemporaryFile() as said:  # several lines where there is no display, or none that answers
+    with tempfile.TemporaryFile() as said:  # several lines without a display that answers
         ended = subprocess.run([*viewer_command(), str(recording)], check=False, stderr=said).returncode
         said.seek(0)
         words = said.read().decode(errors="replace")
@@ -176,7 +176,7 @@ def list_(
 ) -> None:
     """List backends, datasets, models, filters, taxonomies, studies and benchmarks, with 'ready' or what is missing.
 
-    Below stand the settings of your own: ~/.config/semstab/config.yaml.
+    Your own settings, in ~/.config/semstab/config.yaml, follow.
     """
     import yaml
     from rich.markup import escape
@@ -214,8 +214,8 @@ def list_(
     console = Console()
     console.print(table)
     if (own := own_defaults()) is None:
-        console.print("no settings of your own: ~/.config/semstab/config.yaml, or SEMSTAB_CONFIG", markup=False)
+        console.print("you have no settings in ~/.config/semstab/config.yaml, or SEMSTAB_CONFIG", markup=False)
     else:
-        console.print(f"settings of your own, where no --config is given: {own}", markup=False)
+        console.print(f"your settings, without --config: {own}", markup=False)
         content = yaml.safe_dump(read_yaml(own), sort_keys=False, allow_unicode=True)
         print_lines(f"  {line}" for line in content.splitlines())

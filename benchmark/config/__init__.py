@@ -60,12 +60,12 @@ class DatasetConfig(Settings):
 
 
 class BackendConfig(Part):
-    """The settings that name a fusion backend: its options, where it fuses, whether it must agree with the others."""
+    """The settings that name a fusion backend: its class, its options, and whether it must agree with the others."""
 
-    name: str = Field(description="a name from `semstab-bench list`, or that of a class of one's own")
-    code: str | None = Field(None, description="that class, as FILE.py:NAME or package.module:NAME")
-    options: dict[str, Any] = Field(default_factory=dict, description="options of that backend")
-    check: bool | None = Field(None, description="whether it must agree; by default where it associates by pixel")
+    name: str = Field(description="a name from `semstab-bench list`, or the name of a custom class")
+    code: str | None = Field(None, description="a custom class, as FILE.py:NAME or package.module:NAME")
+    options: dict[str, Any] = Field(default_factory=dict, description="options of the backend")
+    check: bool | None = Field(None, description="whether it must agree; by default if it associates by pixel")
 
     @classmethod
     def of(cls, text: str) -> Self:
@@ -91,7 +91,7 @@ class BackendConfig(Part):
 
     @property
     def ruled(self) -> dict[str, Any]:
-        """The options that say the rule; none where it fuses by its own."""
+        """Options that name the rule of fusion; empty for the backend's own rule."""
         named = self.name.partition(BY_RULE)[2]
         own = {"rule": named} if named else {}
         return own | {key: self.options[key] for key in ("rule", "rule_options") if key in self.options}
@@ -110,12 +110,12 @@ class BackendConfig(Part):
 class Perturbation(Settings):
     """Noise on depth and poses, to see what geometry alone does to the numbers; see `semstab.pixels.preparation`.
 
-    Standard deviations, of each axis where there are three. 0 adds nothing.
+    Standard deviations; positions and rotations have them for each axis. 0 adds nothing.
     """
 
     depth_noise: Deviation = Field(0.0, description="of depth, relative to it, of each pixel by itself")
-    translation_noise: Deviation = Field(0.0, description="of the camera's position, metres, anew in every frame")
-    rotation_noise: Deviation = Field(0.0, description="of the camera's rotation, degrees, anew in every frame")
+    translation_noise: Deviation = Field(0.0, description="of the camera's position, metres, of each frame by itself")
+    rotation_noise: Deviation = Field(0.0, description="of the camera's rotation, degrees, of each frame by itself")
     translation_drift: Deviation = Field(0.0, description="of a step of the position's random walk, metres a frame")
     rotation_drift: Deviation = Field(0.0, description="of a step of the rotation's random walk, degrees a frame")
     seed: int = Field(0, ge=0, description="of a unit; a configuration leaves it out, its own `seed` counts")
@@ -133,7 +133,7 @@ class Exclusion(Settings):
     predicted_classes: tuple[str, ...] = Field(
         (), description="pixels predicted as one of these moving things, by a name of the model's or of the taxonomy"
     )
-    masks: bool = Field(True, description="pixels under the masks of the dataset, where it has some")
+    masks: bool = Field(True, description="pixels under the masks of the dataset, if it has masks")
 
 
 class VerdictSettings(Settings):
@@ -154,7 +154,7 @@ class NamedBenchmark(Settings):
 
     id: str = Field(description="NAME@VERSION")
     digest: str = Field(description="hash of the definition")
-    file: str | None = Field(None, description="the definition, where it does not ship")
+    file: str | None = Field(None, description="the definition, if it does not ship with semstab")
 
     def __str__(self) -> str:
         return f"{self.id} ({self.digest})"
@@ -172,8 +172,8 @@ class Config(Settings):
     name: str = Field("run", min_length=1, description="the title of the report; a study's is its file's by default")
     description: str = Field("", description="one line")
     dataset: DatasetConfig = Field(DatasetConfig(), description="name and options of the dataset")
-    scenes: list[str] | None = Field(None, description="scenes of the dataset; all of them where not given")
-    models: list[str] | None = Field(None, description="label sources; all but the ground truth where not given")
+    scenes: list[str] | None = Field(None, description="scenes of the dataset; all by default")
+    models: list[str] | None = Field(None, description="label sources; by default all but the ground truth")
     region_maps: list[str] = Field([], description="label sources whose ids mean nothing across frames (raw SAM)")
     backends: list[BackendConfig] = Field(
         [BackendConfig(name="numba")], min_length=1, description="the first fuses every unit, others the base units"
@@ -183,16 +183,18 @@ class Config(Settings):
         description="sample: the numpy reference on some voxels; a backend that fuses all base units; null",
     )
     tolerance: float = Field(1e-9, ge=0, description="largest difference at which two backends agree")
-    taxonomy: str | None = Field(None, description="label space to fuse in; the dataset's own where not given")
+    taxonomy: str | None = Field(None, description="label space to fuse in; the dataset's own by default")
     distances: str | None = Field(
-        None, description="distances between classes: .csv or .npy; those of the taxonomy's groups where not given"
+        None, description="distances between classes: .csv or .npy; by default from the taxonomy's groups"
     )
     shared_taxonomy: str | None = Field(None, description="label space in which models are compared; null: none")
     voxel_size: float = Field(
-        0.2, ge=1e-9, le=1e9, description="edge, metres; where not given, the suggestion of `check` for data of files"
+        0.2, ge=1e-9, le=1e9, description="edge, metres; by default the suggestion of `check` for data of files"
     )
     pixel_stride: int = Field(1, ge=1, description="use every n-th pixel of each axis")
-    top_k: int | None = Field(None, ge=1, description="fuse the so many largest scores of each pixel; null: all")
+    top_k: int | None = Field(
+        None, ge=1, description="number of the largest scores of each pixel that are fused; null: all"
+    )
     frames: FrameSelection = Field(FrameSelection(), description="frames that are fused; all by default")
     scene_frames: dict[str, FrameSelection] = Field({}, description="frames of single scenes, instead of `frames`")
     exclude: Exclusion = Field(Exclusion(), description="classes and pixels that are left out")
@@ -220,7 +222,7 @@ class Config(Settings):
     # These change no number, so they are not stored with a run.
     threads: int | None = Field(None, ge=1, exclude=True, description="threads that decode frames ahead")
     memory_gb: float | None = Field(
-        None, gt=0, le=1e9, exclude=True, description="memory that maps may take, GB; what is free where not given"
+        None, gt=0, le=1e9, exclude=True, description="memory that maps may take, GB; by default all free memory"
     )
     tile_size: int | Literal["off"] | None = Field(
         None, exclude=True, description="edge of tiles, voxels, a power of 2; by default only where a map needs them"

@@ -109,8 +109,8 @@ Deviation = Annotated[float, Field(ge=0, le=1e9)]
 class Part(Settings):
     """One of the things that are varied, on all scenes and models of the configuration or on some."""
 
-    scenes: list[str] | None = Field(None, min_length=1, description="some of the scenes; all where not given")
-    models: list[str] | None = Field(None, min_length=1, description="some of the models; all where not given")
+    scenes: list[str] | None = Field(None, min_length=1, description="some of the scenes; all by default")
+    models: list[str] | None = Field(None, min_length=1, description="some of the models; all by default")
 
 
 class Values(Part, Generic[V]):
@@ -152,7 +152,7 @@ class Sweeps(Settings):
     rotation_noise: Noise | None = None
     translation_drift: Noise | None = None
     rotation_drift: Noise | None = None
-    frame_count: Counts | None = Field(None, description="so many frames, evenly over the extent of `frames`")
+    frame_count: Counts | None = Field(None, description="number of frames, evenly over the extent of `frames`")
     pixel_stride: Counts | None = Field(None, description="use every n-th pixel of each axis")
 
     def given(self) -> Iterator[tuple[str, Values[Any]]]:

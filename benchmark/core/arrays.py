@@ -104,7 +104,7 @@ class Rows:
 
 
 class RecentArrays:
-    """The arrays that were made last, by number, of at most so many bytes; threads may share it."""
+    """The latest arrays by number, with at most `most_bytes` bytes; threads may share it."""
 
     def __init__(self, most_bytes: int) -> None:
         self._most, self._bytes = most_bytes, 0
@@ -112,7 +112,7 @@ class RecentArrays:
         self._lock = threading.Lock()
 
     def get(self, number: int, make: Callable[[], A]) -> A:
-        """Return the array of that number, read-only; make it where it is not at hand."""
+        """Return the array of a number, read-only; make the array if it is not stored."""
         with self._lock:
             known = self._arrays.pop(number, None)
             if known is not None:

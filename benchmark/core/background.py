@@ -1,4 +1,4 @@
-"""Jobs beside the caller, in a thread of their own."""
+"""Jobs in parallel with the caller, in a thread of their own."""
 
 from __future__ import annotations
 

@@ -150,7 +150,7 @@ def require_named(name: str, field: str = "") -> None:
     """Require that code may run here.
 
     Raises:
-        ConfigError: If `may_run` says no; the message names the file, the field where it is given, and the code.
+        ConfigError: If `may_run` returns False; the message names the file, the field in the file, and the code.
     """
     bound = _allowed_only.get()
     if bound is None or may_run(name):
@@ -162,9 +162,9 @@ def require_named(name: str, field: str = "") -> None:
 
 
 def guarded(text: str, do: Callable[[], T]) -> T:
-    """Run a user's code, and turn an error in it into one line with the position where it was raised.
+    """Run a user's code, and turn an error in it into one line with the position of the error.
 
-    What a file imports is looked for beside it before it is looked for beside other files.
+    Modules that a file imports are searched next to this file first, then next to other files.
     """
     source = text.rpartition(":")[0]
     if source.endswith(".py"):
@@ -188,7 +188,7 @@ def guarded(text: str, do: Callable[[], T]) -> T:
 
 
 def _users_own(text: str, stack: Sequence[traceback.FrameSummary]) -> traceback.FrameSummary:
-    """Return the innermost line that lies in the folder of the user's code, where there is one: torch's are not his."""
+    """Return the innermost line in the folder of the user's code, if any: lines of torch are not the user's."""
     source = text.rpartition(":")[0]
     file = source if source.endswith(".py") else getattr(sys.modules.get(source), "__file__", None)
     folder = None if file is None else Path(file).expanduser().resolve().parent

@@ -28,8 +28,8 @@ if sys.platform == "linux":  # the TBB that Open3D loads is too old for numba, w
 def compiled(**options: Any) -> Callable[[Any], Any]:
     """Return a decorator that compiles a function at its first call, and stores the code for later processes.
 
-    It is stored in __pycache__ next to the source, below HOME, or below the temporary folder; else each process
-    compiles anew.
+    The code is stored in __pycache__ next to the source, below HOME, or below the temporary folder. Without such a
+    folder, each process compiles again.
     """
 
     def decorate(function: Any) -> Any:
@@ -58,14 +58,14 @@ class _Cache(FunctionCache):
         self._cache_file = IndexDataCacheFile(self.cache_path, self._impl.filename_base, stamp)  # type: ignore[no-untyped-call]
 
     def load_overload(self, signature: Any, context: Any) -> Any:
-        """Return compiled code; None where there is none, or where it is damaged: unpickling raises anything."""
+        """Return compiled code, or None if it is missing or damaged: unpickling may raise any exception."""
         try:
             return super().load_overload(signature, context)  # type: ignore[no-untyped-call]
         except Exception:  # noqa: BLE001
             return None
 
     def save_overload(self, signature: Any, data: Any) -> None:
-        """Store compiled code; anew if the index is damaged, not at all if the disk is full."""
+        """Store compiled code; replace a damaged index, and store nothing on a full disk."""
         try:
             super().save_overload(signature, data)  # type: ignore[no-untyped-call]
         except Exception:  # noqa: BLE001
@@ -96,7 +96,7 @@ parallel = compiled(parallel=True)
 
 
 CHUNKS = 64
-"""A loop over voxels is cut into so many chunks, whatever the number of threads."""
+"""Number of chunks of a loop over voxels, for any number of threads."""
 
 
 def in_chunks(loop: Any, *arguments: Any) -> None:
@@ -121,7 +121,7 @@ def is_cached(function: Any) -> bool:
 
 
 def _own_temporary_folder() -> str | None:
-    """Return a folder that nobody else can write to, as code is loaded from it; None where there can be none."""
+    """Return a folder that nobody else can write to, as code is loaded from it, or None without such a folder."""
     folder = Path(tempfile.gettempdir()) / f"semstab-compiled-{os.getuid()}"
     with contextlib.suppress(OSError):
         folder.mkdir(mode=0o700, exist_ok=True)

@@ -234,7 +234,7 @@ def require_seal(path: str | Path, content: Any) -> dict[str, Any]:
 
 
 def read_sealed(path: str | Path) -> dict[str, Any]:
-    """Read what `write_sealed` wrote; raise DataError with the file's name where it cannot be read or has changed."""
+    """Read what `write_sealed` wrote; raise DataError with the file's name if it cannot be read or has changed."""
     return require_seal(path, read_json(path))
 
 
@@ -256,7 +256,7 @@ def write_stack(
 ) -> None:
     """Write an .npz file of one array, of `count` layers of one shape that come one after the other.
 
-    Numbers are stored as `dtype`; None: as those of the first layer.
+    Numbers are stored as `dtype`, or with None, in the type of the first layer.
     """
     method = zipfile.ZIP_DEFLATED if compressed else zipfile.ZIP_STORED
     zipped = zipfile.ZipFile(path, "w", method, compresslevel=1)
@@ -303,7 +303,7 @@ def parse_json(text: str | bytes) -> Any:
 
 
 def read_json(path: str | Path) -> Any:
-    """Read a JSON file; raise DataError with the file's name where it cannot be read."""
+    """Read a JSON file; raise DataError with the file's name if it cannot be read."""
     try:
         with open_file(path) as file:
             return parse_json(file.read().decode("utf-8"))
@@ -357,7 +357,7 @@ YAML_LOADER = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
 def parse_yaml(text: str, where: str) -> Any:
     """Return the content of a YAML text, without tags that make objects.
 
-    Raises ConfigError in one line that starts with `where` where it is not valid.
+    Raises ConfigError in one line that starts with `where` if the text is not valid.
     """
     try:
         return YAML_LOADER(text).get_single_data()
@@ -389,7 +389,7 @@ def read_arrays(path: Path) -> Arrays | None:
     except Exception:  # noqa: BLE001  numpy raises a dozen kinds of them on a damaged .npz file
         return None
     digest = arrays.pop(DIGEST, None)
-    whole = all(isinstance(array, np.ndarray) for array in arrays.values())  # else bytes, where it is none
+    whole = all(isinstance(array, np.ndarray) for array in arrays.values())  # a file that is not an array gives bytes
     return arrays if whole and digest is not None and np.array_equal(digest, _digest(arrays)) else None
 
 

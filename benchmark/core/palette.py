@@ -30,7 +30,7 @@ def hexadecimal(color: tuple[int, int, int]) -> str:
 
 
 def dash(k: int) -> str:
-    """Return the pattern of the k-th model's line, '' where it is solid: another one after every six colours."""
+    """Return the pattern of the k-th model's line, '' for a solid line; the pattern changes after every six colours."""
     return DASHES[2 * k // len(MODEL_COLORS) % len(DASHES)]
 
 

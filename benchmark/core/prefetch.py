@@ -14,7 +14,7 @@ from typing import Generic, TypeVar
 
 LOOK_AHEAD_BYTES = 1 << 30
 MOST_THREADS = 8
-"""The threads where no number is given: more than this only hold more frames in memory."""
+"""Default number of threads: more threads only hold more frames in memory."""
 
 K = TypeVar("K")
 T = TypeVar("T")

@@ -96,7 +96,7 @@ def group_bytes(proc: Path, cgroups: Path) -> int | None:
         root, (limit, used, cache) = (cgroups / "memory", V1_FILES) if controllers else (cgroups, V2_FILES)
         own = root / path.lstrip("/")  # in a container, the path may be that of the host: then only the root is there
         for folder in (each for each in (own, *own.parents) if each.is_relative_to(root)):
-            with contextlib.suppress(OSError, ValueError):  # no limit, where it is 'max'
+            with contextlib.suppress(OSError, ValueError):  # 'max' is no limit
                 most, taken = (int((folder / name).read_text()) for name in (limit, used))
                 stat = dict(entry.split() for entry in (folder / "memory.stat").read_text().splitlines())
                 left.append(most - taken + sum(int(stat.get(name, 0)) for name in cache))

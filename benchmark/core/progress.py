@@ -1,4 +1,4 @@
-"""What a progress bar in the terminal looks like."""
+"""The look of a progress bar in the terminal."""
 
 from __future__ import annotations
 

@@ -93,8 +93,8 @@ class Registry:
 
         Raises:
             ConfigError: If the name is not known, or is that of a user's code and of a built-in class.
-            MissingDependencyError: If its packages are not installed, or fail when they are imported, as those of
-                versions that do not fit each other do.
+            MissingDependencyError: If its packages are not installed, or fail when they are imported, as packages of
+                incompatible versions do.
         """
         if (text := _code.get((self.kind, name))) is not None:
             if name in self.builtin:

@@ -10,7 +10,7 @@ from semstab.core.files import file_digest, read_sealed, write_sealed
 from semstab.errors import DataError
 
 DIGESTS = "digests.json"
-"""The file in the folder of a run, beside summary.json: the digest of each table, and of config.yaml, by path."""
+"""The file in the folder of a run, next to summary.json: the digest of each table, and of config.yaml, by path."""
 
 SCHEMA = 1
 

@@ -24,7 +24,7 @@ def from_above(index: Int32, vss: Float64, up: npt.ArrayLike | None = None) -> U
     Args:
         index: (n, 3) voxels.
         vss: (n,) VSS of each.
-        up: Direction out of the picture; the map's shortest side where not given.
+        up: Direction out of the picture; the map's shortest side by default.
     """
     import cv2
 

@@ -20,7 +20,7 @@ SYMMETRIC = 1e-6
 
 
 def distances_of(space: LabelSpace, source: str | Path | None = None) -> Float64 | None:
-    """Return distances (K, K) between the classes of a taxonomy, from 0 on; None if all classes are alike.
+    """Return distances (K, K) between the classes of a taxonomy, from 0 on; None if all classes have the same distance.
 
     Args:
         space: The taxonomy, in whose order the rows are.

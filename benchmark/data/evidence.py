@@ -14,7 +14,7 @@ from semstab.core.types import Float64, Int64, UInt16
 from semstab.data.information import Concentration
 
 CHUNK_VALUES = 1 << 18
-"""Rows are made dense so many values at a time: an array that fits into a core's cache costs no new memory."""
+"""Number of values of the rows that are made dense at a time: they fit into a core's cache, and cost no new memory."""
 
 PAIRWISE = 8
 """The number of classes from which on NumPy's sum depends on their layout; below, class by class is the faster one."""
@@ -71,7 +71,7 @@ class Evidence(NDArrayOperatorsMixin):
 
     @classmethod
     def read(cls, rows: int, K: int, dense: Callable[[slice], Float64]) -> Evidence:
-        """Read so many rows of an array or `Evidence`, dense (r, K)."""
+        """Read `rows` rows of an array or `Evidence`, dense (r, K)."""
         counts, labels, weights = [np.zeros(1, np.int64)], [], []
         for chunk in row_chunks(rows, K):
             part = dense(chunk)
@@ -237,5 +237,5 @@ class Evidence(NDArrayOperatorsMixin):
 
 
 def _starts(counts: Int64) -> Int64:
-    """Return where each of the rows with so many entries begins, and the number of all entries: (n + 1,)."""
+    """Return the first entry of each row, from the numbers of entries `counts` (n,), and the end: (n + 1,)."""
     return np.concatenate([[0], np.cumsum(counts)])

@@ -100,7 +100,7 @@ SOME_POINTS = 1 << 13
 
 @dataclass(frozen=True, eq=False)
 class Frame:
-    """One observation of the scene, validated where it is made; its arrays are read-only views.
+    """One observation of the scene, validated when it is made; its arrays are read-only views.
 
     It is an image with depth and intrinsics, or a scan of points. A scan of N points is one row: H = 1, W = N, and its
     arrays may be given without that row, as (N, 3), (N,) and (N, K).
@@ -108,7 +108,7 @@ class Frame:
     Attributes:
         index: Number in the sequence.
         depth: (H, W) float32, metres along the optical axis (planar z); 0, negative, NaN and inf are invalid. Of a
-            scan it is each point's distance from the sensor, computed where it is not given.
+            scan it is each point's distance from the sensor, computed by default.
         intrinsics: Intrinsics of the depth image; or its 3x3 camera matrix. A scan has none.
         T_wc: (4, 4) or (3, 4) float64 camera-to-world (sensor-to-world), metres; camera axes x right, y down,
             z forward (OpenCV), a sensor's those of its points.
@@ -182,7 +182,7 @@ class Frame:
 
     @property
     def is_scan(self) -> bool:
-        """Whether it is a scan of points, and not an image."""
+        """True for a scan of points, False for an image."""
         return self.points is not None
 
     @cached_property
@@ -205,7 +205,7 @@ class Frame:
             return math.nan
         x, y, z = self.points.reshape(-1, 3)[there[:: max(1, len(there) // SOME_POINTS)]].T.astype(np.float64)
         degree = np.degrees([np.arctan2(y, x), np.arcsin(np.clip(z / np.sqrt(x * x + y * y + z * z), -1, 1))])
-        cells = np.unique(np.floor(degree / 2).astype(np.int64), axis=1)  # those of 2 degrees that have points
+        cells = np.unique(np.floor(degree / 2).astype(np.int64), axis=1)  # cells of 2 degrees that have points
         solid = np.cos(np.radians(2 * cells[1] + 1)).sum() * math.radians(2) ** 2
         return math.sqrt(solid / len(there))
 
@@ -289,7 +289,7 @@ class Frame:
         return self.every(max(1, -(-H * W // side**2) if self.is_scan else -(-max(H, W) // side)))
 
     def where(self, what: str) -> str:
-        """Return the name of a field in an error message: its file where it has one, else the frame and the field."""
+        """Return the name of a field in an error message: its file, if any, else the frame and the field."""
         return self.files.get(what, f"frame {self.index}, {what}")
 
     def _set(self, name: str, value: npt.NDArray[Any]) -> None:
@@ -378,13 +378,13 @@ class Frame:
         return labels
 
     def _narrowed(self, labels: npt.NDArray[Any]) -> npt.NDArray[Any]:
-        """Return integers of another type as uint8, or as uint16 where there is one above 255."""
+        """Return integers of another type as uint8, or as uint16 with a label above 255."""
         where = self.where("labels")
         if not (np.issubdtype(labels.dtype, np.integer) or labels.dtype == np.bool_):
             raise DataError(f"{where}: labels are {labels.dtype}; use uint8 or uint16 (ignore 255 or 65535)")
         low, high = int(labels.min(initial=0)), int(labels.max(initial=0))
         if low < 0 or high > IGNORE_16BIT:
-            raise DataError(f"{where}: labels go from {low} to {high}; write 255 (65535 of uint16) where there is none")
+            raise DataError(f"{where}: labels go from {low} to {high}; write 255 (65535 of uint16) for no label")
         return labels.astype(np.uint8 if high <= IGNORE_8BIT else np.uint16)
 
     def _checked_scores(self, scores: npt.NDArray[Any]) -> npt.NDArray[Any]:

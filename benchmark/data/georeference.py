@@ -14,7 +14,7 @@ INSTALL = "pip install 'semstab[geo]'"
 """The advice of a message where a package of the extra `geo` is not installed."""
 
 SINGULAR = 1e-6
-"""Determinant of a matrix that flattens the scene; those of topocentric scenes are 1 to a thousandth."""
+"""Determinant of a matrix that flattens the scene; matrices of topocentric scenes have 1 to a thousandth."""
 
 
 Row = tuple[float, float, float]
@@ -51,12 +51,12 @@ class Georeference:
             MissingDependencyError: Without pyproj.
         """
         if linear is not None and not abs(np.linalg.det(np.array(linear))) > SINGULAR:
-            raise ConfigError(f"{where}: the matrix from the scene to the projection cannot be inverted; write it anew")
+            raise ConfigError(f"{where}: the matrix from the scene to the projection cannot be inverted; correct it")
         return cls(wkt(crs, where), offset, IDENTITY if linear is None else linear)
 
     @property
     def name(self) -> str:
-        """Name of the reference system, with its number where it has one: 'WGS 84 / UTM zone 15N (EPSG:32615)'."""
+        """Name of the reference system, with its number, if any: 'WGS 84 / UTM zone 15N (EPSG:32615)'."""
         name = re.search(r'"([^"]*)"', self.crs)
         number = re.search(r'ID\["EPSG",\s*(\d+)\]\s*\]\s*$', self.crs)
         return f"{name[1] if name else 'a projection'}{f' (EPSG:{number[1]})' if number else ''}"
@@ -87,7 +87,7 @@ class Georeference:
 
 
 def wkt(crs: str, where: str) -> str:
-    """Return the WKT of a projected reference system in metres, with its number where there is one; errors as `of`."""
+    """Return the WKT of a projected reference system in metres, with its number, if any; errors as `of`."""
     try:
         from pyproj import CRS
         from pyproj.exceptions import CRSError

@@ -256,7 +256,7 @@ class LabelSpace:
 
 @dataclass(frozen=True)
 class LabelMapping:
-    """A mapping from the ids of one label space to rows 0..K-1 of another; `rows` has None where a class is ignored."""
+    """A mapping from the ids of one label space to rows 0..K-1 of another; `rows` has None for an ignored class."""
 
     source: LabelSpace
     target: LabelSpace

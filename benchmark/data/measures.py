@@ -110,12 +110,12 @@ class Quantity:
 
     Attributes:
         key: Its name in rules of a gate, and among columns that have a value a voxel.
-        title: Title in print; `short` where there is little room, `unit` where it has one.
+        title: Title in print; `short` is the title for little room, `unit` its unit or ''.
         better: Direction that is good.
-        digits: Decimals where a map is summarised, and where maps are compared.
+        digits: Decimals in the summary of a map, and in a comparison of maps.
         needs: Source: the voxel table, the log of events as well, or the ground truth as well.
-        section: Section of the paper, where it defines it.
-        op: Least OP of the voxels that it is a number of; 0 for a number of something else.
+        section: Section of the paper that defines it, if any.
+        op: Least OP of the voxels that the number is about; 0 for a number of something else.
     """
 
     key: str
@@ -150,7 +150,7 @@ class Quantity:
 
     @property
     def symbol(self) -> str:
-        """The title where there is little room."""
+        """Title for little room."""
         return self.short or self.word
 
     @property
@@ -164,7 +164,7 @@ class Measure(Quantity):
     """A number of each voxel, from 0 to `largest`.
 
     Attributes:
-        of: Computes it: (n,), NaN where undefined; from dense evidence, some voxels at a time.
+        of: Computes it: (n,), NaN if undefined; from dense evidence, some voxels at a time.
         lowest_op: Lowest OP at which it is defined.
         range: Range of its colours, in which maps differ; values beyond look like the ends.
         panel: Whether it has a panel in the figure of a map: not where another one shows the same areas.
@@ -200,7 +200,7 @@ def vss(table: Rows) -> Float64:
 def sbd(table: Beliefs) -> Float64:
     """Return the Semantic Belief Drift (n,): mean over t = 2..T of D_JS(p^(t), p^(t-1)), bits, in [0, 1].
 
-    NaN where OP < 2.
+    NaN for OP < 2.
     """
     return mean_drift(table.drift_sum, table.op)
 
@@ -279,7 +279,7 @@ RESERVED = frozenset((
     "statistics", "strata", "summary", "table", "taxonomy", "truth_file", "unit", "up", "variation",
     "video_measures", "voxel_alpha", "voxel_size", "voxels", "voxels_file", "well_seen", "wrong_of_consistent",
 ))  # fmt: skip
-"""Keys that no measure may have: fields beside its mean in JSON, other differences of maps, other compared numbers."""
+"""Keys that no measure may have: fields next to its mean in JSON, other differences of maps, other compared numbers."""
 
 _REGISTER = {measure.key: measure for measure in (VSS, SBD, ENTROPY, MARGIN)}
 
@@ -321,17 +321,17 @@ def registered(measure: Measure) -> Iterator[None]:
 
 
 def mean(values: npt.NDArray[Any]) -> float:
-    """Return the mean of the values that are defined; NaN where none is."""
+    """Return the mean of the defined values, or NaN without defined values."""
     defined = values[~np.isnan(values)]
     return float(defined.mean()) if defined.size else math.nan
 
 
 @dataclass(frozen=True)
 class MeasureMeans:
-    """The mean of every measure over a group of voxels, by its key; NaN where undefined.
+    """The mean of every measure over a group of voxels, by its key; NaN if undefined.
 
-    voxels has, for the measures that do not exist at every OP, over how many the mean runs. In JSON these are entries
-    KEY and KEY_voxels of what the means belong to.
+    `voxels` has the number of voxels behind the mean, for the measures that do not exist at every OP. In JSON these are
+    entries KEY and KEY_voxels of the group's object.
     """
 
     value: Mapping[str, float]
@@ -363,6 +363,6 @@ class MeasureMeans:
 
     @classmethod
     def of_json_content(cls, content: Any) -> MeasureMeans:
-        """Return the entries of all measures; those of one that was declared later are NaN, over 0 voxels."""
+        """Return the entries of all measures; a measure that was declared later gets NaN, over 0 voxels."""
         rare = {m.key: content.get(f"{m.key}_voxels", 0) for m in measures() if m.lowest_op > 1}
         return cls({measure.key: number(content.get(measure.key)) for measure in measures()}, rare)

@@ -82,7 +82,7 @@ def files_of(path: str | Path) -> list[Path]:
     """Return the files of a table: itself, or the tiles in a folder, by x and y.
 
     Raises:
-        DataError: If a tile is none of the others' map.
+        DataError: If a tile belongs to another map than the other tiles.
     """
     path = Path(path)
     if not path.is_dir():

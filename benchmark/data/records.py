@@ -28,10 +28,11 @@ if TYPE_CHECKING:
 
 UNITS, VOXELS, TRUTH, EVENTS, FRAMES, OVERVIEW = "units", "voxels", "truth", "events", "frames", "overview"
 OBSERVATIONS, SUMS = "observations", "sums"
-"""Folders of the files of units: their numbers; the voxel tables SCENE__MODEL__BACKEND.parquet; those of
-the ground truth of the same frames; logs of observations; time series; and the frames that figures show,
-SCENE__MODEL.npz with the arrays frame (its index), labels (H, W) rows 0..K-1 or the ignore id, palette (K, 3) and,
-where the dataset has it, color (H, W, 3). In addition sums by frame and cube of space, `ClusterSums`."""
+"""Folders of the files of units: their numbers; the voxel tables SCENE__MODEL__BACKEND.parquet; voxel tables of the
+ground truth of the same frames; logs of observations; time series; and the frames that figures show. The frames are in
+SCENE__MODEL.npz with the arrays frame (its index), labels (H, W) rows 0..K-1 or the ignore id, palette (K, 3) and, if
+the dataset has colour, color (H, W, 3). The last folders have sampled observations, and sums by frame and cube of
+space, `ClusterSums`."""
 
 REGIONS = "region_maps"
 """The name, not of a sweep, for the label sources that hold regions without classes."""
@@ -47,7 +48,8 @@ class Variation:
     Attributes:
         sweep: 'base', 'shared_taxonomy', 'backends', or the swept setting: 'voxel_size' (metres), 'pixel_stride',
             'frame_count', 'depth_noise' (relative standard deviation), 'translation_noise' (metres), 'rotation_noise'
-            (degrees), 'translation_drift' (metres a square root of frame), 'rotation_drift' (degrees likewise).
+            (degrees), 'translation_drift' (metres a square root of frame), 'rotation_drift' (degrees a square root of
+            frame).
         value: Value of the swept setting; None for 'base', 'shared_taxonomy' and 'backends'.
         repeat: Counts the repeats of a random variation from 0; each has a seed of its own.
     """
@@ -59,9 +61,9 @@ class Variation:
 
 @dataclass(frozen=True)
 class ImageSpace:
-    """Stability in image coordinates, over the sampled frames of a unit; NaN where it is not defined.
+    """Stability in image coordinates, over the sampled frames of a unit; NaN if undefined.
 
-    All but flicker_percent are of every n-th pixel of each axis, where the longer side has more than 640.
+    All but flicker_percent use every n-th pixel of each axis, if the longer side has more than 640.
 
     Attributes:
         flicker_percent: Pixels valid in both of two consecutive frames whose label differs.
@@ -100,7 +102,7 @@ class ImageSpace:
 
 @dataclass(frozen=True)
 class ClipMean:
-    """The mean of video consistency over clips, 0 to 1; NaN where there is no clip. Weigh by clips to pool videos."""
+    """The mean of video consistency over clips, 0 to 1; NaN without clips. Weigh by clips to pool videos."""
 
     value: float = math.nan
     clips: int = 0
@@ -108,7 +110,7 @@ class ClipMean:
 
 @dataclass(frozen=True)
 class WarpedOverlap:
-    """TC of one video in three published forms, 0 to 1, see `semstab.metrics.TemporalConsistency`; NaN where undefined.
+    """TC of one video in three published forms, 0 to 1, see `semstab.metrics.TemporalConsistency`; NaN if undefined.
 
     Attributes:
         sums: (4, K) pixels by class, from which 'vspw' and 'etc' of several videos follow.
@@ -146,7 +148,7 @@ class VideoMeasures:
 
 @dataclass(frozen=True)
 class FrameQuality:
-    """The worth of single frames' labels, as filters left them; shares are 0 to 1, NaN where undefined.
+    """The quality of single frames' labels after filters; shares are 0 to 1, NaN if undefined.
 
     Attributes:
         model, filters: The source of the labels, and the filters over it ('ema:0.6+guided:8'; '' for nothing).
@@ -204,26 +206,26 @@ class PixelStatistics:
 
 @dataclass(frozen=True)
 class Record:
-    """What is kept of one finished unit: its numbers, and where its files are.
+    """Record of one finished unit: its numbers, and the names of its files.
 
     Attributes:
         key: Hash of its inputs and settings, under which it is stored.
         summary: Its report: unit (scene, model, backend), means, strata, classes, times, and what
             `semstab.statistics` reports of the map.
         image_space: Image-space measures of the 'base' units; all NaN elsewhere.
-        quality: Quality of the labels of single frames, where `frame_quality` asked for it.
-        video_measures: VC and TC as published, where `video_measures` asked for them.
+        quality: Quality of the labels of single frames, if `frame_quality` is set.
+        video_measures: VC and TC as published, if `video_measures` is set.
         voxels_file: File of its voxel table, or the folder of its tiles, for the 'base' and 'backends' units; None
             elsewhere.
-        truth_file: File of the ground truth's voxels of the same frames, where the statistics fused it.
+        truth_file: File of the ground truth's voxels of the same frames, if the statistics fused it.
         series: File of its time series, in the folder of the run.
         pixels: Statistics of the labelled pixels of a video; None for a unit with a map.
         input: Digest of its input. This and what follows stand in the unit's own file alone: a result that is loaded
             from its folder has them for all units together.
-        up: The scene's up axis, where it is known or could be estimated.
+        up: The scene's up axis, if known or estimated.
         files: Digests of the unit's other files, by their path in the folder.
-        checked: Agreement with the reference on a sample of its voxels, where it was checked so.
-        advice: Advice on its voxel size, where that was assessed.
+        checked: Agreement with the reference on a sample of its voxels, if checked.
+        advice: Advice on its voxel size, if assessed.
         notes: Remarks of the check on its depth and labels, which look wrong but may be right.
     """
 
@@ -294,7 +296,7 @@ class Record:
 
     @property
     def events_file(self) -> Path | None:
-        """File, or folder of tiles, of its log, which is there where it was asked for and its backend keeps one."""
+        """File, or folder of tiles, of its log; the file exists if a log was requested and its backend keeps one."""
         return self._companion(EVENTS, "" if self.in_tiles else ".parquet")
 
     @property
@@ -364,12 +366,12 @@ class Result:
 
     Attributes:
         name: The name of the run or study.
-        backend: The base backend: that of every unit but those of the 'backends' variation.
+        backend: The base backend: the backend of all units outside the 'backends' variation.
         records: Records in the order of the plan.
         failures: The units that failed, with the message of each.
         agreement: Agreement of each pair of backends that must agree, on each scene and model that both fused.
-        up: (x, y, z) unit vector of the world's up axis by scene, where it is known or could be estimated.
-        georeference: Georeference by scene, where that is known.
+        up: (x, y, z) unit vector of the world's up axis by scene, if known or estimated.
+        georeference: Georeference by scene, if known.
         manifest: The content of manifest.json: versions, inputs, times.
         regions: Flicker of the label sources that are regions without classes.
         compared: The same of each other backend and the base one, which need not agree.

@@ -48,7 +48,7 @@ class UnitName:
 def slug(*names: str) -> str:
     """Join names to a file name: other names give another one.
 
-    A name stays as it is where it consists of letters, digits, '.', '_' and '-', begins with none of '.', '_', does not
+    A name stays as it is if it consists of letters, digits, '.', '_' and '-', does not begin with '.' or '_', does not
     end with '_', holds no '__' and is at most LONGEST_NAME bytes long. Else other characters become '-', a name
     that is too long is cut, and a digest of the name follows.
 
@@ -71,7 +71,7 @@ def _slug(name: str) -> str:
 class FrameReport:
     """The effect of fusing one frame.
 
-    The map's means are those after the frame; NaN where a backend does not compute them.
+    The map's means are the means after the frame, or NaN if a backend does not compute them.
 
     Parts of `seconds`, where a backend measures them: association_seconds go from pixels to voxels with their evidence,
     update_seconds into the map.
@@ -80,8 +80,8 @@ class FrameReport:
         frame: The frame's index.
         points: Valid pixels ('sampled points').
         voxels: Voxels the frame touched ('observations').
-        new_voxels: Those of the voxels that were seen for the first time.
-        drift_sum: Sum over the other ones of D_JS(p^(t), p^(t-1)), bits.
+        new_voxels: Voxels that were seen for the first time.
+        drift_sum: Sum over the other voxels of D_JS(p^(t), p^(t-1)), bits.
         seconds: wall-clock time of integrate.
         map_voxels: Voxels in the map.
         map_vss_all: Mean VSS over them.
@@ -104,7 +104,7 @@ class FrameReport:
 
     @property
     def drift(self) -> float:
-        """Mean drift of the frame's updates, bits a re-observed voxel; NaN where it met none."""
+        """Mean drift of the frame's updates, bits a re-observed voxel; NaN without re-observed voxels."""
         updated = self.voxels - self.new_voxels
         return self.drift_sum / updated if updated else math.nan
 
@@ -115,8 +115,8 @@ class Changes:
 
     Attributes:
         index: (n, 3) int64 index of the voxel.
-        drift: (n,) float32 D_JS of its belief before and after the frame, bits; NaN where it was not seen before.
-        before, after: (n,) uint16 its dominant class; where it was not seen before, both are the one after.
+        drift: (n,) float32 D_JS of its belief before and after the frame, bits; NaN for a new voxel.
+        before, after: (n,) uint16 its dominant class before and after the frame; a new voxel has the latter twice.
     """
 
     index: Int64
@@ -156,7 +156,7 @@ class Recurrent(Means):
 class TableSummary:
     """The summary of a voxel table: one row of the paper's scene table, its strata and its classes.
 
-    `summary[VSS]` is the mean of a measure over all voxels where it is defined, `vss_all` in JSON. `well_seen` is the
+    `summary[VSS]` is the mean of a measure over all voxels with a defined value, `vss_all` in JSON. `well_seen` is the
     last stratum in finer steps of OP. `categories` has the share of the voxels in each stability category,
     `confused_with` for each dominant class the one that most of the other evidence in its voxels is for.
     """
@@ -201,9 +201,8 @@ class UnitSummary:
 
     stages_ms has mean milliseconds a frame by stage, see `STAGES`; left_out counts the pixels that were left out of
     fusion because what they show moves, frames_left_out the selected frames without a file or a pose, frames_empty
-    the fused ones of which no pixel was valid; scores_left_out is there with `top_k`; statistics is what
-    `semstab.statistics.describe` reports of the map, None where it was not asked for; reduced is there for soft
-    scores.
+    the fused frames without a valid pixel; scores_left_out is there with `top_k`; statistics is the report of
+    `semstab.statistics.describe` on the map, or None if not requested; reduced is there for soft scores.
     """
 
     unit: UnitName = field(metadata=INLINE)
@@ -275,8 +274,8 @@ class VoxelAdvice:
     Attributes:
         voxel_size: Metres.
         stays: Share of the points that fall into the same voxel when another frame sees them.
-        suggested: The smallest size in which half of them do, metres; None where the data do not tell.
-        chosen: Whether it was chosen for that reason, and not given.
+        suggested: The smallest size at which half of the points do, metres, or None if the data do not tell.
+        chosen: Whether the suggestion was chosen, and no size was given.
     """
 
     voxel_size: float
@@ -326,8 +325,8 @@ class Agreement:
     """The agreement of two backends' maps of the same frames; one entry of 'agreement' in summary.json.
 
     Attributes:
-        differences: Differences of every column of the voxel table, of every measure, and of the label (1 where it is
-            another), by their keys; evidence is one.
+        differences: Differences of every column of the voxel table, of every measure, and of the label (1 for another
+            label), by their keys; evidence is one key.
         one_in: Number of voxels of which one, drawn at random, was compared.
         first: The first number that differs too much, where the maps do not agree.
     """

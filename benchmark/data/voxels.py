@@ -77,7 +77,7 @@ def as_html(
 
 
 def number(value: float, digits: int) -> str:
-    """Format a value with so many decimals; '-' where there is none."""
+    """Format a value with `digits` decimals; '-' for NaN."""
     return "-" if math.isnan(value) else f"{value:.{digits}f}"
 
 

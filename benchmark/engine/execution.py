@@ -142,7 +142,7 @@ class _Execution:
         self.ended = [work for tiled in self._tiled.values() if (work := tiled.ended()) is not None]
 
     def next_job(self) -> Job | None:
-        """Return the next job; None where there is none until works that are taken call for more."""
+        """Return the next job, or None without a job until a work that comes back calls for more."""
         if self._queue:
             return self._queue.popleft()
         return next(filter(None, (unit.next_job() for unit in self._tiled.values())), None)

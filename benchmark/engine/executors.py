@@ -32,11 +32,11 @@ LOST = "the scheduler does not answer any more; start it again, and the same com
 
 Future = cf.Future[Job]
 NextJob = Callable[[], Job | None]
-"""A function that gives the next job; None where there is none until works that were yielded call for more."""
+"""A function that returns the next job, or None without a job until a yielded work calls for more."""
 
 
 class Executor:
-    """Runs jobs: so many at once (`width`), perhaps in other processes (`elsewhere`); `name` is for the manifest."""
+    """A runner of jobs, `width` at once, in other processes if `elsewhere`; `name` is for the manifest."""
 
     name: str
     width = 1
@@ -188,14 +188,14 @@ def _run_all(job: Job) -> Job:
 
 
 def _check_start(pool: cf.ProcessPoolExecutor) -> None:
-    """Raise ConfigError where not even an empty job runs: a script that starts processes must be importable."""
+    """Raise ConfigError if not even an empty job runs: a script that starts processes must be importable."""
     with _left_alone():
         first = pool.submit(os.getpid)
     try:
         first.result()
     except BrokenProcessPool as error:
         raise ConfigError(
-            "worker processes do not start; in a script of your own, call it under if __name__ == '__main__'"
+            "worker processes do not start; in your script, call it under if __name__ == '__main__'"
         ) from error
 
 
@@ -208,7 +208,7 @@ def _start_worker(listening: Connection, threads: int) -> None:
 
 
 def _use_threads(count: int) -> None:
-    """Let compiled loops, and the reading of tables, have so many."""
+    """Set the number of threads for compiled loops and for reading tables."""
     import numba
     import pyarrow as pa
 

@@ -1,4 +1,4 @@
-"""The folder of a run or a study: what it leaves on disk, unit by unit, so that a killed one goes on where it was."""
+"""The folder of a run or a study: files of each finished unit, from which a killed run or study continues."""
 
 from __future__ import annotations
 
@@ -66,14 +66,14 @@ WRITTEN = (UNITS, VOXELS, TRUTH, EVENTS, OBSERVATIONS, FRAMES, SUMS, OVERVIEW, T
 """Folders into which files are written."""
 
 OWN_FILES = (SETTINGS, FAILURES, DIGESTS, "summary.json", "manifest.json", "report.html", "recording.rrd")
-"""Files of a run beside these folders."""
+"""Files of a run next to these folders."""
 
 
 def require_output(path: str | Path, inputs: Iterable[str | Path | None] = ()) -> None:
-    """Require that a file to write is none of a run's own files, and none of the files that are read for it.
+    """Require that a file to write is not a run's own file, and not a file that is read for it.
 
     Raises:
-        ConfigError: If it is.
+        ConfigError: If it is such a file.
     """
     path = Path(path)
     real = path.resolve()
@@ -109,8 +109,8 @@ class Folder:
     """OUT/ of a run or study, with what was computed with the same settings; one process owns it until `close`.
 
     Raises:
-        ConfigError: If another process does, or where it holds something else, results of an earlier version, or of
-            another run of which this plan would keep nothing, unless `overwrite`.
+        ConfigError: If another process owns it, or if it holds other files or results of an earlier version. Without
+            `overwrite`, also if it holds another run of which this plan would keep nothing.
     """
 
     def __init__(self, path: str | Path, plan: Plan, *, overwrite: bool = False) -> None:
@@ -198,7 +198,7 @@ class Folder:
                 if file.relative_to(self.path).as_posix() not in keep:
                     file.unlink(missing_ok=True)
             with contextlib.suppress(OSError):
-                (self.path / name / slug).rmdir()  # where it is empty
+                (self.path / name / slug).rmdir()  # if it is empty
 
     def save_trace(self, work: Work) -> None:
         """Add where a unit's error was raised to failures.log of this start."""
@@ -296,7 +296,7 @@ def _wanted(unit: Unit, record: Record) -> list[str]:
 
 
 def _models_in(folder: Path) -> set[str]:
-    """Return the models of the summary that lies in a folder; none where it cannot be read."""
+    """Return the models of the summary in a folder, or an empty set if the summary cannot be read."""
     try:
         content = read_json(folder / "summary.json")
         return {str(run["model"]) for run in content["runs"]}
@@ -364,7 +364,7 @@ def load_result(folder: str | Path) -> Result:
 
 
 def _contradiction(result: Result) -> str | None:
-    """Return the first part of a result that refers to something that is not in it; None where there is none."""
+    """Return the first part of a result that refers to something outside of it, or None without such a part."""
     if other := [record.unit.backend for record in result.select() if record.unit.backend != result.backend]:
         return f"a run at the base settings is fused by '{other[0]}', not by '{result.backend}'"
     for record in result.records:
@@ -399,7 +399,7 @@ def _with_files(records: Sequence[Record], change: Callable[[Path], Path]) -> tu
 
 
 def _claimed(path: Path) -> dict[str, Any] | None:
-    """Return the settings of an earlier start; None where there is none. Changes nothing."""
+    """Return the settings of an earlier start, or None without an earlier start. Changes nothing."""
     if not path.exists():
         return None
     if not path.is_dir():

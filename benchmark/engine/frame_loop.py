@@ -28,9 +28,9 @@ from semstab.pixels.preparation import leave_out, perturb
 
 
 def run_job(job: Job, observers: Observers | None = None) -> Iterator[Work]:
-    """Compute works that read one sequence. One that fails does not keep the others from finishing.
+    """Compute works that read one sequence. A work that fails does not keep the other works from finishing.
 
-    Observers see it where it is done in their process.
+    Observers see the works that are computed in their process.
     """
     left = [*job]
     try:

@@ -55,9 +55,11 @@ class LiveMap:
     """A work whose frames are being fused, and what goes with its map.
 
     Attributes:
-        backend: None where nothing is fused; truth fuses the ground truth, hard the likeliest class of soft scores.
+        backend: The backend, or None if nothing is fused; `truth` fuses the ground truth, `hard` the likeliest class of
+            soft scores.
         background: The thread that fuses a frame into the reference while it is measured.
-        tiles: (n, 3) each frame and a tile that it meets, where nothing is fused; origin the voxel of its first camera.
+        tiles: (n, 3) each frame and a tile that it meets, if nothing is fused; `origin` is the voxel of the first
+            camera.
     """
 
     work: Work
@@ -205,7 +207,7 @@ class Decoded:
     Attributes:
         truth: Its ground truth.
         model: The model's frame before filters.
-        network: Seconds that the model took to predict on it; NaN where labels are read.
+        network: Seconds of the model's prediction on it; NaN if labels are read.
         seconds, waited: Seconds of decoding, in a worker thread, and of waiting for it.
     """
 
@@ -227,7 +229,7 @@ Decodings = Mapping[str, Decoded | Exception]
 
 
 class Stream:
-    """Maps that fuse frames prepared alike: of one taxonomy, noise, pixel stride and selection of frames."""
+    """Maps that fuse the same prepared frames: of one taxonomy, noise, pixel stride and selection of frames."""
 
     def __init__(self, maps: Sequence[LiveMap], watch: Stopwatch, observers: Observers, flows: Flows) -> None:
         self.maps, self._watch, self._observers = list(maps), watch, observers

@@ -139,7 +139,7 @@ def finish(live: LiveMap, stream: Stream, watch: Stopwatch) -> Work:
 class FusedMap(NamedTuple):
     """A map at its end, without the locations whose fused class is left out; reduced: `reduced_sums`, or empty.
 
-    It is checked against the reference beside the statistics.
+    It is checked against the reference in parallel with the statistics.
     """
 
     table: VoxelTable
@@ -188,7 +188,7 @@ def _check_evidence(table: VoxelTable, name: UnitName) -> None:
                 f"{name.scene}, {name.model}: backend '{name.backend}': the evidence of voxel ({voxel}) sums to"
                 f" {total[wrong[0]]:g}, and its {what} is {op[wrong[0]]:g}; add one distribution over the classes for"
                 " each frame that sees a voxel, or state in the column `weight` what a row sums to"
-                " (semstab.testing.BackendConformance finds where it goes wrong)"
+                " (semstab.testing.BackendConformance finds the mistake)"
             )
 
 
@@ -324,7 +324,7 @@ def _reduced(sums: Float64) -> ReducedScores:
 
 
 def up_axis(scene: Scene, points: VoxelTable | Float64, poses: Float64) -> tuple[float, float, float] | None:
-    """Return the scene's up axis, given or estimated; None where neither works."""
+    """Return the scene's up axis, given or estimated, or None if the estimate fails."""
     try:
         x, y, z = (float(value) for value in (estimate_up(points, poses) if scene.up is None else scene.up))
     except DataError:
@@ -416,7 +416,7 @@ def save_overview(arrays: Mapping[str, Any], path: Path) -> None:
 
 
 def pictures_of_outlying(task: Task, config: Config, of_frames: OfFrames) -> dict[str, npt.NDArray[Any]]:
-    """Return pictures of the first frames that stand out, which are read once more, as arrays by name; none of scans.
+    """Return pictures of the first frames that stand out, which are read again, as arrays by name; none of scans.
 
     A frame is held against those of the run before and after it, the first and the last one against the two nearest.
     """
@@ -452,7 +452,7 @@ class Files:
 
 
 def written(start: Start, savers: Savers) -> tuple[dict[str, str], dict[str, bytes]]:
-    """Write files into the folder where it is shared; their digests, and their bytes where it is not."""
+    """Write files into a shared folder, and return their digests; without a shared folder, also return their bytes."""
     if start.marker.exists():
         for name, save in savers.items():
             save(start.folder / name)

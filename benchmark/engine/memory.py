@@ -39,12 +39,12 @@ FRAMES_AT_WORK = 3
 
 @dataclass(frozen=True)
 class MapMemory:
-    """What maps of one kind take, roughly: bytes by their voxels and observations.
+    """Approximate memory of maps of one kind: bytes by their voxels and observations.
 
     Attributes:
-        backend: By which they are fused.
+        backend: The backend of the maps.
         K: Number of classes.
-        soft: Of scores, which are fused as labels as well.
+        soft: Whether the maps fuse scores, which are also fused as labels.
         logged: Whether every observation is kept.
         compared: Whether the ground truth is fused, too.
         sampled: Whether the reference fuses a sample of the voxels, or, to check a backend from outside, all of them.
@@ -291,10 +291,11 @@ def map_size(task: Task, settings: Config) -> MapSize:
 
 
 def _of_all_frames(seen: Sequence[Int32], distinct: int, frames: int) -> float:
-    """Return the voxels that so many frames see, from those that each of a sample sees, `distinct` together.
+    """Return the number of voxels that `frames` frames see.
 
-    The more frames, the fewer voxels are new: a quarter, a half and all of the sample tell by which factor the voxels
-    that another doubling of the frames adds are fewer than those which the last one added.
+    `seen` has the voxels that each frame of a sample sees, `distinct` together. The more frames, the fewer voxels are
+    new: a quarter, a half and all of the sample give the factor from the voxels of one doubling of the frames to the
+    voxels of the next.
     """
     quarter, half, voxels = _count(seen[::4]), _count(seen[::2]), float(distinct)
     factor, added, reached = min((distinct - half) / max(half - quarter, 1), 2.0), float(distinct - half), len(seen)
@@ -306,7 +307,7 @@ def _of_all_frames(seen: Sequence[Int32], distinct: int, frames: int) -> float:
 
 
 def _drawn(voxels: Int64, one_in: int) -> Int32:
-    """Return the voxels above one in so many places: the same ones of every frame, and all of a column."""
+    """Return the voxels of a fixed random sample of columns, one in `one_in`; each column is taken whole."""
     places = voxels[:, 0] * 0x9E3779B1 + voxels[:, 1] * 0x85EBCA77  # that are drawn lie evenly, without a grid
     drawn: Int32 = voxels[(places >> 16) % one_in == 0].astype(np.int32)
     return drawn
@@ -344,7 +345,7 @@ class MemoryBudget:
         self._left = 0.0
 
     def lacking(self, maps: Sequence[LiveMap]) -> LiveMap | None:
-        """Return the largest map where the memory left would not do for the end of each; None where it does.
+        """Return the largest map if the memory left does not suffice for the end of each map, else None.
 
         A hash map that is full doubles: the next step may be twice the largest one so far.
         """

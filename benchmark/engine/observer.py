@@ -41,14 +41,14 @@ class Observer:
         """Take note that a frame went into all maps of the group; `frame` holds labels in the run's label space."""
 
     def advanced(self, frames: int, what: str) -> None:
-        """Take note that so many frames went into a map, wherever that is; `what` names the unit."""
+        """Take note that `frames` frames went into a map, in any process; `what` names the unit."""
 
     def unit_finished(
         self, unit: Unit, record: Record | RegionFlicker | None, table: VoxelTable | None, error: str | None
     ) -> None:
         """Take note that a unit is computed and stored, or failed for the reason in `error`.
 
-        The table holds its voxels where it is watched and was fused whole in this process.
+        The table holds its voxels if the unit is watched and was fused whole in this process.
         """
 
     def run_finished(self, result: Result) -> None:

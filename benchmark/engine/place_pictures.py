@@ -15,19 +15,22 @@ from semstab.statistics.places import Place, PlaceView
 from semstab.task import Task, read
 
 PICTURED, READ, EACH = 6, 4, 2
-"""The most places that have pictures, the most frames that are read once more for them, and the most of a place."""
+"""The most places that have pictures, the most frames that are read again for them, and the most of a place."""
 
 EDGE, AROUND, LEAST = 160, 3.0, 48
-"""Edge of a picture in pixels; that of the part of the frame that it shows is so many times the place's extent, and at
-least so many pixels."""
+"""Edge of a picture in pixels; the edge of the part of the frame that it shows, as a multiple of the place's extent;
+and the least edge of this part, in pixels."""
 
 
 def pictures_of_places(task: Task, places: Sequence[Place], pixel_stride: int) -> dict[str, npt.NDArray[Any]]:
-    """Return pictures of the first places, as arrays (n, ...) by name, colour where all frames have it.
+    """Return pictures of the first places, as arrays (n, ...) by name.
 
-    `place_of` is the number of the place, `place_centre` its centre (n, 3), `place_frame` the frame, `place_labels`
-    (n, h, w) rows 0..K-1 and above where there is none, `place_color` (n, h, w, 3), and `place_ring` (n, 3) the centre
-    (x, y) and the radius of a circle around the place, as shares of the picture.
+    - `place_of`: number of the place
+    - `place_centre`: (n, 3) centre of the place
+    - `place_frame`: frame
+    - `place_labels`: (n, h, w) rows 0..K-1, or a larger number without a label
+    - `place_color`: (n, h, w, 3) colour, if all frames have colour
+    - `place_ring`: (n, 3) centre (x, y) and radius of a circle around the place, as shares of the picture
     """
     places = places[:PICTURED]
     chosen = chosen_frames(places)
@@ -47,7 +50,7 @@ def pictures_of_places(task: Task, places: Sequence[Place], pixel_stride: int) -
 
 
 def chosen_frames(places: Sequence[Place]) -> set[int]:
-    """Return the frames that show the places: few, each for several of them where it can."""
+    """Return few frames that show the places; a frame may show several places."""
     chosen = set[int]()
     for place in places:
         for label in (place.label, place.other):
@@ -70,7 +73,7 @@ def cut_out(
 ) -> tuple[npt.NDArray[Any], npt.NDArray[Any] | None, tuple[float, float, float]] | None:
     """Return the square part of a frame around points (n, 3): labels and colour (EDGE, EDGE), and the place's ring.
 
-    None where the frame shows none of the points.
+    Returns None if the frame does not show the points.
     """
     H, W = frame.shape
     camera = (points - frame.T_wc[:3, 3]) @ frame.T_wc[:3, :3]

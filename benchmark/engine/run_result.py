@@ -111,7 +111,7 @@ def _agreements(config: Config, records: Sequence[Record], tables: Tables, *, mu
     checked = {backend.name for backend in config.fused_by() if must_agree(backend)}
     groups: dict[tuple[str, str], list[Record]] = {}
     for record in records:
-        if record.variation.sweep in (BASE, BACKENDS):  # those of the first backend come first
+        if record.variation.sweep in (BASE, BACKENDS):  # the first backend's record comes first
             groups.setdefault((record.unit.scene, record.unit.model), []).append(record)
     for group in groups.values():
         for a, b in itertools.combinations(group, 2) if must else zip(group[:1] * len(group), group[1:], strict=False):

@@ -65,7 +65,7 @@ OF_FRAMES = ("lone_percent", "lone_null_percent", "outlying", "moving_percent")
 class FrameRow:
     """One row of a unit's time series: the backend's report, numbers of the frame itself, and seconds by stage.
 
-    compensated_flicker_percent has the camera's motion removed (`ImageSpace`), NaN where that is not measured. left_out
+    compensated_flicker_percent has the camera's motion removed (`ImageSpace`), or is NaN if not measured. left_out
     counts the pixels that were left out of fusion because they move; scores_left_out and most_scores_left_out are the
     mean and the largest share of a pixel's scores that `top_k` left out.
     """
@@ -84,7 +84,7 @@ class FrameRow:
     most_scores_left_out: float = math.nan
 
     def stage_ms(self) -> dict[str, float]:
-        """Return the milliseconds of each of `STAGES`; NaN where it is not known."""
+        """Return the milliseconds of each of `STAGES`, or NaN if unknown."""
         return {stage: self[f"{stage}_ms"] for stage in STAGES}
 
     def __getitem__(self, key: str) -> Any:

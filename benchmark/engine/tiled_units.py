@@ -70,13 +70,13 @@ class TiledUnit:
         return self._work.unit.name.stated
 
     def next_job(self) -> Job | None:
-        """Return the next tile; None where there is none, or before the pass over the frames has ended."""
+        """Return the next tile, or None without one, or before the pass over the frames has ended."""
         if self._failed or not self._waiting:
             return None
         return (self._waiting.pop(0).bounded(self._bound),)
 
     def take(self, work: Work) -> Work | None:
-        """Take a tile that a worker gave back; return the unit where it came to its end."""
+        """Take a tile that a worker gave back; return the unit if it is complete."""
         if self._failed:
             return None
         if work.error is not None or work.tile is None:
@@ -186,7 +186,7 @@ def assembled(
 
 
 def _with_columns(task: UnitTile, slug: str, analysis: Analysis, folder: Path) -> Savers:
-    """Return the file of a tile's voxels, once more with the columns of the statistics."""
+    """Return the file of a tile's voxels, again with the columns of the statistics."""
     assert task.index is not None
     waiting = folder / task.folder / VOXELS / f"tile={task.index[0]}_{task.index[1]}.parquet"
 

@@ -91,12 +91,12 @@ class TileMeta:
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class TileResult(TileMeta):
-    """The result of a whole unit, of one tile, or of the pass over all frames; those of tiles make a unit's.
+    """The result of a whole unit, of one tile, or of the pass over all frames; tile results are merged into the unit's.
 
     Attributes:
         series: (F, C) NUMBERS of each frame.
         sums: Sums of its voxels, by name, as `TableSums` has them.
-        reduced: Sums of the map of labels that soft scores were reduced to; empty where there are none.
+        reduced: Sums of the map of labels that soft scores were reduced to; empty without scores.
         image: (F, C) stability of each frame in image coordinates, poses (F, 3, 3) of the cameras: of all frames.
         seen: (m, 3) a frame and a tile that it meets, ascending by frame.
     """
@@ -117,7 +117,7 @@ class TileResult(TileMeta):
 
     @classmethod
     def load(cls, path: Path) -> TileResult | None:
-        """Read the file that `save` wrote; None where there is none, or it is damaged or of another version."""
+        """Read the file that `save` wrote; return None if it is missing, damaged or of another version."""
         arrays = read_arrays(path)
         if arrays is None or not {"meta", *ARRAYS} <= arrays.keys() or arrays["series"].shape[1:] != (len(NUMBERS),):
             return None

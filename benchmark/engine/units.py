@@ -56,7 +56,7 @@ NOT_IN_KEYS = {
     "name", "description", "benchmark", "check", "tolerance", "shared_taxonomy", "sweeps", "seed", "events",
 }  # fmt: skip
 """Settings that no number of a unit follows from. What the first ones select is in its key: the digest of the input,
-frames, classes, the backend. A setting that is not named here is part of the key, where it is not the default."""
+frames, classes, the backend. Any other setting is part of the key, unless it has its default."""
 
 OF_REGIONS = {"pixel_stride", "exclude", "perturbation"}
 """The settings that the flicker of regions without classes follows from."""
@@ -66,15 +66,15 @@ NOISES = tuple(name for name in Perturbation.model_fields if name != "seed")
 
 @dataclass(frozen=True, eq=False)
 class Unit:
-    """A model on a scene, fused by a backend under one variation: what is to be computed, and what is wanted of it.
+    """A model on a scene, fused by a backend under one variation.
 
-    A worker gets it without its task, and opens that again.
+    A worker gets it without its task, and opens the task again.
 
     Attributes:
         name: Its scene, model and backend.
-        config: Its settings as those of a run of its own: one scene, one model, one backend, the frames one by one.
+        config: Settings of a run of this unit alone: one scene, one model, one backend, the frames one by one.
         task: The model on the scene, opened and checked.
-        identity: Hash of the settings that its numbers depend on; what shares it is computed once.
+        identity: Hash of the settings that its numbers depend on; units with the same hash are computed once.
         left_out: Number of selected frames without a file or a pose.
         image_space: Whether its stability in image coordinates is wanted.
         stored: Whether its voxels and its time series are stored.
@@ -313,9 +313,9 @@ def _varied_units(config: Config, base: Sequence[Unit], scenes: Mapping[str, Sce
 
 
 def _variations(config: Config) -> Iterator[tuple[Variation, Part, Any]]:
-    """Yield each point of each sweep, where it applies, and its value.
+    """Yield each point of each sweep, the part of the configuration that it applies to, and its value.
 
-    The taxonomy or the backend that is changed comes last.
+    Points that change the taxonomy or the backend come last.
     """
     if config.shared_taxonomy is not None:
         yield Variation(SHARED), Part(), config.shared_taxonomy

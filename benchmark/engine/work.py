@@ -48,9 +48,9 @@ class UnitTile:
         key: Key of the unit, under which results are stored.
         size: Voxels along the edge of a tile.
         index: (x, y) of the tile: ix // size, iy // size.
-        origin: Voxel of the first camera, where it is known.
-        bound: Highest hash in the sample of the tiles before, where that is full: no voxel above it will be in the
-            map's.
+        origin: Voxel of the first camera, if known.
+        bound: Highest hash in the sample of the tiles before, if the sample is full: the map's sample will have no
+            voxel above it.
     """
 
     key: str
@@ -90,9 +90,9 @@ class Work:
         tile: The tile of a unit in tiles; None for all of a unit.
         record: What is kept of the unit.
         error: The reason why the work failed, in one line.
-        files: Further files by their path in the folder, where the worker does not see that folder.
-        cause: The exception, where the work failed in this very process; trace where it was raised.
-        table: The voxels of a unit that observers watch, where it was fused in this process.
+        files: Further files by their path in the folder, if the worker does not see the folder.
+        cause: The exception, if the work failed in this very process; `trace` has its traceback.
+        table: The voxels of a unit that observers watch, if it was fused in this process.
         seconds: Seconds that its pass took, by stage; of the last work of a pass only.
     """
 

@@ -101,18 +101,18 @@ def export(
     Args:
         run: Folder of the run, or FOLDER:MODEL.
         to: Files to write, one or several.
-        scene: Scene of the unit; may be left out where there is one.
-        model: Model of the unit; may be left out where there is one.
-        backend: Backend of the unit, the base backend where not given.
+        scene: Scene of the unit; not needed with a single scene.
+        model: Model of the unit; not needed with a single model.
+        backend: Backend of the unit, by default the base backend.
         measures: Columns to write: measures, op, category, psa, or columns of the run's Parquet file.
         min_op: Only voxels seen that often are written.
-        classes: Only voxels of these dominant classes are written; all where empty.
+        classes: Only voxels of these dominant classes are written; empty for all classes.
         thresholds: A file of `AcceptanceThresholds`: only voxels whose label has the required evidence are written.
         cell: Edge of a raster's cell, in voxels.
         asprs: YAML file CLASS: CODE for LAS; else the table that ships for the taxonomy.
         classify: A cloud: write this cloud, classified; a point outside of all voxels takes the nearest one within
             `radius`.
-        radius: Metres, a voxel's edge where not given.
+        radius: Metres, by default a voxel's edge.
         join: A Parquet file with further columns of the same voxels, such as `compare` writes.
         task_format: 'coco': write annotation tasks, the locations where frames disagree, instead of the map.
         most: The largest number of annotation tasks, or of places.

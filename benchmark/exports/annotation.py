@@ -65,7 +65,7 @@ class AnnotationTask:
 
 
 def annotation_tasks(chosen: Chosen, task: Task, most: int) -> list[AnnotationTask]:
-    """Return at most so many tasks, the highest score first.
+    """Return at most `most` tasks, the highest score first.
 
     A location is a connected set of voxels that at least two frames saw, with the same two likeliest classes, on which
     frames disagree. Its best view has the largest product of size in the image, how frontal and how sharp it is. A
@@ -112,7 +112,7 @@ class _Locations:
 
     @classmethod
     def of(cls, chosen: Chosen, most: int) -> _Locations:
-        """Return the locations with the most entropy, at most so many."""
+        """Return the locations with the most entropy, at most `most`."""
         parts = list(chosen)
         first = parts[0]
         table = VoxelTable.joined([part.table.rows(_disagreed(part.table)) for part in parts])
@@ -219,7 +219,7 @@ def _view(
     locations: _Locations,
     sharpness: Float64,
 ) -> _View | None:
-    """Return location k within a box of the image; None where the image shows too little of it."""
+    """Return location k within a box of the image, or None if the image shows too little of it."""
     seen = location[box] == k
     K, z = frame.intrinsics, frame.depth[box][seen].astype(np.float64)
     outline, mask = outlined(seen, locations.table.voxel_size * K.fx / float(np.median(z)), SMALLEST * rows.size)

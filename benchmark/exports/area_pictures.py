@@ -29,7 +29,7 @@ class FramesOf:
 
 
 def frames_of(run: Compared, scene: str, indices: Sequence[int]) -> FramesOf | None:
-    """Return frames as a run had them; None where it has no folder, or its data or its code is not at hand."""
+    """Return frames as a run had them, or None without its folder, its data or its code."""
     if run.source is None or not Path(run.source).is_dir():
         return None
     try:

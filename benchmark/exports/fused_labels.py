@@ -39,9 +39,9 @@ class Belief:
     Attributes:
         min_op: Number of frames that must see a voxel.
         min_psa: Share of its pairs of frames that must agree; a voxel seen once has no pair.
-        categories: Categories that a voxel may be in, any where none is named.
-        leave_one_out: True to leave the frame's own vote out; another frame must then see the voxel. Drift stays that
-            of all votes: it depends on their order.
+        categories: Categories that a voxel may be in; empty for any.
+        leave_one_out: True to leave the frame's own vote out; another frame must then see the voxel. Drift stays the
+            drift of all votes: it depends on their order.
         thresholds: Thresholds whose evidence the label must have.
 
     Raises:

@@ -258,7 +258,7 @@ def _require_header(header: laspy.LasHeader) -> None:
 
 
 def _las_chunks(cloud: Path) -> Iterator[laspy.ScaleAwarePointRecord]:
-    """Yield the points of a cloud; errors of what is written from them are none of the cloud's."""
+    """Yield the points of a cloud; errors of writing them are not errors of the cloud."""
     with open_las(cloud) as reader:
         yield from reader.chunk_iterator(min(CHUNK, points_at_once(reader.header)))
 

@@ -307,7 +307,7 @@ class _Cells:
         self.empty = np.bincount(at, minlength=shape[0] * shape[1]).reshape(shape) == 0
 
     def mean(self, values: npt.NDArray[Any]) -> Float64:
-        """Return the mean (H, W) of values (n,) of the voxels; NaN where none is defined."""
+        """Return the mean (H, W) of values (n,) of the voxels; NaN for a column without defined values."""
         taken = values[self._rows].astype(np.float64)
         defined, n = ~np.isnan(taken), self.empty.size
         total = np.bincount(self._at[defined], taken[defined], minlength=n)
@@ -316,7 +316,7 @@ class _Cells:
         return mean
 
     def highest(self, values: Float64) -> Float64:
-        """Return the largest of values (n,) of the voxels (H, W); NaN where there is none."""
+        """Return the largest of values (n,) of the voxels (H, W); NaN for a column without defined values."""
         most = np.full(self.empty.size, -np.inf)
         np.maximum.at(most, self._at, values[self._rows])
         return np.where(np.isinf(most), np.nan, most).reshape(self._shape)

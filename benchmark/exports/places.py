@@ -32,7 +32,7 @@ def holds_places(file: Path) -> bool:
 
 
 def write_places(chosen: Chosen, record: Record, file: Path, most: int) -> tuple[int, Voxels]:
-    """Write the worst places among the chosen voxels, at most so many; return their number and a part of the map.
+    """Write the worst places among the chosen voxels, at most `most`; return their number and a part of the map.
 
     Raises:
         ConfigError: If frames disagree nowhere.

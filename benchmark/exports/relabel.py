@@ -47,17 +47,17 @@ def relabel(
 ) -> Relabelled:
     """Write the fused class of every pixel of every frame of a unit to OUT/labels/NAME.
 
-    Of scans it is a .label file of each in OUT/predictions/NAME: an id a point, where it has none 0, or 65535 where 0
+    Scans get a .label file each in OUT/predictions/NAME: an id a point. A point without a class has id 0, or 65535 if 0
     is a class.
 
     Args:
         run: Folder of the run, or FOLDER:MODEL.
         out: Folder that gets labels/NAME.
-        belief: The criteria of a voxel; other pixels are ignored, as are those without depth.
-        scene: Scene of the unit; may be left out where there is one.
-        model: Model of the unit; may be left out where there is one.
-        backend: Backend of the unit, the base backend where not given.
-        name: Name of the new source, MODEL-fused where not given; its classes are in its folder.
+        belief: The criteria of a voxel; other pixels are ignored, and so are pixels without depth.
+        scene: Scene of the unit; not needed with a single scene.
+        model: Model of the unit; not needed with a single model.
+        backend: Backend of the unit, by default the base backend.
+        name: Name of the new source, by default MODEL-fused; its classes are in its folder.
         overwrite: Whether other predictions in the folder are replaced.
         code: Code that the run's settings name and that may run, FILE.py:NAME each; other code is refused.
         progress: A function that is called with the task, the number of finished frames, and the number of all frames.

@@ -1,4 +1,4 @@
-"""The effect of relabelling: pixels confirmed, changed and dropped, and accuracy where there is ground truth."""
+"""The effect of relabelling: pixels confirmed, changed and dropped, and accuracy with ground truth."""
 
 from __future__ import annotations
 
@@ -125,7 +125,7 @@ class Tally:
             self._confusion[name] += np.bincount(pairs, minlength=self._K**2).reshape(self._K, self._K)
 
     def correctness(self) -> Correctness | None:
-        """Return the accuracies; None where no pixel has ground truth."""
+        """Return the accuracies, or None without ground truth."""
         if not self._confusion["all_before"].any():
             return None
         return Correctness(**{name: Accuracy.of(confusion) for name, confusion in self._confusion.items()})

@@ -60,8 +60,8 @@ class Voxels:
         classes: The names of the K classes.
         colors: (K, 3) RGB.
         taxonomy: The taxonomy of the classes.
-        up: (3,) the scene's up axis, None where it is not known.
-        georeference: Georeference of the scene, None where it has none.
+        up: (3,) the scene's up axis, None if unknown.
+        georeference: Georeference of the scene, or None.
         benchmark: The benchmark that the run is of, '' for none.
     """
 
@@ -76,7 +76,7 @@ class Voxels:
 
     @property
     def points(self) -> Float64:
-        """Return centres (n, 3): global coordinates where there is a georeference, else the scene's; metres."""
+        """Return centres (n, 3): global coordinates with a georeference, else the scene's; metres."""
         return self.in_file(self.table.centers)
 
     @property
@@ -111,7 +111,7 @@ class Voxels:
 class Chosen:
     """The voxels of a unit that are exported, tile by tile; the latest tiles stay in memory.
 
-    A voxel is exported if its OP is at least min_op, its dominant class is one of `classes` (any where none is named)
+    A voxel is exported if its OP is at least min_op, its dominant class is one of `classes` (any if `classes` is empty)
     and, with thresholds, its label has enough evidence. `columns` names measures, op, category, psa, columns of the
     unit's Parquet file, or of a file to `join`, which has some of the same voxels; for the default see `usual`.
 
@@ -119,7 +119,7 @@ class Chosen:
         size: Edge of a tile in voxels, None for the one tile of a map in a single file.
 
     Raises:
-        ConfigError: For an unknown name, and where no voxel is left.
+        ConfigError: For an unknown name, and if no voxel is left.
     """
 
     def __init__(
@@ -288,7 +288,7 @@ def _column(name: str, table: VoxelTable, file: Path) -> Column:
 
 
 def _colors(overview: Path, K: int) -> UInt8:
-    """Return the colours of the classes in the run's figures, or the palette where it has no overview."""
+    """Return the colours of the classes in the run's figures, or the palette without an overview."""
     try:
         palette = Overview.load(overview).palette
     except DataError:

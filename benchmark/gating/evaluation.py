@@ -189,7 +189,7 @@ def assess(rule: Rule, pairs: Sequence[Pair], level: float, scope: Scope) -> Jud
 
 
 def value_of(rule: Rule, entry: Entry) -> float:
-    """Return the number of a rule's measure in a run on a scene; NaN where undefined."""
+    """Return the number of a rule's measure in a run on a scene; NaN if undefined."""
     if rule.measure.quantity is FLICKER:
         return float(np.mean(list(entry.flicker.values())))
     if rule.measure.quantity is COVERAGE:

@@ -87,8 +87,8 @@ def gate(new: str | os.PathLike[str], against: str | os.PathLike[str] | None, co
     """Assess a run, or 'FOLDER:MODEL', by rules; those on a drop or a rise need a baseline, a run or a small summary.
 
     Args:
-        new: Folder of a run, 'FOLDER:MODEL' where it has several models, or a result in memory.
-        against: The baseline: likewise, or a small summary; None where no rule needs one.
+        new: Folder of a run, 'FOLDER:MODEL' if it has several models, or a result in memory.
+        against: The baseline: a run, as `new`, or a small summary; None if no rule needs a baseline.
         config: The rules.
 
     Returns:
@@ -141,7 +141,7 @@ def _rules(given: Rule, runs: GateRuns) -> tuple[tuple[Rule, ...], list[str]]:
 
 
 def _of_lost_class(rule: Rule, pairs: Sequence[Pair]) -> Judgement:
-    """Return that a rule is undecided, with the mean of the baseline over the scenes where it has the class."""
+    """Return an undecided judgement on a rule, with the baseline's mean over the scenes in which it has the class."""
     base = float(np.nanmean([value_of(rule, old) for _, old in pairs if old is not None]))
     return Judgement(rule, "undecided", dataclasses.replace(UNKNOWN, undecided=LOST), math.nan, base)
 

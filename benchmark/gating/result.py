@@ -31,8 +31,8 @@ EXIT_CODES: Mapping[Verdict, int] = {"passes": 0, "fails": 4, "undecided": 5}
 def verdict(rule: Rule, interval: Interval) -> Verdict:
     """Return the verdict on a rule from an interval, each end of which is missed with the gate's level.
 
-    A rule passes where the whole interval is within the limit, and fails where none of it is; a loss fails as soon as
-    it is shown and not shown to be smaller than the limit. A number that is known is not undecided.
+    A rule passes if the whole interval is within the limit, and fails if the whole interval is outside. A loss fails as
+    soon as it is shown and not shown to be smaller than the limit. A number that is known is not undecided.
     """
     if interval.undecided or math.isnan(interval.low) or math.isnan(interval.high):
         return "undecided"
@@ -63,7 +63,7 @@ class Judgement:
 
     Attributes:
         interval: The change, or the number itself, that the rule bounds, with one-sided ends at the gate's level.
-        new, base: The numbers of both runs, NaN where there is none.
+        new, base: The numbers of both runs, NaN without a number.
     """
 
     rule: Rule
@@ -86,10 +86,10 @@ class Judgement:
         return self.interval.scope
 
     def frames_needed(self, level: float) -> int | None:
-        """Return the number of frames that decide the rule with a probability of POWER; None where no number does.
+        """Return the number of frames that decide the rule with a probability of POWER, or None if no number does.
 
-        A rule on a change has to pass where nothing changed; one on a value where the value is the measured one. The
-        standard error falls with the square root of the frames of this scene.
+        A rule on a change has to pass if nothing changed; a rule on a value has to be decided if the value is the
+        measured value. The standard error falls with the square root of the frames of this scene.
         """
         from scipy import special
 
@@ -149,7 +149,7 @@ class GateResult:
     """The whole result of a gate.
 
     Attributes:
-        new, against: The run, and the baseline, empty where there is none.
+        new, against: The run, and the baseline, empty without a baseline.
         undecided: The outcome of undecided rules, see `GateConfig`.
         notes: Further remarks for the reader.
     """
@@ -192,5 +192,5 @@ class GateResult:
 
     @property
     def exit_code(self) -> int:
-        """Exit code of the command: 0 where the gate passes, 4 where it fails, 5 where it is undecided."""
+        """Exit code of the command: 0 if the gate passes, 4 if it fails, 5 if it is undecided."""
         return EXIT_CODES[self.outcome]

@@ -36,14 +36,14 @@ Number = Literal["alpha", "flicker", "accuracy", "miou", "wrong_of_consistent"]
 """The numbers of a headline; flicker does not follow from sums, so that runs have it, and the table does not."""
 
 WITHOUT_NUMBERS = {"description", "get", "license", "citation", "superseded_by"}
-"""What may change in a version: words, no number follows from them."""
+"""Fields that may change in a version: texts, from which no number follows."""
 
 
 IN_A_RUN = (
     "scenes", "frames", "scene_frames", "taxonomy", "voxel_size", "pixel_stride", "exclude", "critical_classes",
     "statistics",
 )  # fmt: skip
-"""The settings of a run that a definition fixes, beside its dataset."""
+"""The settings of a run that a definition fixes, in addition to its dataset."""
 
 
 class Benchmark(Settings):
@@ -60,7 +60,7 @@ class Benchmark(Settings):
     file: str | None = Field(None, exclude=True, description="the file, of a definition that does not ship")
     id: str = Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9_-]*@[1-9][0-9]{0,3}$", description="NAME@VERSION, as its file")
     description: str = Field(min_length=1, description="one line")
-    get: str = Field("", description="how the data is obtained, one line; nothing where it is built in")
+    get: str = Field("", description="how to get the data, one line; empty for built-in data")
     license: str = Field(min_length=1, description="licence of the data")
     citation: str = Field(min_length=1, description="whom users of the data cite")
     superseded_by: str | None = Field(None, description="the version to use instead of this one")
@@ -69,13 +69,13 @@ class Benchmark(Settings):
     flights: dict[str, tuple[str, ...]] = Field({}, description="scenes that are the same place flown again, by place")
     frames: FrameSelection = Field(FrameSelection(), description="frames that are fused")
     scene_frames: dict[str, FrameSelection] = Field({}, description="frames of single scenes, instead of `frames`")
-    taxonomy: str | None = Field(None, description="label space to fuse in; that of the labels where not given")
+    taxonomy: str | None = Field(None, description="label space to fuse in; by default the label space of the labels")
     voxel_size: float = Field(ge=1e-3, le=1e3, description="edge, metres")
     voxel_sizes: tuple[float, ...] = Field((), description="further edges, metres, at which the maps are fused as well")
     pixel_stride: int = Field(1, ge=1, description="use every n-th pixel of each axis")
     exclude: Exclusion = Field(Exclusion(), description="classes and pixels that are left out")
     critical_classes: tuple[str, ...] = Field((), description="classes of the verdict")
-    statistics: bool = Field(False, description="also accuracy, where there is ground truth")
+    statistics: bool = Field(False, description="also accuracy, with ground truth")
     measures: tuple[Number, ...] = Field(("alpha",), min_length=1, description="of the headline; the first one ranks")
     digests: dict[str, str] | None = Field(
         None, description="short hashes of each frame's depth and pose, by scene; null where nobody had the data yet"
@@ -115,10 +115,10 @@ class Benchmark(Settings):
         """Return the settings of a run of it.
 
         Args:
-            data: Folder of its data; none where that is built in.
-            labels: Folder of label maps, SCENE/MODEL/NAME below it; the data's own where not given.
+            data: Folder of its data; None for built-in data.
+            labels: Folder of label maps, SCENE/MODEL/NAME below it; the data's own by default.
             predictors: Models that predict, instead of label maps.
-            models: Names of label sources; all where not given.
+            models: Names of label sources; all by default.
             taxonomy: The classes of its taxonomy, with the names that the labels have for them among the members.
 
         Raises:

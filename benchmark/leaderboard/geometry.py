@@ -140,7 +140,7 @@ def keys_of(part: ClusterSums) -> Int64:
 
 
 def rows_in(keys: Int64, of: Int64) -> Int64:
-    """Return which of the rows (m, 4), all distinct, each of the keys (n, 4) is; -1 for one that is none of them."""
+    """Return the number of each key (n, 4) among the distinct rows (m, 4), or -1 for a key that is not a row."""
     row = {tuple(key): number for number, key in enumerate(of.tolist())}
     return np.array([row.get(tuple(key), -1) for key in keys.tolist()], np.int64)
 
@@ -156,7 +156,7 @@ class _Content:
 
 
 def geometry_file(definition: Path) -> Path:
-    """Return the file beside a definition that has its spots."""
+    """Return the file next to a definition that has its spots."""
     return definition.with_name(definition.stem + SUFFIX)
 
 

@@ -57,11 +57,11 @@ Line = Annotated[str, Field(max_length=LONGEST_LINE), AfterValidator(_one_line)]
 
 
 class ModelCard(Settings):
-    """What whoever hands a result in says of the model."""
+    """Description of a model by the people who submit its result."""
 
-    name: Line = Field("", description="its name in the table; that of the label source where not given")
+    name: Line = Field("", description="its name in the table; by default the name of the label source")
     by: Line = Field("", description="who made it")
-    url: Line = Field("", pattern=r"^(https?://\S+)?$", description="where it is found")
+    url: Line = Field("", pattern=r"^(https?://\S+)?$", description="its web page")
     license: Line = Field("", description="licence of the weights")
     parameters: float | None = Field(None, gt=0, description="number of its parameters, millions")
     trained_on: Line = Field("", description="training data")
@@ -75,14 +75,14 @@ class ModelCard(Settings):
 
 @dataclass(frozen=True)
 class Submission:
-    """What stands beside the sums of a result that was handed in.
+    """Description of a submitted result, in addition to its sums.
 
     Attributes:
-        benchmark: NAME@VERSION; digest that of its definition.
+        benchmark: NAME@VERSION; `digest` is the digest of its definition.
         made: Day, year first.
-        semstab, python, platform, processor, cores, packages: What it was computed with.
+        semstab, python, platform, processor, cores, packages: Software and machine of the computation.
         predicted: Whether the model predicted in this very run, so that milliseconds are its own.
-        milliseconds: Of the model for a frame, on that machine; NaN where label maps were read.
+        milliseconds: Time of the model for a frame, on this machine; NaN if label maps were read.
     """
 
     benchmark: str
@@ -237,7 +237,7 @@ def _about(benchmark: Benchmark, result: Result, config: Config, handle: RunHand
 
 
 def _require_statement(path: Path, about: Submission) -> None:
-    """Raise DataError where what stands beside the sums is no statement: a line of text, a day, a time."""
+    """Raise DataError if a field next to the sums is not valid: a line of text, a day, a time."""
     texts = {name: getattr(about, name) for name in ("made", "semstab", "python", "platform", "processor")}
     texts |= {f"packages.{name}": f"{name} {version}" for name, version in about.packages.items()}
     for name, text in texts.items():

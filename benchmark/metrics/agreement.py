@@ -91,7 +91,7 @@ def require_same_grid(*tables: VoxelTable | Events) -> None:
         if (first.K, first.voxel_size) != (other.K, other.voxel_size):
             raise DataError(
                 f"maps of {first.K} classes in voxels of {first.voxel_size:g} m and of {other.K} in"
-                f" {other.voxel_size:g} m cannot be compared; fuse both alike"
+                f" {other.voxel_size:g} m cannot be compared; fuse both with the same settings"
             )
 
 

@@ -1,4 +1,4 @@
-"""Formulas of predicted classes beside the true ones, from sums over pixels or voxels: IoU and calibration."""
+"""Formulas of predicted against true classes, from sums over pixels or voxels: IoU and calibration."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ BINS = 15
 
 
 def iou(right: npt.NDArray[Any], true: npt.NDArray[Any], predicted: npt.NDArray[Any]) -> Float64:
-    """Return intersection over union (...,) from the right, the true and the predicted; NaN where there is neither."""
+    """Return intersection over union (...,) from the right, the true and the predicted; NaN for a union of 0."""
     union = true + predicted - right
     with np.errstate(invalid="ignore", divide="ignore"):
         ratio: Float64 = np.where(union.real > 0, right / union, np.nan)
@@ -36,7 +36,7 @@ def confidence_bin(confidence: Float64) -> Int64:
 
 
 def calibration_error(gap: Float64, count: Float64) -> Float64:
-    """Return the expected calibration error (...,) (Guo et al. 2017, ICML); NaN where nothing is counted.
+    """Return the expected calibration error (...,) (Guo et al. 2017, ICML); NaN for counts of 0.
 
     sum_b |right_b - confidence_b| / n.
 

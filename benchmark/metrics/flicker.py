@@ -21,7 +21,7 @@ from semstab.pixels.warp import DEPTH_TOLERANCE, Correspondence, correspond
 def flicker_percent(previous: Frame, current: Frame) -> float:
     """Return the share of the pixels valid in both frames whose label differs, same pixel coordinates, in percent.
 
-    Soft scores count by their largest class. NaN where no pixel is valid in both.
+    Soft scores count by their largest class. NaN if no pixel is valid in both.
 
     Raises:
         DataError: If the frames differ in size.
@@ -50,8 +50,8 @@ class CompensatedFlicker:
     """Flicker between two views of the same surface points.
 
     Attributes:
-        flicker_percent: Percentage of the co-visible pixels whose label differs; NaN where no pixel is co-visible.
-        share: Share of the current frame's valid pixels that are co-visible, 0 to 1; NaN where none is valid.
+        flicker_percent: Percentage of the co-visible pixels whose label differs; NaN if no pixel is co-visible.
+        share: Share of the current frame's valid pixels that are co-visible, 0 to 1; NaN if no pixel is valid.
     """
 
     flicker_percent: float
@@ -64,12 +64,12 @@ def compensated_flicker(
 ) -> CompensatedFlicker:  # fmt: skip
     """Return flicker after the previous frame's labels are warped into the current one: camera motion is not counted.
 
-    A pixel is co-visible where it is valid, the previous camera saw the same surface point (see
+    A pixel is co-visible if it is valid, the previous camera saw the same surface point (see
     `semstab.pixels.warp.correspond`), and the pixel that saw it was valid too. Soft scores count by their largest
-    class; the frames may differ in size. Equals `flicker_percent` where camera and depth stay as they are.
+    class; the frames may differ in size. Equals `flicker_percent` if camera and depth stay as they are.
 
-    Scans meet by voxels of that size, in metres: a point is compared with the label that most points of the previous
-    scan have in its voxel (see `semstab.pixels.scans.dominant_before`).
+    Scans are matched by voxels of `voxel_size`, in metres: a point is compared with the label that most points of the
+    previous scan have in its voxel (see `semstab.pixels.scans.dominant_before`).
 
     `seen` has the pixels of the previous frame that show the same, if they do not follow from depth and pose.
 
@@ -135,12 +135,12 @@ class VideoConsistency:
         self._clips = _Clips(n)
 
     def add(self, labels: Labels, valid: Mask, truth: Labels) -> float:
-        """Add the next frame; return the consistency of the clip that ends with it, NaN where none does.
+        """Add the next frame; return the consistency of the clip that ends with it, or NaN without such a clip.
 
         Args:
             labels: (H, W) predicted ids.
             valid: (H, W) pixels that count: neither prediction nor truth is ignored; a pixel counts in a clip
-                where it counts in all of its frames.
+                if it counts in all frames of the clip.
             truth: (H, W) ground truth ids.
 
         Raises:
@@ -164,12 +164,12 @@ class VideoConsistency:
 
     @property
     def value(self) -> float:
-        """Mean over the clips in which a pixel counts, 0 to 1; NaN where there is none."""
+        """Mean over the clips in which a pixel counts, 0 to 1; NaN without clips."""
         return self._clips.mean
 
     @property
     def published(self) -> float:
-        """The same without the last clip of each video, 0 to 1; NaN where there is none."""
+        """Mean without the last clip of each video, 0 to 1; NaN without clips."""
         return self._clips.published
 
     @property
@@ -204,7 +204,7 @@ class SelfConsistency:
 
     @property
     def value(self) -> float:
-        """Mean over the clips in which a pixel counts, 0 to 1; NaN where there is none."""
+        """Mean over the clips in which a pixel counts, 0 to 1; NaN without clips."""
         return self._clips.mean
 
     @property
@@ -300,10 +300,11 @@ class RegionChange:
     """The change of regions between two frames.
 
     Attributes:
-        flicker_percent: Percentage of the pixels valid in both that left their region; NaN where there are none.
+        flicker_percent: Percentage of the pixels valid in both that left their region; NaN without such pixels.
         matched: Number of regions in both frames.
         births, deaths: Number of new regions of the current frame, and of lost ones of the previous frame.
-        variation_of_information: Bits between the two partitions, the unassigned pixels being one part; NaN likewise.
+        variation_of_information: Bits between the two partitions, in which the unassigned pixels are one part; NaN
+            without valid pixels.
     """
 
     flicker_percent: float
@@ -330,7 +331,7 @@ def matched_region_flicker(
     Args:
         previous: (H, W) region ids of the previous frame, 0 for a pixel without a region.
         current: (H, W) region ids of the current frame.
-        valid: (H, W) pixels that count; all where not given.
+        valid: (H, W) pixels that count; all by default.
         iou_threshold: IoU that a pair must exceed.
 
     Raises:

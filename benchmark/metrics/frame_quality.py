@@ -54,7 +54,7 @@ class FrameQualityMeter:
         self._before = frame, model, truth
 
     def result(self, model: str, filters: str, milliseconds: float) -> FrameQuality:
-        """Return the quality so far of filters over a model, which took so many milliseconds per frame."""
+        """Return the quality so far of filters over a model; `milliseconds` is the time of the filters per frame."""
         n = dict(zip(COUNTS, self._counts.tolist(), strict=True))
         right = np.diag(self._confusion)
         return FrameQuality(
@@ -149,7 +149,7 @@ class Lag:
 
     @property
     def mean(self) -> float:
-        """The mean in frames; NaN where nothing changed."""
+        """The mean in frames; NaN without changes."""
         if not self._waiting[0]:
             return math.nan
         waiting = np.maximum(self._waiting, 1)

@@ -33,7 +33,7 @@ COLUMNS = ("compensated_flicker_percent", "compensated_share", "vc8", "vc16", "s
 """Numbers of a frame and those before it, by the name of their mean over all frames."""
 
 EDGES_EVERY = 8
-"""One frame out of so many is searched for edges."""
+"""Every n-th frame is searched for edges, n being this number."""
 
 SIDE = 640
 """Pixels of the longer side from which on every n-th pixel of each axis is measured, so that fusion does not wait."""
@@ -97,7 +97,7 @@ class ImageSpaceMeter:
 
 
 def mean_over_scenes(rows: Iterable[ImageSpace]) -> ImageSpace:
-    """Return the macro mean of each number over scenes: each of them counts once, where it has the number."""
+    """Return the macro mean of each number over scenes: each scene with the number counts once."""
     known = list(rows)
     names = [field.name for field in dataclasses.fields(ImageSpace)]
     return ImageSpace(**{name: macro_mean([getattr(row, name) for row in known]) for name in names})

@@ -39,7 +39,7 @@ MOST_CONFUSED = 1024
 """Most classes of a taxonomy whose confusions are summed up."""
 
 CROWDED, PARTS = 0.5, 3
-"""A last stratum that holds more than this share of the voxels is split into so many parts of about equal size."""
+"""A last stratum that holds more than the share CROWDED of the voxels is split into PARTS parts of about equal size."""
 
 
 def summarise(table: VoxelTable, edges: Sequence[int] = STRATA) -> TableSummary:
@@ -53,7 +53,7 @@ def summarise(table: VoxelTable, edges: Sequence[int] = STRATA) -> TableSummary:
 
 @dataclass(frozen=True, eq=False)
 class TableSums:
-    """The sums behind a map's summary; those of the parts of a map add up to those of the map.
+    """The sums behind a map's summary; the sums of the parts of a map add up to the sums of the map.
 
     Attributes:
         total: (3,) points, observations, voxels.
@@ -163,8 +163,8 @@ def _steps(edges: Sequence[int]) -> list[int]:
 def _by_group(values: Sequence[Float64], op: Int32, group: Int64, groups: int) -> Float64:
     """Return (1 + 3 M, groups) of the values (n,) of M measures.
 
-    The first row counts voxels; then each measure has its sum, the number of voxels where it is defined, and the
-    number whose OP is high enough for it.
+    The first row counts voxels. Then each measure has its sum, the number of voxels with a defined value, and the
+    number of voxels whose OP is high enough for it.
     """
     levels = sorted({1, *(measure.lowest_op for measure in measures())})
     enough = [np.where(op >= level, 1.0, np.nan) for level in levels]
@@ -241,7 +241,7 @@ def pool(groups: Sequence[Means], voxels: int) -> Means:
 
 
 def macro_mean(values: Sequence[float]) -> float:
-    """Return the mean over scenes, each counting once, of those where the value is defined; NaN where none is."""
+    """Return the mean over the scenes with a defined value, each counting once, or NaN without such scenes."""
     return mean(np.array(values, dtype=np.float64))
 
 
@@ -312,6 +312,6 @@ def categorise(
 
 
 def category_shares(table: VoxelTable, thresholds: CategoryThresholds | None = None) -> dict[str, float]:
-    """Return the share of the voxels in each category, 0 to 1, by name; NaN where the map is empty."""
+    """Return the share of the voxels in each category, 0 to 1, by name; NaN for an empty map."""
     counts = np.bincount(categories(table, thresholds), minlength=len(CATEGORIES))
     return {name: float(n / len(table)) if len(table) else math.nan for name, n in zip(CATEGORIES, counts, strict=True)}

@@ -32,14 +32,13 @@ class TemporalConsistency:
 
     - 'vspw': intersections and unions are summed over all pairs of all videos; the mean is over the classes that any
       frame's own labels have (Miao et al. 2021, CVPR, VSPW; TC_cal.py).
-    - 'etc': likewise, but the mean is over all K classes; one that occurs nowhere counts 0 (Liu et al. 2020, ECCV,
-      ETC; tool/eval_tc.py).
+    - 'etc': the same sums, but the mean is over all K classes; a class that occurs nowhere counts 0 (Liu et al. 2020,
+      ECCV, ETC; tool/eval_tc.py).
     - 'ssp': the mean over the videos of the mean over their pairs of the mean over the classes that the pair has
       (Hesham et al. 2025, CVPR, SSP; utils/metrics.py).
 
-    A pixel whose own label is none of the K classes does not count. One whose warped label is none does not count
-    either, but for 'etc', where it counts in the union of its own class. The scripts of VSPW and SSP end with an error
-    there.
+    A pixel whose own label is not one of the K classes does not count. A pixel whose warped label is not a class counts
+    for 'etc' only, in the union of its own class. The scripts of VSPW and SSP end with an error at such a pixel.
 
     Args:
         num_classes: K.
@@ -60,12 +59,12 @@ class TemporalConsistency:
         self._videos: list[float] = []
 
     def add(self, labels: Labels, warped: Labels, counted: Mask | None = None) -> float:
-        """Add a pair of frames; return its own mean IoU over the classes that it has, NaN where no pixel counts.
+        """Add a pair of frames; return its own mean IoU over the classes that it has, or NaN if no pixel counts.
 
         Args:
             labels: (H, W) ids of a frame.
             warped: (H, W) ids of the next frame at the frame's pixels, see `warp_labels`.
-            counted: (H, W) pixels that count, such as those that are not occluded; all by default.
+            counted: (H, W) pixels that count, such as pixels that are not occluded; all by default.
 
         Raises:
             DataError: If the sizes differ.
@@ -93,7 +92,7 @@ class TemporalConsistency:
 
     @property
     def value(self) -> float:
-        """TC of the videos so far, 0 to 1; NaN where no pixel counts."""
+        """TC of the videos so far, 0 to 1; NaN if no pixel counts."""
         return self.of(self.form)
 
     def of(self, form: Form) -> float:
@@ -105,10 +104,11 @@ class TemporalConsistency:
 
     @property
     def sums(self) -> npt.NDArray[np.int64]:
-        """(4, K) pixels of each class, of which 'vspw' and 'etc' are made; those of several videos add up.
+        """(4, K) pixels of each class, from which 'vspw' and 'etc' are computed; sums of several videos add up.
 
-        Of the own and the warped labels both, of the own ones, of the warped ones, and of the own ones where the warped
-        label is none, which the first three leave out.
+        The rows count pixels that have the class in the own and the warped labels, in the own labels, and in the warped
+        labels. The last row counts pixels of the own labels whose warped label is not a class, which the first three
+        rows leave out.
         """
         return self._sums.copy()
 
@@ -118,7 +118,7 @@ SUMS = 4
 
 
 def pooled_tc(sums: npt.NDArray[np.int64], form: Literal["vspw", "etc"]) -> float:
-    """Return TC in a form that pools pixels, from `TemporalConsistency.sums`; NaN where no pixel counts."""
+    """Return TC in a form that pools pixels, from `TemporalConsistency.sums`; NaN if no pixel counts."""
     same, own, warped, lost = sums
     if form == "vspw":
         there = own > 0
@@ -164,7 +164,7 @@ def warp_labels(labels: Labels, flow: npt.NDArray[np.floating[Any]], sampling: S
 def _nearest(labels: Labels, x: npt.NDArray[Any], y: npt.NDArray[Any], outside: int) -> Labels:
     H, W = labels.shape
     column, row = np.rint(x), np.rint(y)
-    inside = (column >= 0) & (column < W) & (row >= 0) & (row < H)  # False where not finite
+    inside = (column >= 0) & (column < W) & (row >= 0) & (row < H)  # False if not finite
     warped = np.full(labels.shape, outside, dtype=labels.dtype)
     warped[inside] = labels[row[inside].astype(np.int64), column[inside].astype(np.int64)]
     return warped
@@ -183,7 +183,7 @@ def _linear(labels: Labels, x: Float32, y: Float32) -> Labels:
     return warped
 
 
-# Flow, and where it cannot be known.
+# Flow, and the pixels at which it cannot be known.
 
 
 def image_flow(image: UInt8, following: UInt8) -> Float32:

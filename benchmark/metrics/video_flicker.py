@@ -66,7 +66,8 @@ class VideoFlickerMeter(ImageSpaceMeter):
     Frames have colour. Motion is that between images of at most SIDE pixels a side. Two frames stay in memory.
 
     Attributes:
-        lone: How much of each frame stands alone, but of the first and the last, and beside a change of the size.
+        lone: How much of each frame stands alone, but for the first and the last frame, and next to a change of the
+            size.
         pixels: (K,) labelled pixels of each class.
         size: (width, height) of the last image.
     """

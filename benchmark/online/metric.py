@@ -43,7 +43,7 @@ class State:
     Attributes:
         updates: (n,) how often a further frame moved the belief of each voxel.
         spots: The sampled observations from which alpha is computed; None without alpha.
-        one_in: The table holds one in so many voxels.
+        one_in: The table holds a sample of one in `one_in` voxels.
         features: The sampled features; None without any.
     """
 
@@ -145,7 +145,7 @@ class _Map:
             self._left_out = int(np.count_nonzero(~in_sample(index, self._one_in)))
 
     def _drawn(self, frame: Frame) -> Frame:
-        """Return the frame without depth where it shows voxels that are left out."""
+        """Return the frame without the depth of pixels that show voxels outside of the sample."""
         if self._one_in == 1:
             return frame
         near = drawn_of(frame, self._voxel_size, ODD, self._one_in)
@@ -175,7 +175,7 @@ class TemporalStability:
         alpha: True to ask frames at the spots that give alpha and a verdict: half of the time of an update.
         max_voxels: The most voxels of a sequence; a larger map is sampled at random, so that its memory is bounded.
         backend: The backend that fuses.
-        of_torchmetrics: The arguments of `torchmetrics.Metric`, where it is installed.
+        of_torchmetrics: The arguments of `torchmetrics.Metric`, if torchmetrics is installed.
 
     Examples:
         >>> metric = semstab.TemporalStability(num_classes=3, voxel_size=0.1)
@@ -260,9 +260,9 @@ class TemporalStability:
     def compute(self) -> dict[str, float]:
         """Return alpha, vss_op3, sbd_op3 (bits), psa_op2, flicker (percent) and recurrent_share, means over sequences.
 
-        With features there is feature_alpha, too; the numbers of labels mean nothing where predicted was None.
+        With features there is feature_alpha, too; the numbers of labels mean nothing if predicted was None.
 
-        A run of these frames gives the same numbers; a number is NaN where undefined, as before the first update.
+        A run of these frames gives the same numbers; an undefined number is NaN, as before the first update.
         """
         rows = [state.scalars() for state in self.states().values()]
         names = dict.fromkeys((*Summary.NAMES, *(name for row in rows for name in row)))
@@ -331,7 +331,7 @@ class TemporalStability:
         return dataclasses.replace(frame, unlabelled=none) if none.any() else frame
 
     def _checked(self, k: int, labels: npt.NDArray[Any]) -> npt.NDArray[Any]:
-        """Return labels as uint8, or uint16 where there are more classes; ignored pixels get the highest id."""
+        """Return labels as uint8, or uint16 with more classes; ignored pixels get the highest id."""
         dtype, none = (np.uint8, IGNORE_8BIT) if self.num_classes < IGNORE_8BIT else (np.uint16, IGNORE_16BIT)
         known = (labels >= 0) & (labels < self.num_classes)
         if not known.all():

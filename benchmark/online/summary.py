@@ -13,7 +13,7 @@ from semstab.data.statistics import UNKNOWN, MapStatistics
 
 @dataclass(frozen=True)
 class Summary:
-    """The numbers of one map; NaN where undefined.
+    """The numbers of one map; NaN if undefined.
 
     Attributes:
         frames: Frames that were fused.

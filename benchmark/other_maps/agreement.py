@@ -155,7 +155,7 @@ class MapAgreement:
 
 
 SAME, OTHER, ONLY_RUN, ONLY_OTHER = range(4)
-"""What two maps say of a voxel: one class (or the other map has none), two classes, or one map holds it alone."""
+"""Kinds of voxels of two maps: one class (or the other map has none), two classes, or a voxel of one map only."""
 
 
 @dataclass(frozen=True, eq=False)

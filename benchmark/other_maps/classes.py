@@ -20,7 +20,7 @@ from semstab.errors import ConfigError, DataError
 from semstab.other_maps.clouds import LAS_CLOUD, Cloud
 
 NONE = -1
-"""The class of a point whose class is none of the run's."""
+"""The class of a point whose class the run does not have."""
 
 SAME_COLOUR = 12.0
 """The largest distance of two colours, of 255 steps in each channel, that count as the same."""
@@ -135,7 +135,7 @@ def names_by_id(classes: str) -> dict[int, str]:
     """Return the names in a YAML file ID: NAME, in a taxonomy file, or in a taxonomy that ships.
 
     Raises:
-        ConfigError: If it is none of these.
+        ConfigError: For anything else.
     """
     if Path(classes).is_file():
         content = read_yaml(classes)
@@ -182,7 +182,7 @@ def palette_of(file: Path) -> dict[str, Sequence[int]]:
     The CSV file has the columns name, red, green, blue, as Kimera-Semantics reads them.
 
     Raises:
-        ConfigError: If it is none of these.
+        ConfigError: For any other file.
     """
     if not file.is_file():
         raise ConfigError(f"{file}: there is no such file")

@@ -39,13 +39,13 @@ Columns = dict[str, npt.NDArray[Any]]
 
 @dataclass(frozen=True, eq=False)
 class Stated:
-    """What a file says about itself.
+    """Description of a file by its own header.
 
     Attributes:
         names: Name of each class by its id.
-        crs: Reference system in words that pyproj reads, or its name, '' where none is stated.
-        system: The system of its coordinates; None where the file does not say it.
-        voxel_size: Edge of its voxels in metres, NaN where it is not stated.
+        crs: Reference system in words that pyproj reads, or its name; '' if not stated.
+        system: The system of its coordinates; None if not stated.
+        voxel_size: Edge of its voxels in metres, NaN if not stated.
         origin: (3,) coordinates of the corner of voxel (0, 0, 0).
     """
 
@@ -62,8 +62,8 @@ class Cloud:
 
     Attributes:
         points: (n, 3) coordinates of the file.
-        label: (n,) ids or names of classes; None where colours alone tell them.
-        colors: (n, 3) RGB, 0 to 255; None where there is none.
+        label: (n,) ids or names of classes; None if colours alone tell the classes.
+        colors: (n, 3) RGB, 0 to 255; None without colours.
         what: The field that holds the class, or COLOUR.
         faces: (m, 3) corners of the triangles of a mesh.
     """
@@ -135,7 +135,7 @@ def _cloud(
 
 
 def _labels(path: Path, what: str, values: npt.NDArray[Any]) -> npt.NDArray[Any]:
-    """Return classes (n,) as whole numbers or texts; a float counts where it is whole, as CloudCompare stores them."""
+    """Return classes (n,) as whole numbers or texts; a whole float counts, as CloudCompare stores them."""
     if values.ndim == 2 and values.shape[1] > 1:
         raise DataError(f"{path}: field '{what}' has {values.shape[1]} numbers a point; take the largest, and store it")
     values = values.reshape(-1)

@@ -209,7 +209,7 @@ MUCH = 0.05
 LESS = 0.2
 
 TIE = 0.005
-"""Of hypotheses whose scores differ by no more the first one counts."""
+"""Difference of scores up to which the first hypothesis counts."""
 
 SMALL = 0.1
 """A unit is not tried that makes a cloud smaller than this share of the map."""
@@ -247,16 +247,17 @@ class _Fit:
 def better_placement(
     points: Float64, row: Int64, grid: Grid, given: Placement, georeference: Georeference | None
 ) -> Found | None:
-    """Return a placement under which much more of a cloud lies in the map with its class; None where there is none.
+    """Return a placement under which much more of a cloud lies in the map with its class, or None without one.
 
-    Tried are frames of reference, units and exchanged or mirrored axes, then shifts by half a voxel along each axis.
+    The search tries frames of reference, units and exchanged or mirrored axes, then shifts by half a voxel along each
+    axis.
 
     Args:
         points: (n, 3) in the file's coordinates.
         row: (n,) their classes.
         grid: The map.
-        given: The placement that was asked for.
-        georeference: Of the scene, None where it has none.
+        given: The configured placement.
+        georeference: Georeference of the scene, or None.
     """
     drawn = np.linspace(0, len(points) - 1, min(SAMPLE, len(points))).astype(np.int64)
     points, row = points[drawn], row[drawn]

@@ -94,7 +94,7 @@ def _row(name: str, place: Place, point: Any, georeference: Any) -> dict[str, An
 
 
 def pictures(comparison: MapComparison) -> list[Figure]:
-    """Return a picture of each map: where it has the run's classes, and with ground truth which of the two is right."""
+    """Return a picture of each map: its classes against the run's, and their correctness with ground truth."""
     return [
         Figure(
             slug("maps", own.agreement.name),
@@ -109,11 +109,11 @@ def pictures(comparison: MapComparison) -> list[Figure]:
 
 RANK_OF_KIND = np.array([0.0, 3.0, 1.0, 2.0])
 RANK_OF_RIGHT = np.array([0.0, 3.0, 4.0, 4.0, 1.0])
-"""Of the voxels in a column the one with the highest rank is shown."""
+"""Ranks of kinds: a column of voxels shows the voxel with the highest rank."""
 
 
 def draw(comparison: MapComparison, own: Voxelwise) -> Canvas:
-    """Return the picture of a map beside the run's."""
+    """Return the picture of a map next to the run's."""
     union, run, georeference = own.laid_together(comparison.run), comparison.run, comparison.first.georeference
     size, up = run.grid.size, comparison.first.up or (0.0, 0.0, 1.0)
     laid = centers(union.index, size)

@@ -11,7 +11,7 @@ import numpy.typing as npt
 from semstab.core.types import Float32, Mask
 
 JUMP = 0.05
-"""An edge of depth is where it changes by this share from pixel to pixel."""
+"""Relative change of depth from pixel to pixel that counts as an edge."""
 
 
 def depth_edges(depth: Float32) -> Mask:

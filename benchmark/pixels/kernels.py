@@ -15,7 +15,7 @@ from semstab.core.compiled import compiled, parallel, serial
 def _seen_at(d: float, ray_x: float, ray_y: float, motion: Any, camera: Any) -> tuple[float, float, float]:
     """Return the column, row and depth in the other camera of the point at depth d along a ray.
 
-    Depth 0 where it is not seen.
+    The depth is 0 if the other camera does not see the point.
     """
     (fx, fy, cx, cy), (to_x, to_y, to_z) = camera, motion
     x, y = ray_x * d, ray_y * d
@@ -66,10 +66,10 @@ def blend(
 ) -> None:
     """Blend the other view's four nearest pixels that see the same surface and hold something, by linear weights.
 
-    The other arguments are those of `look_up`.
+    See `look_up` for the other arguments.
 
-    - `values`: (H', W', K) of the other view's pixels, 0 or more, all 0 where they hold nothing
-    - `out`: (H, W, K) zeros, is filled; 0 where there is nothing
+    - `values`: (H', W', K) of the other view's pixels, 0 or more, all 0 for pixels that hold nothing
+    - `out`: (H, W, K) zeros, is filled; stays 0 for pixels that see nothing
     """
     ray_x, ray_y = rays
     H, W, K = values.shape

@@ -57,8 +57,8 @@ def perturb(frame: Frame, noise: Perturbation, scene: str) -> Frame:
     - position: t + translation_noise n + translation_drift w, world axes
     - rotation: R exp(rotation_drift w) exp(rotation_noise n), rotation vectors in camera axes, about the camera
 
-    n is a standard normal number drawn anew in each frame, w the sum of one for each frame since the sequence began: a
-    random walk, 0 at frame 0, whose standard deviation grows with the square root of the index.
+    n is an independent standard normal number for each frame. w is the sum of one such number for each frame since the
+    sequence began: a random walk, 0 at frame 0, whose standard deviation grows with the square root of the index.
     """
     n = _random(noise, scene, POSE, frame.index).standard_normal(6)
     drifts = noise.translation_drift > 0 or noise.rotation_drift > 0

@@ -18,7 +18,7 @@ REACH = 1 << 14
 """Voxels to either side of the sensor within which scans are compared."""
 
 ROWS = 64
-"""Rows of such a picture, from the highest ray to the lowest: those of a common scanner."""
+"""Rows of such a picture, from the highest ray to the lowest, as many as a common scanner has."""
 
 
 def dominant_before(previous: Frame, current: Frame, voxel_size: float) -> Int32:
@@ -54,7 +54,7 @@ def pictured(frame: Frame, values: npt.NDArray[Any], fill: float) -> npt.NDArray
     """Return values (H, W) of a scan's points as a picture around the sensor (ROWS, WIDTH).
 
     Columns go once around from behind over the left, rows from the highest ray to the lowest; each pixel has the value
-    of the nearest point that falls into it, and `fill` where none does.
+    of the nearest point that falls into it, or `fill` without a point.
     """
     assert frame.points is not None
     there = np.flatnonzero((frame.depth > 0) & (frame.depth < np.inf))

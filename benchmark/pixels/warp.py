@@ -23,9 +23,9 @@ another view looks up meet none. A LiDAR of 64 beams has .04 in an image of 1241
 
 
 def density(depth: Float32) -> float:
-    """Return the share of the neighbours, beside and below, of pixels with depth that have depth as well, 0 to 1.
+    """Return the share of the neighbours, to the side and below, of pixels with depth that have depth too, 0 to 1.
 
-    It is about the chance that a point, seen by two views, meets depth in both. NaN where no pixel has depth.
+    It is about the chance that a point, seen by two views, meets depth in both. NaN if no pixel has depth.
     """
     known = (depth > 0) & (depth < np.inf)
     pairs = ((known[:, 1:], known[:, :-1]), (known[1:], known[:-1]))
@@ -39,7 +39,7 @@ class Correspondence:
     """The pixel of another view that sees the surface point behind each pixel of a frame.
 
     Attributes:
-        pixel: (H, W) int32 flat index into the other view's images, -1 where it does not see the point.
+        pixel: (H, W) int32 flat index into the other view's images, -1 if it does not see the point.
     """
 
     pixel: Int32
@@ -52,7 +52,7 @@ class Correspondence:
     def bring(self, values: npt.NDArray[Any], fill: Any = 0) -> npt.NDArray[Any]:
         """Return values (H', W', ...) of the other view at the frame's pixels, (H, W, ...).
 
-        `fill` where not visible.
+        Pixels that the other view does not see get `fill`.
         """
         flat = values.reshape(-1, *values.shape[2:])
         brought: npt.NDArray[Any] = flat[self.pixel]
@@ -87,7 +87,7 @@ def correspond(frame: Frame, other: Frame, *, depth_tolerance: float = DEPTH_TOL
 def warp(
     values: npt.NDArray[Any], source: Frame, target: Frame, *, depth_tolerance: float = DEPTH_TOLERANCE, fill: Any = 0
 ) -> tuple[npt.NDArray[Any], Mask]:
-    """Return values (H, W, ...) of source pixels (H', W', ...) as the target sees them, and where it does, (H, W).
+    """Return values (H, W, ...) of source pixels (H', W', ...) as the target sees them, and the mask of seen pixels.
 
     Labels, scores, colours: the nearest pixel's value, never a mixture. See `correspond`.
     """
@@ -111,11 +111,11 @@ def by_rows(matrix: Float64) -> tuple[tuple[float, ...], ...]:
 
 
 def carry(belief: Float32, source: Frame, target: Frame, *, depth_tolerance: float = DEPTH_TOLERANCE) -> Float32:
-    """Return beliefs (H', W', K) of the source's pixels as the target's pixels see them (H, W, K), 0 where none is.
+    """Return beliefs (H', W', K) of the source's pixels as the target's pixels see them (H, W, K), 0 without a belief.
 
-    Backward warping, linear between those of the four nearest pixels that see the same surface: their depth differs
-    from the point's distance z by at most depth_tolerance * z, and they have a belief. Nearest pixels, carried on from
-    frame to frame, would stay behind a camera that moves by less than half a pixel.
+    Backward warping, linear between the beliefs of the four nearest pixels that see the same surface: their depth
+    differs from the point's distance z by at most depth_tolerance * z, and they have a belief. Nearest pixels, carried
+    on from frame to frame, would stay behind a camera that moves by less than half a pixel.
     """
     from semstab.pixels.kernels import blend
 

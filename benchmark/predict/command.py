@@ -85,7 +85,7 @@ class ImageFiles:
 
 
 def chosen(names: Sequence[str] | None, known: Sequence[str], where: str) -> Sequence[str]:
-    """Return the named scenes, all where none are named.
+    """Return the named scenes, by default all.
 
     Raises:
         ConfigError: For one that is not there.
@@ -114,7 +114,7 @@ def file_job(pattern: str, frames: FrameSelection, out: Path | None) -> Job:
     """Return images by a pattern.
 
     Raises:
-        ConfigError: Without `out`, or where no image is selected.
+        ConfigError: Without `out`, or without a selected image.
     """
     if out is None:
         raise ConfigError("--images: predictions of single images need a folder; name it with --out")
@@ -136,8 +136,8 @@ def scene_jobs(
     `looks_at` names the parts of a frame that must be there, as for `select_frames`.
 
     Raises:
-        ConfigError: For a dataset without folders of its own where there is no `out`, and for a scene or frames that
-            are not there.
+        ConfigError: For a dataset without its own folders and without `out`, and for a scene or frames that do not
+            exist.
     """
     opened = open_dataset(dataset.name, dataset.options)
     names = chosen(scenes, opened.scenes, dataset.name)
@@ -246,11 +246,11 @@ def run(
     Args:
         predictor: Settings of `PredictorConfig` without options.
         options: Options of the model.
-        images: Folder or files of images, None where they are those of scenes.
-        dataset: Resolved settings of the dataset, where the images are those of scenes.
-        scenes: Names of the scenes; all where None.
+        images: Folder or files of images, None for images of scenes.
+        dataset: Resolved settings of the dataset, for images of scenes.
+        scenes: Names of the scenes; None for all.
         frames: Settings of `FrameSelection`.
-        out: Folder of the predictions; the scene's own where None.
+        out: Folder of the predictions; None for the scene's own.
         batch: Images that the model is given together.
         overwrite: Whether other predictions in the folder are replaced.
         quiet: Whether nothing is printed.

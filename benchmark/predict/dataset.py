@@ -46,7 +46,7 @@ class PredictedOptions(Settings):
     dataset: DatasetConfig = Field(description="a dataset with its options")
     models: list[PredictorConfig] = Field(min_length=1, description="each predicts every frame")
     frames: FrameSelection = Field(
-        FrameSelection(), description="frames that sequential models are shown, in order; those of the run by default"
+        FrameSelection(), description="frames that sequential models see, in order; by default the frames of the run"
     )
     scene_frames: dict[str, FrameSelection] = Field(
         default_factory=dict, description="frames of single scenes, instead of `frames`"
@@ -122,7 +122,7 @@ class PredictedDataset(Dataset):
         """Return the settings of a label source.
 
         Raises:
-            ConfigError: If there is none of that name.
+            ConfigError: If no label source has this name.
         """
         if source not in {**self.predictors, **self._hidden}:
             raise ConfigError(f"model '{source}' does not predict here; there is {', '.join(self.predictors)}")
@@ -132,7 +132,7 @@ class PredictedDataset(Dataset):
         """Return the model behind a label source, its filters included.
 
         Raises:
-            ConfigError: If there is none of that name.
+            ConfigError: If no label source has this name.
         """
         config = self.predictor(source)
         with self.lock:
@@ -149,9 +149,9 @@ class PredictedDataset(Dataset):
         return model
 
     def without_filters(self, source: str) -> str | None:
-        """Return the source whose maps the filters of this one take; None where it has none, or filters stored labels.
+        """Return the source whose maps the filters of a source take, or None without filters, or for stored labels.
 
-        It is among the models where one of them is the same without filters. Else it has a name of its own.
+        It is one of the models, if one is the same without filters. Else it has a name of its own.
         """
         config = self.predictor(source)
         if not config.filters or config.model == STORED:
@@ -219,7 +219,7 @@ class PredictedScene(Scene):
 
     @property
     def timestamps(self) -> Float64 | None:
-        """The inner scene's, where it has any."""
+        """Time stamps of the inner scene, if any."""
         return self._inner.timestamps
 
     def frame_name(self, index: int) -> str:
@@ -275,7 +275,7 @@ class PredictedScene(Scene):
         return self._inner.geometry(index, color=color)
 
     def color(self, index: int) -> UInt8 | None:
-        """Colour (H, W, 3) uint8 RGB, None where the frame has none."""
+        """Return the colour (H, W, 3) uint8 RGB, or None for a frame without colour."""
         return self._inner.color(index)
 
     def image_name(self, index: int) -> str:

@@ -23,7 +23,7 @@ from semstab.models.validation import Wrapped
 from semstab.pixels.warp import LEAST_DENSITY, carry, density
 
 Belief = Float32
-"""(H, W, K) float32: the belief of each pixel, which sums to 1 over the classes, or to 0 where there is none."""
+"""(H, W, K) float32: the belief of each pixel, which sums to 1 over the classes, or to 0 without a prediction."""
 
 REGISTRY = Registry(
     "filter",
@@ -143,7 +143,7 @@ def parse(text: str) -> FilterSpec:
 
 
 def too_sparse(filters: Sequence[FilterSpec], density: float) -> str | None:
-    """Return why filters that warp cannot be used with depth of that density; None where they can, or none warps."""
+    """Return why filters that warp cannot be used with depth of this density, or None if all filters can be used."""
     warped = [str(spec) for spec in filters if spec.kind.warps]
     if not warped or not density < LEAST_DENSITY:
         return None
@@ -155,7 +155,7 @@ def too_sparse(filters: Sequence[FilterSpec], density: float) -> str | None:
 
 
 def one_hot(rows: npt.NDArray[Any], K: int) -> Belief:
-    """Return beliefs that are certain: (H, W) rows 0..K-1, K where there is no prediction."""
+    """Return beliefs (H, W, K) that are certain, from (H, W) rows 0..K-1, or K for pixels without a prediction."""
     belief = np.zeros((rows.size, K + 1), dtype=np.float32)
     belief[np.arange(rows.size), rows.reshape(-1)] = 1
     return belief[:, :K].reshape(*rows.shape, K)
@@ -174,7 +174,7 @@ def normalised(belief: Belief) -> Belief:
 class Filtered(Wrapped):
     """A model behind filters in their order. Pixels without a prediction stay without.
 
-    Filters see its scores where it has any; else its labels count as certain.
+    Filters see its scores, if any; else its labels count as certain.
 
     Raises:
         ConfigError: For a model without classes.
@@ -201,7 +201,7 @@ class Filtered(Wrapped):
     def predict(
         self, images: Sequence[Image], *, scores: bool = False, geometry: Sequence[Frame] = ()
     ) -> list[Prediction]:
-        """See `Model`; an image of another size begins anew."""
+        """See `Model`; an image of another size begins a new sequence."""
         predictions = self.ask(images, self.inner.gives_scores, geometry)
         frames: Sequence[Frame | None] = geometry or [None] * len(images)
         return [self._filtered(*each, scores) for each in zip(predictions, images, frames, strict=True)]
@@ -246,7 +246,7 @@ def belief_of(prediction: Prediction, space: LabelSpace) -> Belief:
 def labels_of(belief: Belief, space: LabelSpace, like: npt.NDArray[Any]) -> Labels:
     """Return the likeliest class of each pixel, by its id in maps such as `like`.
 
-    It is the ignore id where there is no prediction.
+    Pixels without a prediction get the ignore id.
     """
     ids = np.array([*space.ids], dtype=like.dtype)[belief.argmax(axis=2)]
     ids[~belief.any(axis=2)] = ignore_id(like)
@@ -275,7 +275,7 @@ class Ema(Filter):
 class EmaWarped(Filter):
     """The same at each surface point: b_{t-1} is looked up where the pixel's surface point was, by depth and pose.
 
-    A pixel begins anew where that point was hidden or out of view, or where there is no depth.
+    A pixel begins again without b_{t-1} if its point was hidden or out of view, or if the pixel has no depth.
     """
 
     parameter = Ema.parameter

@@ -247,7 +247,7 @@ def _short(value: Any) -> str:
 # Soft scores class by class, as they go to disk: one map in memory at a time, or few where only the largest are stored.
 
 Maps = Callable[[], Iterator[Float32]]
-"""A function that gives the scores (H, W) of each class in order, anew at each call."""
+"""A function that returns a new iterator over the scores (H, W) of each class in order."""
 
 
 def resized(maps: Maps, shape: tuple[int, ...], where: str) -> Maps:

@@ -43,16 +43,16 @@ class ImageSequence(Protocol):
         ...
 
     def predicted(self, index: int, *, labels: Labels | None = None, scores: Scores | None = None) -> Frame | None:
-        """Return the frame with what was predicted on its image, at the depth's pixels.
+        """Return the frame with the predictions on its image, at the depth's pixels.
 
-        The result is None where there is no depth.
+        The result is None without depth.
         """
         ...
 
     def view(self, index: int, shape: tuple[int, int]) -> Frame | None:
         """Return depth and pose of the frame at the pixels of its image, of shape (H, W).
 
-        The result is None where there is no depth.
+        The result is None without depth.
         """
         ...
 

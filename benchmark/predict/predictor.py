@@ -86,7 +86,7 @@ class Stored(Model):
 
 
 class StoredSequence:
-    """A scene's frames at the pixels of the depth, with labels of one source; colour only where it is looked at."""
+    """A scene's frames at the pixels of the depth, with labels of one source; colour is read on demand."""
 
     labels_like_depth = True
 

@@ -19,9 +19,10 @@ from semstab.predict.sequence import PredictionObserver, SequenceOptions, predic
 
 
 class Producer(PredictionObserver):
-    """A model's predictions of one sequence, in a folder; those of an earlier start are reused.
+    """A model's predictions of one sequence, in a folder; predictions of an earlier start are reused.
 
-    One thread predicts, however many ask. A sequential model is shown its `frames` in order, whichever is asked for.
+    One thread predicts for all threads that ask. A sequential model sees its `frames` in order, whichever frame is
+    requested.
 
     Args:
         sequence: Images.
@@ -97,13 +98,13 @@ class Producer(PredictionObserver):
         return Prediction(labels, soft, features)
 
     def index_of(self, digest: str) -> int | None:
-        """Return the frame whose image has that digest, once it is there; None where none of the announced ones has."""
+        """Wait for the frame whose image has this digest, and return it, or None if no announced image has it."""
         with self._changed:
             self._changed.wait_for(lambda: digest in self._digests or not self._coming)
         return self._digests.get(digest)
 
     def seconds(self, index: int) -> float:
-        """Return the seconds that the model took for a frame, once; NaN where it did not, as its maps were there."""
+        """Return the seconds that the model took for a frame, at the first call; NaN later, and if maps were reused."""
         seconds = self._done.get(index, math.nan)
         if index in self._done:
             self._done[index] = math.nan

@@ -46,12 +46,12 @@ class RegionSeries:
 
     @property
     def flicker_percent(self) -> float:
-        """Mean over the pairs; NaN where there are none."""
+        """Mean over the pairs; NaN without pairs."""
         return macro_mean([change.flicker_percent for change in self.plain])
 
     @property
     def compensated_flicker_percent(self) -> float:
-        """The same without camera motion; NaN where it is not known."""
+        """Mean over the pairs without camera motion; NaN if the motion is unknown."""
         return macro_mean([change.flicker_percent for change in self.compensated])
 
     def write(self, path: Path) -> None:
@@ -139,7 +139,7 @@ class SequenceReport:
 
     @property
     def frames_per_second(self) -> float:
-        """The speed of the predicted frames, all included; NaN where there were none."""
+        """Speed of the predicted frames, all included; NaN without predicted frames."""
         return self.predicted / self.seconds if self.predicted else float("nan")
 
 
@@ -147,10 +147,10 @@ class PredictionObserver:
     """An observer of a prediction; override what is of interest."""
 
     def sequence_started(self, name: str, frames: int) -> None:
-        """Take note that a sequence of so many selected frames is begun."""
+        """Take note that a sequence of `frames` selected frames is begun."""
 
     def frame_done(self, shown: Picture, seconds: float) -> None:
-        """Take note of one more frame, and the model's seconds; NaN where it is reused from an earlier start."""
+        """Take note of one more frame, and the model's seconds, NaN for a frame of an earlier start."""
 
 
 def predict_sequence(
@@ -235,7 +235,7 @@ class _Work:
         return all(folder.has(picture.name, picture.digest) for folder in self.folders)
 
     def take(self, picture: Picture, anew: bool) -> None:
-        """Leave what is finished, unless everything is made anew; predict the rest in batches of one size."""
+        """Skip a finished picture, unless `anew`; collect other pictures, and predict in batches of one size."""
         if not anew and self.is_stored(picture):
             self._reused += 1
             self._tell(picture, math.nan)

@@ -52,7 +52,7 @@ class EncoderSettings(Settings):
 class VocabularySettings(Settings):
     """The content of a vocabulary's file."""
 
-    name: str | None = Field(None, min_length=1, description="its name; that of the file by default")
+    name: str | None = Field(None, min_length=1, description="its name; by default the name of the file")
     names: list[NameEntry] = Field(description="names, or name, synonyms, group")
     embeddings: Path | None = Field(
         None, description=".npy (n, D): a row for each name and then for each of its synonyms, in order"
@@ -105,7 +105,7 @@ class Vocabulary:
         """Read a vocabulary's file.
 
         Raises:
-            ConfigError: If the file is none, or two names are alike.
+            ConfigError: If the file is not a vocabulary, or two names are the same.
             DataError: If its embeddings cannot be used.
             MissingDependencyError: If its text encoder needs packages that are not installed.
         """

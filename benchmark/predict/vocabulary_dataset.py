@@ -28,7 +28,7 @@ TAKEN = (
     "settings_file", "labels_like_depth", "surface", "depth_from", "sources", "on_photographs", "skips_incomplete",
     "images_elsewhere", "of_scans", "made", "posed", "replaced", "in_program", "usual",
 )  # fmt: skip
-"""What a scene has from the scene below."""
+"""Attributes that a scene takes from the scene below."""
 
 
 class VocabularyOptions(Settings):
@@ -149,7 +149,7 @@ class VocabularyScene(Scene):
 
     @property
     def timestamps(self) -> Float64 | None:
-        """The inner scene's, where it has any."""
+        """Time stamps of the inner scene, if any."""
         return self._inner.timestamps
 
     def require_one_size(self, indices: Sequence[int]) -> None:
@@ -191,7 +191,7 @@ class VocabularyScene(Scene):
         return self._inner.intrinsics(index, shape)
 
     def color(self, index: int) -> UInt8 | None:
-        """Return the colour (H, W, 3) uint8 RGB, None where the frame has none."""
+        """Return the colour (H, W, 3) uint8 RGB, or None for a frame without colour."""
         return self._inner.color(index)
 
     def image(self, index: int) -> UInt8:

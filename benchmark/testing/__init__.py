@@ -69,7 +69,7 @@ class BackendConformance(EvidenceTests, GeometryTests, ContractTests, PropertyTe
         reach: Voxels that a map holds to either side of its first camera, 2^31 unless the backend reaches less far;
             points beyond are refused.
         long_cases: Whether the cases of very many frames (65,538) are run too.
-        scans: Whether the backend fuses scans of points too; False where it takes images alone.
-        scores: Whether it fuses soft scores too; False where it takes labels alone. Tests of what is left out are
-            skipped.
+        scans: Whether the backend fuses scans of points too; False for a backend of images alone.
+        scores: Whether it fuses soft scores too; False for a backend of labels alone. Tests of scans or scores are
+            skipped if the backend does not fuse them.
     """

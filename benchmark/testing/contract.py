@@ -123,7 +123,7 @@ class ContractTests(BackendTests):
                 np.testing.assert_array_equal(array, copy)
 
     def test_arrays_of_any_layout(self) -> None:
-        """Every second pixel of an image is a strided view, a transposed one is column-major: they fuse alike."""
+        """A strided view of every second pixel and a transposed (column-major) array fuse as packed copies do."""
         for frame in random_frames(1, count=2):
             strided = frame.every(2)
             packed = {

@@ -164,9 +164,10 @@ class GeometryTests(BackendTests):
     def test_pinhole_geometry(self) -> None:
         """A camera at (10.25, -19.75, 5.25) looks along x: its x axis is the world's y, its y axis the world's z.
 
-        With fx = 2, fy = 4, cx = 1, cy = 2, pixel (u, v) = (3, 0) at depth 8 lies at x_c = (3-1)/2*8 = 8,
-        y_c = (0-2)/4*8 = -4, z_c = 8, so at x_w = (18.25, -11.75, 1.25): voxel (36, -24, 2) of 0.5 m.
-        Pixel (0, 2) at depth 2: x_c = -1, y_c = 0, z_c = 2, x_w = (12.25, -20.75, 5.25): voxel (24, -42, 10).
+        The intrinsics are fx = 2, fy = 4, cx = 1, cy = 2. Voxels have 0.5 m.
+        Pixel (u, v) = (3, 0) at depth 8: x_c = (3-1)/2*8 = 8, y_c = (0-2)/4*8 = -4, z_c = 8.
+        In the world x_w = (18.25, -11.75, 1.25), in voxel (36, -24, 2).
+        Pixel (0, 2) at depth 2: x_c = -1, y_c = 0, z_c = 2, x_w = (12.25, -20.75, 5.25), in voxel (24, -42, 10).
         """
         depth = np.zeros((3, 4), dtype=np.float32)
         depth[0, 3], depth[2, 0] = 8, 2

@@ -33,10 +33,10 @@ logger = logging.getLogger("semstab")
 
 
 class Bag(OfBags, FileDataset[BagOptions]):
-    """{name} is the stamp of the colour image, 1305031102.175304000; of the depth image where there is no colour.
+    """{name} is the stamp of the colour image, 1305031102.175304000, or of the depth image without colour.
 
-    Label maps may be named by it with six digits, too, or as whole nanoseconds. They are in the folder that is called
-    as the bag is without its suffix: run/labels/MODEL/ beside run.bag.
+    Names of label maps may also have the stamp with six digits, or in whole nanoseconds. Label maps are in the folder
+    that has the bag's name without its suffix: run/labels/MODEL/ next to run.bag.
     """
 
     Options: type[BaseModel] = BagOptions
@@ -51,7 +51,7 @@ class Bag(OfBags, FileDataset[BagOptions]):
         return list(self.bags.values())
 
     def frames(self, folder: Path) -> list[FrameSource]:
-        """Return a frame for each depth image with a colour image; NaN is its pose where no two poses are around it.
+        """Return a frame for each depth image with a colour image; its pose is NaN without a pose before and after it.
 
         Raises:
             DataError: If the bag lacks a part, is damaged, or nothing fits together in time.
@@ -150,7 +150,7 @@ class Recorded:
         return at, partners[at]
 
     def _posed(self) -> Float64:
-        """Return (n, 4, 4) poses of the frames, NaN where there is none."""
+        """Return (n, 4, 4) poses of the frames, NaN for a frame without a pose."""
         frame = self._options.camera_frame or self._seen.frame
         poses, said = self._content.poses.around(self._stamps.tolist(), frame, "frame")
         self.sources.append(said)

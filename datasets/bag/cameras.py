@@ -30,9 +30,9 @@ def is_rectified(topic: str) -> bool:
 
 
 def camera_of(info: Any, where: str, *, rectified: bool) -> tuple[Camera, Lens | None]:
-    """Return the pinhole of a CameraInfo, in pixels of its image, and the lens of its raw images, None where none.
+    """Return the pinhole of a CameraInfo, in pixels of its image, and the lens of its raw images, or None without one.
 
-    A pinhole of rectified images is that of P; else it is that of K, and so is that of undistorted images.
+    The pinhole of rectified images comes from P. The pinhole of raw images, and of undistorted images, comes from K.
 
     Raises:
         DataError: If it is not calibrated, or its distortion is of another model, with `where`.

@@ -23,7 +23,7 @@ TYPES = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 8: "f8"}
 
 
 def label_field_of(message: Any) -> str | None:
-    """Return the name of the field of classes of a cloud; None where it has none."""
+    """Return the name of a cloud's field of classes, or None without such a field."""
     names = {field.name for field in message.fields}
     return next((name for name in LABEL_FIELDS if name in names), None)
 
@@ -34,7 +34,7 @@ def size_of(message: Any) -> int:
 
 
 def points_of(message: Any, where: str) -> npt.NDArray[np.floating[Any]]:
-    """Return points (N, 3) of a cloud, in the order of its bytes; NaN where it has them.
+    """Return points (N, 3) of a cloud, in the order of its bytes, with the NaN values of the cloud.
 
     Raises:
         DataError: If it has no x, y, z of floats, or is damaged, with `where`.

@@ -13,7 +13,7 @@ from semstab.datasets.formats.disk import files_named, natural, subfolders
 from semstab.errors import DataError
 
 CONTENTS = f"a ROS bag ({', '.join(SUFFIXES)}, or a folder of a rosbag2)"
-"""What a scene is, for error messages."""
+"""Description of a scene, for error messages."""
 
 
 class OfBags:
@@ -75,7 +75,7 @@ def find_bags(root: Path) -> list[tuple[SceneEntry, tuple[Path, ...]]]:
 
 
 def _bags_below(folder: Path, levels: int) -> Iterator[list[Path]]:
-    """Yield the bags in a folder and, up to so many levels, in the folders below it, each with its parts."""
+    """Yield the bags in a folder and in the folders up to `levels` levels below it, each with its parts."""
     if not folder.is_dir():
         return
     for suffix in SUFFIXES:

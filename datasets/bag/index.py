@@ -1,4 +1,4 @@
-"""What one pass over a bag finds: stamps and places of images, cameras over time, and poses. No pixel is kept."""
+"""Index of a bag from one pass: stamps and places of images, cameras over time, and poses. No pixel is kept."""
 
 from __future__ import annotations
 
@@ -56,7 +56,7 @@ class Stream:
         return (self.stamps - start) / NANOSECONDS
 
     def near(self, stamps: Int64, max_difference: float) -> list[int | None]:
-        """Return for each stamp the message nearest to it, None where none is within `max_difference` seconds."""
+        """Return for each stamp the message nearest to it, or None if `max_difference` seconds hold no message."""
         if not len(self):
             return [None] * len(stamps)
         wanted = (stamps - self.stamps[0]) / NANOSECONDS

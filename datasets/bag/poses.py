@@ -28,17 +28,17 @@ POSES: Mapping[str, Callable[[Any], tuple[str, Any]]] = {
 """The frame that a message's pose is of ('': it does not say) and the pose, by type; the first ones are preferred."""
 
 WORLDS = ("map", "world", "odom")
-"""What the frames of a world have in their names; the first ones are preferred."""
+"""Words in the names of frames of a world; the first words are preferred."""
 
 
 _OF_SENSOR = {
     "camera": re.compile("optical"),
     "sensor": re.compile("lidar|laser|velodyne|ouster|os_|livox|hesai|rslidar"),
 }
-"""What frames of a sensor itself have in their names: others are those of what it is mounted on, with other axes."""
+"""Patterns of names of a sensor's own frames; other frames belong to its mount, and have other axes."""
 
 SAME = 1000
-"""Nanoseconds by which a stamp of a file of poses may differ from that of the image that it is of."""
+"""Nanoseconds by which a stamp in a file of poses may differ from the stamp of its image."""
 
 
 def numbers_of(pose: Any) -> tuple[float, ...]:
@@ -49,7 +49,7 @@ def numbers_of(pose: Any) -> tuple[float, ...]:
 
 
 class SensorPoses:
-    """What a bag says about where its sensor is: add the messages of `topics`, then ask.
+    """Poses of a sensor from a bag: add the messages of `topics`, then ask.
 
     Args:
         bag: The bag.
@@ -113,12 +113,12 @@ class SensorPoses:
         return poses, f"poses    {where}; around {known} of {len(poses)} {what}s, at most {limit:g} s apart"
 
     def at(self, stamps: Sequence[int], sensor: str) -> tuple[Poses, str]:
-        """Return poses (n, 4, 4) of the sensor at stamps, NaN where they are not known, and where they come from.
+        """Return poses (n, 4, 4) of the sensor at stamps, NaN if unknown, and the source of the poses.
 
         `sensor` is the frame of its messages.
 
         Raises:
-            DataError: If nothing tells where it is.
+            DataError: If the bag has no poses of the sensor.
         """
         options = self._options
         sensor = bare(sensor)

@@ -51,7 +51,7 @@ def is_bag(path: Path) -> bool:
 
 
 def _endings(folder: Path) -> set[str]:
-    """Return the suffixes of a folder's files; that of a compressed one is the one before."""
+    """Return the suffixes of a folder's files; the suffix of a compressed file is the suffix before '.zstd'."""
     names = (name.lower().removesuffix(".zstd") for name in os.listdir(folder))  # noqa: PTH208  names, not paths
     return {os.path.splitext(name)[1] for name in names}  # noqa: PTH122
 
@@ -60,10 +60,10 @@ SPLIT = re.compile(r"(.*?)(?:_?\d{4}(?:-\d{2}){5})?_(\d{1,6})")
 """The name of a part of a recording: NAME_3, or of ROS 1 NAME_2024-05-31-10-15-00_3."""
 
 MOST_BETWEEN = 5 * NANOSECONDS
-"""A recording goes on in the next part before so many nanoseconds have passed, ..."""
+"""The next part of a recording begins within this number of nanoseconds after the end of the part before."""
 
 MOST_OVERLAP = NANOSECONDS
-"""... and messages that were under way may be in it that are earlier by so many."""
+"""The next part of a recording may begin this number of nanoseconds before the end of the part before."""
 
 
 def recordings(paths: Sequence[Path]) -> list[list[Path]]:
@@ -127,7 +127,7 @@ class OpenBag:
 
     Args:
         path: The file, or the folder of a rosbag2.
-        parts: The files of a recording that was split, of which `path` is the first, in the order of time.
+        parts: The files of a recording that was split, in the order of time; `path` is the first.
 
     Attributes:
         path: The same.
@@ -206,7 +206,7 @@ class OpenBag:
             yield name, place, message
 
     def first(self, topic: str) -> Any:
-        """Return the first message of a topic; None where there is none. Raises DataError."""
+        """Return the first message of a topic, or None without messages. Raises DataError."""
         return next((message for _, _, message in self.messages([topic])), None)
 
     def message(self, topic: str, place: Place) -> Any:

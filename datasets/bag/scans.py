@@ -50,8 +50,8 @@ class BagScanOptions(PoseOptions, ScanOptions):
 class BagScans(OfBags, ScanDataset[BagScanOptions]):
     """{name} is the stamp of the cloud in whole nanoseconds, 1305031102175304000.
 
-    Predictions may be named by it in seconds, too, with nine digits or six. They are in the folder that is called as
-    the bag is without its suffix: run/labels/MODEL/ beside run.bag.
+    Names of predictions may also have the stamp in seconds, with nine digits or six. Predictions are in the folder that
+    has the bag's name without its suffix: run/labels/MODEL/ next to run.bag.
     """
 
     Options: type[BaseModel] = BagScanOptions
@@ -74,7 +74,7 @@ class BagScans(OfBags, ScanDataset[BagScanOptions]):
         return bags
 
     def scans(self, entry: SceneEntry) -> list[ScanSource]:
-        """Return a scan for each cloud with points; NaN is its pose where no two poses are around it.
+        """Return a scan for each cloud with points; its pose is NaN without a pose before and after it.
 
         Raises:
             DataError: If the bag lacks a part, or is damaged.
@@ -96,7 +96,7 @@ class BagScans(OfBags, ScanDataset[BagScanOptions]):
 
 
 def _holds_clouds(path: Path) -> bool | None:
-    """Return whether a bag is one of clouds, False where it has depth; None where it has neither, or is not read."""
+    """Return True for a bag of clouds, False for a bag with depth, None for a bag without both or one not readable."""
     try:
         bag = OpenBag(path)
         if has_depth(bag):

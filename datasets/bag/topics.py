@@ -1,4 +1,4 @@
-"""Which topics of a bag hold depth, colour, labels and cameras: by type, encoding and name, or as options name them."""
+"""Choice of bag topics of depth, colour, labels and cameras: by type, encoding and name, or as options name them."""
 
 from __future__ import annotations
 
@@ -18,9 +18,9 @@ from semstab.errors import DataError
 INFO = "sensor_msgs/CameraInfo"
 
 LABELS = re.compile(r"label|semantic|segment|(?:^|[/_])seg(?:$|[/_])|(?:^|[/_])class(?:es)?(?:$|[/_])")
-"""What names of topics of label maps have in them."""
+"""Pattern of the names of topics of label maps."""
 REGISTERED = re.compile(r"aligned|registered")
-"""What names of depth in the pixels of colour have in them."""
+"""Pattern of the names of topics of depth in the pixels of colour."""
 NO_COLOR = re.compile(r"infra|(?:^|[/_])ir(?:$|[/_\d])|depth|disparity|thermal")
 TRANSPORT = re.compile(r"/(?:compressed|compressedDepth)$")
 
@@ -45,7 +45,7 @@ class Images:
 
 @dataclass(frozen=True)
 class Chosen:
-    """The topics that a scene is read from; None or empty where there is none.
+    """The topics that a scene is read from; None or empty for a missing topic.
 
     Attributes:
         depth: Depth images.
@@ -53,7 +53,7 @@ class Chosen:
         labels: Label maps by label source.
         depth_info: CameraInfo of the depth images.
         color_info: CameraInfo of the colour images.
-        others: Topics that could have been taken for depth or colour.
+        others: Other topics that could be depth or colour.
     """
 
     depth: Images | None
@@ -196,7 +196,7 @@ Rank = tuple[bool | int | str, ...]
 def _one(
     named: str | None, images: dict[str, Images], candidates: list[Images], rank: Callable[[Images], Rank]
 ) -> Images | None:
-    """Return the images of a named topic, else those of the lowest rank; None where there are none."""
+    """Return the images of a named topic, else the candidate of the lowest rank, or None without candidates."""
     return images[named] if named is not None else min(candidates, key=rank, default=None)
 
 
@@ -222,7 +222,7 @@ def _color_rank(images: Images, depth: Images | None) -> Rank:
 
 
 def _info_of(bag: OpenBag, images: Images) -> str | None:
-    """Return the CameraInfo of images: that of their namespace, else of their frame, else None."""
+    """Return the CameraInfo topic of images: the topic of their namespace, else of their frame, else None."""
     infos = bag.of_types(INFO)
     own = f"{images.base.rpartition('/')[0]}/camera_info"
     if own in infos:

@@ -43,7 +43,7 @@ SAMPLES: Mapping[bytes, np.dtype[Any]] = {b"DR": np.dtype("<f4"), b"D2": np.dtyp
 
 
 def read_mvei(path: Path, scale: float | None = None, read: Read = read_bytes) -> Float32:
-    """Return depth (H, W) of a depth-LN.mvei, float32, as lengths of rays; 0 where there is none.
+    """Return depth (H, W) of a depth-LN.mvei, float32, as lengths of rays; 0 for pixels without depth.
 
     `scale` is units in a metre.
 
@@ -101,7 +101,7 @@ def dmap_header(path: Path, data: bytes) -> DmapHeader:
 
 
 def read_dmap(path: Path, scale: float | None = None, read: Read = read_bytes) -> Float32:
-    """Return depth (H, W) of a .dmap along the optical axis, float32, 0 where there is none; raises as `read_mvei`."""
+    """Return depth (H, W) of a .dmap along the optical axis, float32, 0 without depth; raises as `read_mvei`."""
     data = read(path)
     header = dmap_header(path, data)
     return _metres(path, data, header.start, header.shape, header.dtype, (scale or 1) / 2.0**header.exponent)
@@ -149,7 +149,7 @@ FORMATS = {".bin": read_depth_map, ".mvei": read_mvei, ".dmap": read_dmap}
 
 
 def stored_scale(frame: FrameSource, options: FileOptions) -> float:
-    """Return units of a frame's depth file in a metre: those of the options, else the usual ones of its kind."""
+    """Return units of a frame's depth file in a metre: the units of the options, else the usual units of its kind."""
     usual = MILLIMETRES if frame.depth.suffix.lower() == ".png" else 1.0
     return options.depth_scale or frame.depth_scale or usual
 

@@ -81,7 +81,7 @@ class LabelSource:
 
     Attributes:
         folders: The listed content of folders.
-        first: The first frame that has a file, and the file; None where none has.
+        first: The first frame that has a file, and the file; None if no frame has a file.
     """
 
     kind: Kind
@@ -184,9 +184,9 @@ MOST_FRAMES = 50
 
 
 def unread_labels(options: LabelOptions, entry: SceneEntry, frames: Sequence[Named]) -> str | None:
-    """Return the images that are in a folder labels/ of which none is read, and the setting that reads them.
+    """Return the images of a folder labels/ from which no image is read, and the setting that reads the images.
 
-    None where options say where label maps are, or none is there.
+    Returns None if options name the label maps, or without such images.
     """
     folder = entry.folder / "labels"
     if options.labels is not None or options.labels_root is not None or not folder.is_dir() or not frames:
@@ -226,7 +226,7 @@ OTHER_SUFFIXES = (".tif", ".tiff", ".bmp", ".webp", ".gif")
 
 
 def _pattern(path: Path, names: Sequence[str]) -> str | None:
-    """Return the name of a file with {name} for the longest name of a frame in it, None where none is."""
+    """Return the name of a file with {name} for the longest name of a frame in it, or None without such a name."""
     there = [name for name in names if name in path.stem]
     return path.stem.replace(max(there, key=len), "{name}", 1) if there else None
 
@@ -319,7 +319,7 @@ class LabelMaps:
         """Return the files of a label source.
 
         Raises:
-            ConfigError: If there is none of that name.
+            ConfigError: If no label source has this name.
         """
         known = self._sources
         if model not in known:
@@ -359,9 +359,9 @@ class LabelMaps:
         return [*dict.fromkeys(lost)]
 
     def space(self, model: str) -> LabelSpace | None:
-        """Return the classes of a label source, read once; None for regions, and where no file or option has them.
+        """Return the classes of a label source, read once; None for regions, and if no file or option has the classes.
 
-        They are those of option taxonomies, else of a label_space.yaml next to its maps, else of the scene.
+        The classes come from option taxonomies, else from a label_space.yaml next to its maps, else from the scene.
 
         Raises:
             ConfigError: For one that cannot be used.
@@ -391,7 +391,12 @@ class LabelMaps:
             raise ConfigError(f"{self._folder}: {error}") from error
 
     def label_space(self, model: str, where: Path) -> LabelSpace:
-        """Return the same; raises DataError with `where` where they are not known, ConfigError where it has none."""
+        """Return the classes of a label source.
+
+        Raises:
+            ConfigError: For regions without classes.
+            DataError: If the classes are unknown; the message begins with `where`.
+        """
         source = self.source(model)
         if source.kind == "features":
             return OF_FEATURES
@@ -455,7 +460,7 @@ class LabelMaps:
         return scores
 
     def mask_file(self, frame: Named) -> Path | None:
-        """Return the mask of a frame, or the ground truth that says what moves, where it has one."""
+        """Return the file of a frame's mask, or of the ground truth with the moving classes, or None."""
         if self._masks is None and self.truth.moving and self.ground_truth:
             return self._sources[GROUND_TRUTH].file(frame)
         return None if self._masks is None else self._masks.file(frame)

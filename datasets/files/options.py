@@ -64,7 +64,7 @@ VoidIds = Annotated[dict[str, tuple[Id, ...]], Field(description="ids that mean 
 
 
 ZERO_IS_VOID: dict[str, tuple[int, ...]] = {GROUND_TRUTH: (0,)}
-"""`void_ids` of a dataset whose ground truth has 0 where there is no label."""
+"""`void_ids` of a dataset whose ground truth has 0 for pixels without a label."""
 
 
 class LabelSettings(Settings):
@@ -122,7 +122,7 @@ class FileSettings(LabelSettings):
 
     intrinsics_size: Size = None
     pixel_centre: PixelCentre = 0
-    frames_per_second: Positive | None = Field(None, description="for time stamps from 0 s, where there are none")
+    frames_per_second: Positive | None = Field(None, description="for time stamps from 0 s, if frames have none")
 
     @model_validator(mode="after")
     def _placed_in_a_system(self) -> Self:
@@ -290,16 +290,16 @@ class FrameSource:
         depth: The file.
         pose_file: The file that holds its pose, or all poses.
         camera: Intrinsics of the depth image.
-        pose: (4, 4) in the dataset's convention, where it is not in a file of its own.
-        label_camera: Intrinsics of the images of label maps, where that is another one.
-        label_lens: The same where they are distorted photographs.
-        depth_lens: Lens of the depth image, where that is distorted.
-        color_lens: Lens of the colour image, where that is distorted.
-        photograph: The distorted photograph, where label maps belong to it.
+        pose: (4, 4) in the dataset's convention, or None if a file has the pose.
+        label_camera: Intrinsics of the images of label maps, if they differ from `camera`.
+        label_lens: Lens of the images of label maps, if they are distorted photographs.
+        depth_lens: Lens of the depth image, if it is distorted.
+        color_lens: Lens of the colour image, if it is distorted.
+        photograph: The distorted photograph, if label maps belong to it.
         aliases: Other names that its label maps may have.
-        color: The file that it has, or would have; None where that is not known.
-        depth_scale: Units in a metre, where the dataset's own files say so.
-        depth_reader: Reads the depth file, where its suffix does not say how.
+        color: The file of the colour image, which may be missing, or None if its name is unknown.
+        depth_scale: Units of depth in a metre, if the dataset's own files state it.
+        depth_reader: Reads the depth file, if its suffix does not tell the format.
         timestamp: Seconds.
         confidence: Image of how sure each pixel's depth is; pixels below `least_confidence` have none.
     """
@@ -332,10 +332,10 @@ class Truth:
     """Description of ground truth that a format brings in files that are not label maps of a taxonomy's ids.
 
     Attributes:
-        read: Gives the stored ids of a file, where it is no label map.
-        ids: Table (65536,) from stored ids to those of the classes, `NO_ID` for an id that is none.
-        space: The classes, where no option says others for the ground truth.
-        moving: Stored ids of what moves; its pixels are masked where no option names other masks.
+        read: Reads the stored ids of a file that is not a label map.
+        ids: Table (65536,) from stored ids to class ids, `NO_ID` for an id without a class.
+        space: The classes, unless an option names other classes for the ground truth.
+        moving: Stored ids of moving objects; their pixels are masked unless an option names other masks.
     """
 
     read: LabelReader | None = None

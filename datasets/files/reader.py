@@ -143,7 +143,7 @@ class FileDataset(ScenesBelow[Options]):
         return Georeference.of(options.crs, options.offset or (0.0, 0.0, 0.0), f"{folder}: crs", options.linear)
 
     def mesh_origin(self, folder: Path, surface: Path) -> tuple[float, float, float] | None:
-        """Return the origin of a mesh's coordinates in the projection, None where they are the scene's."""
+        """Return the origin of a mesh's coordinates in the projection, or None if they are the scene's coordinates."""
         return None
 
     def depth_files(self, folder: Path, before: str, after: str, *, instead: Iterable[str]) -> dict[str, Path]:
@@ -151,10 +151,9 @@ class FileDataset(ScenesBelow[Options]):
 
         Args:
             folder: The folder of the depth images.
-            before: Part of the file's name before that of the frame.
-            after: Part of the file's name after it.
-            instead: Names of frames, by their poses or images, which a surface gives depth where no depth image is
-                there.
+            before: Part of the file's name before the name of the frame.
+            after: Part of the file's name after the name of the frame.
+            instead: Names of frames with a pose or an image, which get depth from a surface without a depth image.
         """
         there = files_named(folder, before, after)
         if self.options.surface is None:
@@ -183,7 +182,7 @@ class FileDataset(ScenesBelow[Options]):
 
 
 def with_poses_of(frames: tuple[FrameSource, ...], shift: int) -> tuple[FrameSource, ...]:
-    """Return the frames, each with the pose of the frame `shift` further on; NaN where there is none."""
+    """Return the frames, each with the pose of the frame `shift` further on, or NaN without such a frame."""
     if shift == 0:
         return frames
     lost = np.full((4, 4), np.nan)
@@ -196,7 +195,7 @@ def with_poses_of(frames: tuple[FrameSource, ...], shift: int) -> tuple[FrameSou
 
 
 def find_scenes(root: Path, is_scene: Callable[[Path], bool], contents: str) -> list[SceneEntry]:
-    """Return the root where it is a scene itself, else the scenes below it in natural order; one holds no other.
+    """Return the root if it is a scene itself, else the scenes below it in natural order; no scene holds another.
 
     Raises:
         DataError: If there is none, or two would have one name.

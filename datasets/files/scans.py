@@ -76,7 +76,7 @@ class ScanSource:
     Attributes:
         name: Name of the scan in path templates.
         points: The file.
-        pose: (4, 4) sensor-to-world, metres; NaN where there is none.
+        pose: (4, 4) sensor-to-world, metres; NaN for a scan without a pose.
         pose_file: The file that holds it.
         timestamp: Seconds.
         aliases: Other names that its label files may have.
@@ -97,9 +97,9 @@ class ScanDataset(ScenesBelow[Options]):
     """Scenes of scans below a root. A reader recognises a scene's folder, lists its scans, and reads points and ids.
 
     Attributes:
-        labels: Templates of predictions, of which the first that finds some counts.
+        labels: Templates of predictions; the first template that finds files counts.
         truth: Template of ground truth, or None.
-        taxonomy: The classes of the labels, where options name no others.
+        taxonomy: The classes of the labels, unless options name others.
         in_world: Whether points are in the world already; a pose is then only where the sensor was.
 
     Raises:
@@ -213,7 +213,7 @@ class ScanScene(Scene):
 
     @cached_property
     def timestamps(self) -> Float64 | None:
-        """Return (len,) seconds on the dataset's own clock; None where it has none."""
+        """Return (len,) seconds on the dataset's own clock, or None without a clock."""
         times = [scan.timestamp for scan in self._scans]
         return None if None in times else np.array(times, dtype=np.float64)
 
@@ -347,7 +347,7 @@ class ScanScene(Scene):
         return ids
 
     def _ids(self, file: Path, points: int) -> npt.NDArray[np.integer[Any]]:
-        """Return stored ids (N,) of a file of a scan of so many points, by whose number .label has another width."""
+        """Return stored ids (N,) of a scan with `points` points, which tell the width of the ids in a .label file."""
         size = file.stat().st_size if file.suffix == LABEL and file.is_file() else 0
         if points and size in (2 * points, 8 * points):
             return narrow_ids(file, self._files.read(file), points)
@@ -386,7 +386,7 @@ class ScanScene(Scene):
         return motion_in_sweep(before, self._scans[index].pose, after)
 
     def _source(self, model: str) -> LabelSource:
-        """Return the files of a label source; raises ConfigError if there is none of that name."""
+        """Return the files of a label source; raises ConfigError if no label source has this name."""
         known = self._sources | ({} if self._truth is None else {GROUND_TRUTH: self._truth})
         if model not in known:
             hint = nearest(model, [*known]) if self._sources else f"put its files into {self.label_paths[0]}"
@@ -465,10 +465,10 @@ MOST_TRAINED = 34
 
 
 def narrow_ids(path: Path, data: bytes, points: int) -> npt.NDArray[np.integer[Any]]:
-    """Return ids (N,) of a .label of uint16 or int64, of which N points tell the width.
+    """Return ids (N,) of a .label of uint16 or int64; the number of points N tells the width.
 
     Raises:
-        DataError: If some of 64 bits are no ids of 16.
+        DataError: If some of the 64-bit numbers do not fit in 16 bits.
     """
     if len(data) == 2 * points:
         return np.frombuffer(data, "<u2")

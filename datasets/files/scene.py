@@ -127,7 +127,7 @@ class FileScene(Scene):
 
     @cached_property
     def timestamps(self) -> Float64 | None:
-        """Return (len,) seconds on the dataset's own clock; None where it has none."""
+        """Return (len,) seconds on the dataset's own clock, or None without a clock."""
         if self.options.frames_per_second is not None:
             return np.arange(len(self)) / self.options.frames_per_second
         times = [frame.timestamp for frame in self._frames]
@@ -177,7 +177,7 @@ class FileScene(Scene):
         return self._maps.label_space(model, self.settings_file or self.folder)
 
     def frame(self, index: int, model: str, *, color: bool = True) -> Frame:
-        """Return frame 0 <= index < len with that source's labels or scores, and colour where it has any.
+        """Return frame 0 <= index < len with the labels or scores of a source, and colour, if any.
 
         Labels of another size than the depth are brought to its pixels.
 
@@ -324,7 +324,7 @@ class FileScene(Scene):
         return np.where(confidence >= self._frame(index).least_confidence, depth, np.float32(0))
 
     def color(self, index: int) -> UInt8 | None:
-        """Return the colour (H, W, 3) uint8 RGB, None where the frame has none; needs no labels. Raises DataError."""
+        """Return the colour (H, W, 3) uint8 RGB, or None without colour; needs no labels. Raises DataError."""
         source = self._frame(index)
         path = self._color_file(source)
         if path is None or source.color_lens is None:
@@ -419,7 +419,7 @@ class FileScene(Scene):
         return str(path).removeprefix(f"{self.folder}{os.sep}")
 
     def _images(self, index: int, model: str) -> dict[tuple[int, str], Path]:
-        """Return the files that a frame is made of, but for its pose: depth where it is stored, labels, a mask."""
+        """Return the files of a frame, without its pose: stored depth, labels, a mask."""
         source = self._frame(index)
         depth = source.depth if self._surface is None else None
         labels, mask = self._maps.file(source, model), self._maps.mask_file(source)
@@ -444,7 +444,7 @@ class FileScene(Scene):
         files: Mapping[str, Path] | None = None,
     ) -> Frame:
         source, timestamps = self._frame(index), self.timestamps
-        image = self._color_file(source)  # named also where it is not read: a recording takes the file as it is
+        image = self._color_file(source)  # named also if it is not read: a recording takes the file as it is
         mask, masked = self._maps.mask_file(source), None
         if mask is not None:  # outside of the mask's view nothing is masked
             own = self._sizes(index, depth.shape, mask, "the mask is")
@@ -519,7 +519,7 @@ class FileScene(Scene):
         return read
 
     def _stored_pose(self, source: FrameSource) -> Poses:
-        """Return the pose (4, 4) as it is stored; NaN where its rotation is zeros: tracking was lost."""
+        """Return the pose (4, 4) as it is stored, or NaN if its rotation is zeros: tracking was lost."""
         stored = read_pose(source.pose_file) if source.pose is None else source.pose
         return stored if stored[:3, :3].any() else np.full((4, 4), np.nan)
 

@@ -36,7 +36,7 @@ SPACINGS = 2.0
 
 
 class Heights(NamedTuple):
-    """z (rows, columns) float64 in metres, NaN where there is none; cell (j, i) is at x0 + dx i, y0 + dy j."""
+    """Grid of heights z (rows, columns) float64 in metres, NaN if unknown; cell (j, i) is at x0 + dx i, y0 + dy j."""
 
     z: Float64
     x0: float
@@ -307,8 +307,8 @@ def _require_whole_chunks(path: Path, header: Any) -> None:
     if laz.item_size() != size or points.sum() < header.point_count or first + lengths.sum() > path.stat().st_size:
         raise ValueError(f"its {len(points)} chunks do not hold the {header.point_count:,} points of its header")
     if points.max(initial=0) * size > POINT_BYTES_AT_ONCE:
-        raise ValueError(f"it has chunks of {points.max():,} points; compress it anew (laszip writes 50,000)")
-    if layers := _layers_of(record):  # lazrs aborts the process where it cannot have the memory that a layer claims
+        raise ValueError(f"it has chunks of {points.max():,} points; compress it again (laszip writes 50,000)")
+    if layers := _layers_of(record):  # lazrs aborts the process without the memory that a layer claims
         with path.open("rb") as file:
             for length in lengths.tolist():
                 file.seek(first + size + 4)
@@ -400,7 +400,7 @@ class Casts:
         self._surface = surface
 
     def get(self, view: View) -> Float32 | None:
-        """Return the depth (H, W) of a view, None where it is missing or damaged."""
+        """Return the depth (H, W) of a view, or None if it is missing or damaged."""
         import pyarrow as pa
 
         file, (H, W) = self._file(view), view.shape
@@ -492,7 +492,7 @@ class Surface:
         )
 
     def depth(self, view: View) -> Float32:
-        """Return depth (H, W) of a view along the optical axis in metres, 0 where it sees no surface."""
+        """Return depth (H, W) of a view along the optical axis in metres, 0 for pixels that see no surface."""
         depth = self._casts.get(view)
         if depth is None:
             depth = self._cast(view)
@@ -500,7 +500,7 @@ class Surface:
         return depth
 
     def require_seen(self, views: Iterable[View]) -> None:
-        """Raise DataError, which says how far away the cameras are, where no view sees the surface."""
+        """Raise DataError with the distance of the cameras if no view sees the surface."""
         centres = []
         for view in views:
             (H, W), (rows, columns), K = view.shape, PROBE, view.intrinsics

@@ -93,7 +93,7 @@ def files_by_stem(folder: Path, suffixes: Container[str]) -> dict[str, str]:
 
 
 def files_named(folder: Path, before: str, after: str) -> dict[str, Path]:
-    """Return the files 'BEFORE name AFTER' of a folder by name, in natural order; none where there is no folder.
+    """Return the files 'BEFORE name AFTER' of a folder by name, in natural order; an empty result without the folder.
 
     The case of AFTER, which is a suffix, does not count.
 
@@ -110,7 +110,7 @@ def files_named(folder: Path, before: str, after: str) -> dict[str, Path]:
 
 
 def _entries(folder: Path) -> Iterator[os.DirEntry[str]]:
-    """Yield the entries of a folder, but for hidden entries; nothing where there is no folder."""
+    """Yield the entries of a folder without hidden entries; yield nothing without the folder."""
     try:
         with os.scandir(folder) as entries:
             yield from (entry for entry in entries if not entry.name.startswith("."))
@@ -128,7 +128,7 @@ NPY_SHAPE = re.compile(rb"""['"]shape['"]\s*:\s*\(([\d\s,]{0,200})\)""")
 
 
 LONGEST_HEADER = 2**16
-"""Bytes at the beginning of an .npy file that hold its header, where it is one of plain numbers."""
+"""Bytes at the beginning of an .npy file that hold the header of an array of plain numbers."""
 
 MAX_UNPACKED = 2**32
 """Bytes that an array in an .npz file may take."""
@@ -167,7 +167,7 @@ def _decode_npy(where: str, data: bytes | bytearray, claimed: Claimed | None = N
 
 
 def _claims(where: str, data: bytes | bytearray) -> tuple[tuple[int, ...], np.dtype[Any], Literal["C", "F"], int]:
-    """Return the shape, the type and the order that an .npy header claims, and where it ends."""
+    """Return the shape, the type and the order that an .npy header claims, and the position of its end."""
     if not data.startswith(b"\x93NUMPY") or len(data) < 12:
         raise DataError(f"{where}: not an .npy array; {AGAIN}")
     width = 2 if data[6] == 1 else 4
@@ -177,7 +177,7 @@ def _claims(where: str, data: bytes | bytearray) -> tuple[tuple[int, ...], np.dt
     header = data[8 + width : start]
     dtype, order, shape = (pattern.search(header) for pattern in (NPY_DTYPE, NPY_ORDER, NPY_SHAPE))
     if not (dtype and order and shape):
-        raise DataError(f"{where}: the .npy header is damaged, or the array does not hold plain numbers; save it anew")
+        raise DataError(f"{where}: the .npy header is damaged, or the array does not hold plain numbers; save it again")
     kind = np.dtype(dtype[1].decode())
     sizes = tuple(int(n) for n in re.findall(rb"\d+", shape[1]))
     if math.prod(sizes) == 0 or len(sizes) > 4:
@@ -366,7 +366,7 @@ def read_intrinsics(path: Path) -> Intrinsics:
 
 
 def read_camera(path: Path) -> tuple[Intrinsics, tuple[int, int] | None]:
-    """Return intrinsics of a JSON file, and the (width, height) of the image that they are for, where it says so.
+    """Return intrinsics of a JSON file, and the (width, height) of their image, or None if the file has no size.
 
     It has the names of Open3D, an intrinsic_matrix whose columns follow each other; or fx, fy, cx, cy; or a matrix of
     three rows.

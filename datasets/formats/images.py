@@ -59,7 +59,7 @@ BEYOND_IMAGE = 4
 """Times the pixels of its frame's image that a larger file may have."""
 
 BEYOND_DEPTH = 16
-"""Times the pixels of its frame's depth that a larger label map, scores or mask may have, where there is no image."""
+"""Times the pixels of its frame's depth that a label map, scores or mask may have without an image."""
 
 MAX_PHOTOGRAPH = 2**28
 """Most pixels of a colour image."""
@@ -79,12 +79,12 @@ Read = Callable[[Path], bytes]
 
 @dataclass(frozen=True)
 class FrameSize:
-    """What a frame says of the sizes of its files before one is decoded.
+    """Bounds of a frame on the sizes of its files, before a file is decoded.
 
     Attributes:
-        pixels: Gives the pixels of its image, 0 where they are not known; asked where a file claims many.
-        require: Raises DataError for a size (H, W) that cannot be of the frame's view.
-        depth: Shape (H, W) of its depth, for other files; None where it does not bound them.
+        pixels: Returns the number of pixels of its image, 0 if unknown; called if a file claims many pixels.
+        require: Raises DataError for a size (H, W) that the frame's view cannot have.
+        depth: Shape (H, W) of its depth, for other files; None if depth does not bound the other files.
     """
 
     pixels: Callable[[], int] = lambda: 0
@@ -184,7 +184,7 @@ def read_scores(
 ) -> npt.NDArray[np.floating[Any]]:
     """Return soft scores (H, W, K) float16, float32 or float64, C-contiguous; `layout` is the file's.
 
-    `size` is (H, W) of the depth, to recognise the other layout; `classes` the number of classes, where it is known.
+    `size` is (H, W) of the depth, to recognise the other layout; `classes` the number of classes, if known.
 
     Raises:
         DataError: If the file has another type or layout, too many classes, or is damaged.
@@ -299,7 +299,7 @@ def color_size(path: Path) -> Size:
 
 
 def depth_size(path: Path) -> Size | None:
-    """Return (width, height) of a depth image from its header; None where that does not tell, or is damaged."""
+    """Return (width, height) of a depth image from its header, or None if the header is damaged or has no size."""
     suffix = path.suffix.lower()
     try:
         if suffix in (".png", ".tif", ".tiff"):
@@ -464,7 +464,7 @@ def _whole_png(
 ) -> Iterator[Png]:
     """Yield a PNG that is whole; it is decoded within the context.
 
-    Its size is checked first where it is a file of a frame; `more` has by kind what a pixel takes beyond the file's.
+    The size of a frame's file is checked first; `more` has the bytes that a pixel takes beyond the file's, by kind.
     """
     from PIL import PngImagePlugin
 

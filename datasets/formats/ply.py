@@ -52,7 +52,7 @@ class Header:
             raise
         except (LookupError, ValueError) as error:  # a missing word, no number, a repeated name
             raise DataError(
-                f"{path}: its header cannot be read ({summarize_error(error)}); save the cloud anew"
+                f"{path}: its header cannot be read ({summarize_error(error)}); save the cloud again"
             ) from error
 
     @classmethod
@@ -72,11 +72,11 @@ class Header:
             if word[0] == "property" and len(word) == 3 and word[1] in TYPES:
                 properties.append((word[2], ORDERS[form] + TYPES[word[1]]))
             elif word[0] != "comment":
-                raise DataError(f"{path}: '{' '.join(word)[:60]}' in its header cannot be read; save the cloud anew")
+                raise DataError(f"{path}: '{' '.join(word)[:60]}' in its header cannot be read; save the cloud again")
         comments = (line.removeprefix("comment").strip() for line in lines if line.startswith("comment"))
         header = cls(np.dtype(properties), int(elements[0][2]), size, tuple(comments))
         if header.count < 0:
-            raise DataError(f"{path}: has {header.count} points in its header; save the cloud anew")
+            raise DataError(f"{path}: has {header.count} points in its header; save the cloud again")
         missing = {"x", "y", "z"} - set(header.dtype.names or ())
         if missing:
             raise DataError(f"{path}: its points have no {', '.join(sorted(missing))}")

@@ -34,7 +34,7 @@ class Camera:
         K = self.intrinsics
         for name, value, least in (("fx", K.fx, 1e-3), ("fy", K.fy, 1e-3), ("cx", K.cx, 0), ("cy", K.cy, 0)):
             if not least <= abs(value) <= LARGEST:
-                raise DataError(f"intrinsics: {name} = {value:g} pixels is none of a camera; is the file damaged?")
+                raise DataError(f"intrinsics: {name} = {value:g} pixels does not fit a camera; is the file damaged?")
 
     @classmethod
     def stated(cls, numbers: FxFyCxCy, size: tuple[int, int] | None, where: str) -> Camera:
@@ -51,7 +51,7 @@ class Camera:
     def at(self, shape: tuple[int, ...], centre: float = 0.0) -> Intrinsics:
         """Return intrinsics, pixel centres at integers, of an image of the whole field of view, of shape (H, W, ...).
 
-        `centre` is where the dataset has the centre of the first pixel: 0, or 0.5 where it counts from the corner.
+        `centre` is the dataset's coordinate of the first pixel's centre: 0, or 0.5 for coordinates from the corner.
         """
         stated, size = self.intrinsics, (shape[1], shape[0])
         K = Intrinsics(stated.fx, stated.fy, stated.cx - centre, stated.cy - centre)
@@ -120,7 +120,7 @@ def to_camera_to_world(T: Poses, convention: str, axes: str, where: str) -> Pose
 
 
 def from_quaternions(translations: Poses, quaternions: Poses, path: Path) -> Poses:
-    """Return (n, 4, 4) of translations (n, 3) and quaternions (n, 4), order x y z w; NaN where one is not finite.
+    """Return (n, 4, 4) of translations (n, 3) and quaternions (n, 4), order x y z w; NaN for a row that is not finite.
 
     A quaternion of zeros says that tracking was lost, as one that is not finite does.
 
@@ -151,8 +151,9 @@ def at_times(
 ) -> Poses:
     """Return (m, 4, 4) at `wanted` seconds of a trajectory (n, 4, 4) at ascending `times`: nearest, or between two.
 
-    NaN where no pose is within `max_gap` seconds, or the nearest pose is NaN. Between two poses the position is
-    linear and the rotation spherically linear (slerp); before the first and after the last one they hold.
+    The pose is NaN without a pose within `max_gap` seconds, or if the nearest pose is NaN. Between two poses the
+    position is linear and the rotation spherically linear (slerp). Before the first pose and after the last pose, the
+    pose is constant.
     """
     known = np.isfinite(poses).all(axis=(1, 2))
     times, poses = times[known], poses[known]

@@ -105,7 +105,7 @@ def fitted(values: Pixels, shape: tuple[int, ...], where: str, what: str = "the 
 def at_image(frame: Frame, shape: tuple[int, int], where: str, K: Intrinsics | None = None) -> Frame:
     """Return a frame's depth and pose at the pixels of its colour image (H, W); no labels, depth 0 if unknown.
 
-    K is the image's, where it shows another view than the depth.
+    K has the intrinsics of the image, if its view differs from the view of the depth.
 
     Raises:
         DataError: For another shape, with `where`.

@@ -18,7 +18,7 @@ AROUND = (9, 5)
 """Rows and columns around a pixel in which a nearer surface hides what is behind it: beams lie far apart."""
 
 BEHIND, BEHIND_METRES = 1.1, 0.3
-"""How much farther than that surface a point is at least, to be hidden: the factor, and metres beside it."""
+"""Least distance of a hidden point, as a factor of the distance of the surface in front, plus metres."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -40,7 +40,7 @@ class Seen:
     shape: tuple[int, int]
 
     def depth_image(self) -> Float32:
-        """Return (H, W) float32 in metres, 0 where no point is."""
+        """Return (H, W) float32 in metres, 0 for pixels without a point."""
         image = np.zeros(self.shape, np.float32)
         image[self.v, self.u] = self.depth
         return image

@@ -20,9 +20,9 @@ def motion_in_sweep(before: Float64 | None, now: Float64, after: Float64 | None)
     It is that between the scans before and after, per scan; sweeps follow each other without a gap.
 
     Args:
-        before: Pose (4, 4) sensor-to-world of the scan before; None, or NaN, where it has none.
-        now: That of the scan itself.
-        after: That of the scan after.
+        before: Pose (4, 4) sensor-to-world of the scan before; None, or NaN, without a pose.
+        now: Pose of the scan itself.
+        after: Pose of the scan after, as `before`.
     """
     from scipy.spatial.transform import Rotation
 

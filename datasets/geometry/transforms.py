@@ -41,7 +41,7 @@ class Trajectory:
         self.numbers.extend(numbers)
 
     def at(self, stamps: Sequence[int], max_gap: float, path: Path) -> Poses:
-        """Return (n, 4, 4) at stamps, NaN where no two poses at most `max_gap` seconds apart are around one.
+        """Return (n, 4, 4) at stamps, NaN for a stamp that is not between two poses at most `max_gap` seconds apart.
 
         Raises:
             DataError: For a quaternion that is not of length 1, with `path`.

@@ -1,4 +1,4 @@
-"""True errors that the first tasks of `export --format` hold, beside as many regions chosen without a map.
+"""True errors in the first tasks of `export --format`, and in as many regions chosen without a map.
 
 The others are windows as large as the tasks, pixel by pixel the same budget: where the scores of a single image have
 the highest entropy (without windows that overlap in one image), at random, and at random on an edge between two

@@ -1,4 +1,4 @@
-"""The whole command beside the same run without check, recording and report: wall-clock and CPU, cold and warm.
+"""The whole command, and the same run without check, recording and report: wall-clock and CPU, cold and warm.
 
 An indoor sequence is made once: a camera walks round a furnished room (room.py) of half its size, 41 classes, PNG depth
 and labels, JPEG colour. Each command is a process of its own, bound to two cores, and they take turns. *Cold* is the

@@ -1,9 +1,9 @@
 """The command line on a folder of PNGs, against the bare OpenCV decode of the same files on the same cores.
 
-A folder is made for each kind of depth and noise level: views of the built-in city, rendered at half the size and
-scaled up (depth linearly, labels to the nearest), depth with Gaussian noise of so many mm, as sensors have it, as
-16-bit PNGs or as .npy in metres, and 8-bit labels. `jpeg` is 16-bit PNGs beside colour as JPEG, which the loop reads
-where the run is `--recorded`, and only there; so does the bare decode. A bare read of .npy looks at each value once.
+A folder is made for each kind of depth and noise level. It has views of the built-in city, rendered at half the size
+and scaled up (depth linearly, labels to the nearest). Depth has Gaussian noise of the given mm, as sensors have it, and
+is stored as 16-bit PNGs or as .npy in metres; labels have 8 bits. `jpeg` is 16-bit PNGs and colour as JPEG; the loop
+and the bare decode read the colour only if the run is `--recorded`. A bare read of .npy looks at each value once.
 Noise 0 compresses best, so its bare decode is the fastest: the harder case. Both sides read files that are in the page
 cache, and are bound to the same cores. Command and bare decode take turns; the figures are medians. One unmeasured
 start compiles what is compiled on first use. Nothing is subtracted: the whole process has a column of its own, and

@@ -1,4 +1,4 @@
-"""CPU time of one frame through each fusion backend, beside Open3D's own VoxelBlockGrid.integrate on the same frames.
+"""CPU time of one frame through each fusion backend, and through Open3D's own VoxelBlockGrid.integrate.
 
 The frames fly along a street of facades, trees and sky. 'first' is the first frame of a new map, code already compiled;
 'later' the median of all others, most of whose voxels are known; both user and system time of all threads, which other
@@ -90,7 +90,7 @@ def measure(
         maps = {name: made(name) for name in names}
         for name in names:
             times[name].append([])
-        for frame in (*frames, *frames):  # in turns: what else the machine does meets all of them alike
+        for frame in (*frames, *frames):  # in turns, so that all maps share any other load of the machine
             for name in names:
                 times[name][-1].append(measuring.cpu_ms(maps[name], frame))
         del maps

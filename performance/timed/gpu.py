@@ -1,4 +1,4 @@
-"""Time of one frame through backend `torch`, its input on the device already, beside the floor and the CPU backends.
+"""Time of one frame through backend `torch`, its input on the device already, with the floor and the CPU backends.
 
 The map grows by one view fused at ever new places; then places chosen at random are fused again, as ids, as logits, and
 as ids of three models at once. Medians of `rounds` frames by CUDA events, after a warm-up. The floor is the bytes
@@ -126,7 +126,7 @@ def on_the_cpu(frame: semstab.Frame, K: int, name: str, rounds: int) -> dict[str
 
 
 def agreement(K: int, size: tuple[int, int], device: str) -> bool:
-    """Whether torch and numba leave the same map of four frames."""
+    """Return whether torch and numba make the same map of four frames."""
     tables = []
     for name, options in (("torch", {"device": device}), ("numba", {})):
         backend = backends.create(name, voxel_size=VOXEL_SIZE, num_classes=K, **options)

@@ -1,4 +1,4 @@
-"""What a frame and a voxel cost as the frames, the voxels or the classes become 1, 2, 4 and 8 times as many.
+"""Costs of a frame and of a voxel as the number of frames, voxels or classes grows by factors of 1, 2, 4 and 8.
 
 Frames of a flight (flight.py) are fused at places 200 m apart, each as often as there are frames. One of three grows,
 the others stay. 'ms' is the CPU time of a later frame, all of whose voxels are known, the median; 'bytes' is what the
@@ -50,7 +50,7 @@ def finished(watch: measuring.Watch, backend: Any) -> int:
 
 
 def measured(backend_name: str, size: tuple[int, int], frames: int, wanted: int, K: int) -> dict[str, float]:
-    """The costs of a map of at least so many voxels, each place of which so many frames have seen."""
+    """Return the costs of a map of at least `wanted` voxels, each place of which `frames` frames have seen."""
     views = [flight.frame(i, *size, K, at=(0.0, 0.0)) for i in range(VIEWS)]
     warm_up = backends.create(backend_name, voxel_size=VOXEL_SIZE, num_classes=K)
     warm_up.integrate(views[0])

@@ -1,9 +1,10 @@
-"""What a frame costs beside its pixels: opening and planning a long sequence, and the memory that a run takes a frame.
+"""Costs of a frame without its pixels: opening and planning a long sequence, and the memory that a run takes a frame.
 
 A posed folder of tiny frames, of which all but 50 are links. CPU seconds and resident memory in MB after each step:
 open the scene, select frames (each pose is read: tracking may have been lost), hash the input, pickle what a task is
-sent of a stretch of 4096 frames. Then the command fuses so many of its frames: peak memory, and what a frame adds. The
-camera goes over new ground, or with --still back and forth over the same: the map does not grow then.
+sent of a stretch of 4096 frames. Then the command fuses a growing number of its frames: peak memory, and the memory
+that a frame adds. The camera goes over new ground, or with --still back and forth over the same ground, and then the
+map does not grow.
 """
 
 from __future__ import annotations
@@ -27,7 +28,7 @@ WIDTH, HEIGHT, OWN, LEG = 16, 12, 50, 500
 
 
 def write(root: Path, count: int, *, still: bool) -> Path:
-    """A sequence of so many frames in legs, or over one place; some images are links to others."""
+    """Write a sequence of `count` frames in legs, or over one place; some images are links to others."""
     rng, frames = np.random.default_rng(0), []
     for index in range(OWN):
         depth = (rng.integers(5000, 6000, (HEIGHT, WIDTH)) / 1000).astype(np.float32)

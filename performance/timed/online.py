@@ -1,4 +1,4 @@
-"""What `semstab.TemporalStability` adds to a validation, a frame, on one core, beside fusing alone.
+"""Time that `semstab.TemporalStability` adds to a frame of a validation, on one core, and the time of fusing alone.
 
 A camera walks round a furnished room (room.py) at half its size: 640x480, depth in every pixel, 41 classes. `compute`
 at the end is counted in, spread over the frames. Frames are made beforehand; wall-clock, medians of the runs.

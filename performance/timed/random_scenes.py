@@ -1,4 +1,4 @@
-"""CPU time of a frame of scenes drawn at random, beside Open3D's own VoxelBlockGrid.integrate on the same frames.
+"""CPU time of a frame of scenes drawn at random, and of Open3D's own VoxelBlockGrid.integrate on the same frames.
 
 scenes.py draws geometry, height, pitch, field of view, range, resolution, classes, size of the voxels and errors of the
 labels; noise is the standard deviation of depth in per cent of it. As in `fusion`, times are those of later frames,

@@ -1,7 +1,7 @@
-"""What the recording costs: the command line on a folder of PNGs and colour JPEGs, with it and without.
+"""Costs of the recording: the command line on a folder of PNGs and colour JPEGs, with a recording and without.
 
-The folder is that of `end-to-end` (16-bit depth with noise, 8-bit labels), with colour as JPEG of the quality that
-cameras use. Runs with and without take turns, bound to the same cores, on files in the page cache; the figures are
+The folder is the folder of `end-to-end` (16-bit depth with noise, 8-bit labels), with colour as JPEG of the quality
+that cameras use. Runs with and without take turns, bound to the same cores, on files in the page cache; the figures are
 medians. One unmeasured start of each compiles what is compiled on first use. `run` is the whole process by the clock,
 `CPU` its user and system time, `loop` reading, flicker, fusion and observers, by manifest.json; `ratio` is with by
 without. It also says how large the recording is.

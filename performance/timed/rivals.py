@@ -1,4 +1,4 @@
-"""CPU time, memory, voxels and labels of semstab's fusion beside other programs that fuse the same points.
+"""CPU time, memory, voxels and labels of semstab's fusion, and of other programs that fuse the same points.
 
 A camera walks round a noisy room; 12 % of the patches of its label maps err. Each implementation runs as a program of
 its own on one core, and they take turns. The columns:

@@ -1,4 +1,4 @@
-"""CPU time and memory of one LiDAR scan on each backend, beside the same fusion by np.unique.
+"""CPU time and memory of one LiDAR scan on each backend, and of the same fusion by np.unique.
 
 A scanner of 64 beams drives along a street of walls and boxes at 1.2 m a scan; points err by 2 cm, and a share of them,
 `--wrong`, has a random label. With `--data` the scans are those of a folder of SemanticKITTI, with their true labels. A
@@ -28,7 +28,7 @@ LOWEST, HIGHEST = -24.8, 2.0
 
 
 def street(points: int, K: int, scans: int, wrong: float, seed: int = 0) -> list[semstab.Frame]:
-    """Scans of about so many points along a street, a share of them with a random label."""
+    """Return scans of about `points` points along a street, with a random label for the share `wrong` of them."""
     rng = np.random.default_rng(seed)
     at = np.linspace(0, 2 * np.pi, int(1.15 * points / BEAMS), endpoint=False)
     up, at = np.meshgrid(np.radians(np.linspace(HIGHEST, LOWEST, BEAMS)), at, indexing="ij")

@@ -1,4 +1,4 @@
-"""CPU time of one frame of soft scores, beside one read of its scores and the finding of its pixels' voxels.
+"""CPU time of one frame of soft scores, of one read of its scores, and of finding its pixels' voxels.
 
 The frames fly along the street of `fusion`: a third of the image is sky, whose scores nobody needs. 'read' is
 one pass over all scores of the frame, 'keys' the voxel of each pixel, each alone and by compiled code on all cores;
@@ -73,7 +73,7 @@ def soft(frame: semstab.Frame, K: int, kind: str) -> semstab.Frame:
 
 
 def steps(frame: semstab.Frame, K: int) -> dict[str, Callable[[], Any]]:
-    """What is measured, in a map that has seen the frame."""
+    """Return the steps that are timed, by name, in a map that has seen the frame."""
     assert frame.scores is not None
     H, W = frame.shape
     flat: npt.NDArray[Any] = frame.scores.reshape(-1)

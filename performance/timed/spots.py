@@ -1,4 +1,4 @@
-"""CPU time of a frame's spots, on which alpha rests, beside fusing it; and their memory over a flight.
+"""CPU time of a frame's spots, on which alpha rests, and of fusing it; and the memory of spots over a flight.
 
 A UAV flies over blocks of houses, 1.5 m a frame. After `--warm` frames all code is compiled, and most spots that a
 frame shows are known. Then every second frame is added to the sampler, and fused by backend `numba`, the baseline of
@@ -54,7 +54,7 @@ def made(index: int, size: tuple[int, int], K: int, noise: float) -> Frame:
 
 
 def milliseconds(work: Callable[..., Any], frame: Frame) -> float:
-    """Of one call with a copy of the frame, as what a frame remembers is part of the work."""
+    """Return the milliseconds of one call with a copy of the frame: filling a frame's caches is part of the work."""
     return measuring.cpu_ms(work, dataclasses.replace(frame))
 
 

@@ -1,4 +1,4 @@
-"""CPU time of the statistics beside that of the loop whose log they read, and the memory that both take.
+"""CPU time of the statistics and of the loop whose log they read, and the memory that both take.
 
 A camera walks round a furnished room and sees each place again and again (room.py); with --rooms it goes on to the next
 one; with --flight it flies over a field and sees most places twice (flight.py); --flipped is a share of pixels whose

@@ -1,11 +1,11 @@
 """One map in tiles on one Dask worker and on two: how much faster are two, and what keeps them from twice as fast?
 
 The flight of `tiles`, in a folder that all see; a real scheduler and worker processes of one thread each on 127.0.0.1,
-started before the clock, with so much memory each. They have done a run of a few frames before, as workers that stay
-have, so that nothing is loaded for the first time; with `--cold` they have not. Wall-clock of the whole command, the
-least of `--repeat` runs in turn: it says something on a quiet machine with as many free cores as workers. Beside it the
-CPU time of the command itself, which is what workers cannot share, and of each worker, whose largest is the way that is
-left. That two workers find what one finds is compared bit by bit.
+started before the clock, with a fixed amount of memory each. They have done a run of a few frames before, as workers
+that stay have, so that nothing is loaded for the first time; with `--cold` they have not. Wall-clock of the whole
+command, the least of `--repeat` runs in turn: it says something on a quiet machine with as many free cores as workers.
+Beside it the CPU time of the command itself, which is what workers cannot share, and of each worker, whose largest is
+the way that is left. That two workers find what one finds is compared bit by bit.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ UNWATCHED = {"DASK_DISTRIBUTED__WORKER__PROFILE__ENABLED": "False"}
 
 PORT = 8786
 LOADED = "semstab.engine.frame_loop"
-"""What a worker loads for its first job, which is no part of what is measured."""
+"""Module that a worker loads for its first job; loading it is not measured."""
 
 
 @contextlib.contextmanager

@@ -10,7 +10,7 @@ from semstab.data.statistics.intervals import Interval
 
 @dataclass(frozen=True)
 class ClassAgreement:
-    """Agreement on one class against all others, over the voxels with OP >= 2; NaN where undefined.
+    """Agreement on one class against all others, over the voxels with OP >= 2; NaN if undefined.
 
     observations is the evidence for the class in these voxels, in frames.
     """
@@ -53,7 +53,7 @@ class ClassAlpha:
         locations: Voxels with OP >= 2 of which it is the dominant class.
         counts_for_verdict: Whether the verdict depends on it.
         alpha: Alpha with its interval.
-        unstable: Probability that alpha is below the level 'usable'; NaN where that is not known.
+        unstable: Probability that alpha is below the level 'usable'; NaN if unknown.
         disagreement: Its share of the disagreement between views: of two labels that differ, each class has one half.
     """
 
@@ -85,7 +85,8 @@ class Meaning:
     """Agreement with distances between classes.
 
     Attributes:
-        alpha: 1 less the mean distance of the labels that two views give a spot, over that of any two labels.
+        alpha: 1 minus the mean distance of the labels that two views give a spot, over the mean distance of any two
+            labels.
         near: Share of the disagreement that is between classes whose distance is at most half of the largest one; NaN
             without disagreement.
     """
@@ -108,8 +109,8 @@ class RangeStratum:
         low, high: Ends of the range in metres; the high one is not part of it.
         share: Share of all sampled observations.
         spots: Spots that two views saw from there.
-        alpha: Alpha of these observations; NaN where they were not assessed: two views saw too few spots from there, or
-            nearly all of them are one class.
+        alpha: Alpha of these observations; NaN if two views saw too few spots from there, or nearly all observations
+            are of one class.
     """
 
     low: float
@@ -139,8 +140,8 @@ class RangeAgreement:
     Attributes:
         strata: By range, the nearest first.
         usable: The level above which labels can be used.
-        reliable: Metres up to which alpha stays above it, 0 where it never does.
-        low, high: The least and the largest that this may be, by the intervals of the strata.
+        reliable: Metres up to which alpha stays above this level, 0 if it never does.
+        low, high: The least and the largest value of `reliable`, by the intervals of the strata.
     """
 
     strata: tuple[RangeStratum, ...]
@@ -234,9 +235,8 @@ class SpotAgreement:
         chance: Probability that two observations from anywhere on the map agree.
         largest_class: The class with most observations, and `largest_share` its share of them.
         labelled: Share of the locations with depth that have a label in at least half of their observations.
-        pixels_labelled: Share of the pixels with depth that have a label; NaN where that was not stored.
-        pairs_labelled: Share of the pairs of two views of a spot of which both have a label; NaN where that was not
-            stored.
+        pixels_labelled: Share of the pixels with depth that have a label; NaN if not stored.
+        pairs_labelled: Share of the pairs of two views of a spot of which both have a label; NaN if not stored.
         classes: Alpha of each class.
         moving: The classes that move, where much of the disagreement is theirs; else None.
         meaning: Agreement with distances between classes, if there are some.

@@ -20,7 +20,7 @@ class Reliability:
 
 @dataclass(frozen=True)
 class Correctness:
-    """Accuracy of the fused labels of a group of voxels; NaN where no voxel has a true class.
+    """Accuracy of the fused labels of a group of voxels; NaN without voxels of a known true class.
 
     Attributes:
         miou: Mean over the classes that are true or predicted somewhere, of intersection over union.
@@ -71,8 +71,8 @@ class CorrectnessStatistics:
 class Losses:
     """The pairwise disagreement 1 - PSA over voxels with OP >= 2 in both maps, and its sources.
 
-    share is geometry's part of the total. Negative parts of the model mean that its labels agree better than the
-    view-independent ones: it errs alike in all views.
+    share is geometry's part of the total. A negative part of the model means that its labels agree better than
+    view-independent labels: the model makes the same errors in all views.
     """
 
     voxels: int

@@ -36,7 +36,7 @@ class FeatureAgreement:
         components: Number of components of a vector.
         spots: Spots that two views saw or more, of those that are kept.
         views: Distinct views.
-        one_in: One in so many spots of alpha is kept, for lack of memory.
+        one_in: The sample keeps one in `one_in` spots of alpha, for lack of memory.
         alpha: 1 - (1 - cosine) / (1 - chance).
         cosine: Mean cosine of two views at a spot.
         chance: Mean cosine of two observations from anywhere.

@@ -9,12 +9,12 @@ from dataclasses import dataclass, field
 from semstab.core.types import THESE_FRAMES, Scope
 
 CONFIDENCE = 0.95
-"""Level of confidence intervals, where no other is asked for."""
+"""Default level of confidence intervals."""
 
 
 @dataclass(frozen=True)
 class Estimate:
-    """A value with its confidence interval, and the level of that; NaN where undefined."""
+    """A value with its confidence interval, and the level of the interval; NaN if undefined."""
 
     value: float
     low: float
@@ -43,7 +43,7 @@ class Estimate:
 
 
 def short(value: float, sign: str = "", *, digits: int = 2) -> str:
-    """Return a number from -1 to 1 without the 0 before its point: '.55', '-.19', '1.00'; '-' where it is undefined."""
+    """Return a number from -1 to 1 without the 0 before its point: '.55', '-.19', '1.00'; '-' if undefined."""
     return "-" if math.isnan(value) else re.sub(r"^([+-]?)0\.", r"\1.", f"{value:{sign}z.{digits}f}")
 
 

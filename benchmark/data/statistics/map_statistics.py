@@ -26,12 +26,11 @@ class StabilityVerdict:
     """A model on a scene.
 
     Attributes:
-        level: See ADVICE; of what the model labels.
-        probability: Probability that the level is right, for the same scene flown again; NaN where no threshold
-            decides.
+        level: Level of the surface that the model labels, see ADVICE.
+        probability: Probability that the level is right, for the same scene flown again; NaN if no threshold decides.
         line: The reasons.
-        of_all: The level if what the model leaves out counts as disagreeing, where it is another one; else None.
-        labelled: Share of the pixels with depth that have a label; NaN where that was not stored.
+        of_all: The level if pixels without a label count as disagreeing, or None if it equals `level`.
+        labelled: Share of the pixels with depth that have a label; NaN if not stored.
         probability_of_all: Probability that `of_all` is right; NaN without `of_all`.
     """
 
@@ -44,7 +43,7 @@ class StabilityVerdict:
 
     @property
     def decisive(self) -> Level:
-        """The level that counts against other models: that of all, whatever has a label."""
+        """Level that counts against other models: the level of the whole surface, with labels or without."""
         return self.of_all or self.level
 
     @property
@@ -62,7 +61,7 @@ class StabilityVerdict:
 
     @property
     def stated(self) -> str:
-        """The probability in print: '(p .71)', '(p > .99)', no share of a map; '' where no level has enough."""
+        """Probability in print: '(p .71)', '(p > .99)', not a share of a map; '' if no level is probable enough."""
         p = self.probability
         return "" if math.isnan(p) or self.level == "undecided" else "(p > .99)" if p >= 0.995 else f"(p {short(p)})"
 
@@ -175,7 +174,7 @@ class MapStatistics:
 
     @property
     def moving_lines(self) -> tuple[str, ...]:
-        """What moved, in sentences; empty if nothing did."""
+        """Sentences on moving things; empty if nothing moved."""
         if self.static is None:
             return (self.moving_untold,) if self.moving_untold else ()
         return (f"{self.static.text(self.headline.alpha.value)}; the verdict is of what stayed", self.static.of_classes)

@@ -47,7 +47,7 @@ class MisplacedFrame:
 
 @dataclass(frozen=True)
 class MovedSpots:
-    """Which spots moved: other views see through them.
+    """Spots that moved: other views see through them.
 
     Attributes:
         spots: Spots of which it is known whether they moved.
@@ -97,7 +97,7 @@ class MovedSpots:
 
     @property
     def of_poses(self) -> str:
-        """Which poses do not fit, see `poses_that_do_not_fit`."""
+        """Text on poses that do not fit, see `poses_that_do_not_fit`."""
         return poses_that_do_not_fit(self.misplaced)
 
 
