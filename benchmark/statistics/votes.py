@@ -40,9 +40,6 @@ depth move things sidewards in an image. Holes count as near in the next blocks.
 REACH = 0.25
 """Blocks to each side, a pixel at least, in which a spot's surface must be smooth where it was found."""
 
-EDGE_OF_POINTS = 0.05
-"""Sparse depth in the blocks around a spot differs by at most this, relative."""
-
 EDGE, EDGE_SIGMAS = 0.05, 6.0
 """Inverse depth of the pixels around a spot differs by EDGE, relative, and so many standard deviations of noise, at
 most: else the spot is at an edge of depth, or seen at a grazing angle, and it is not told whether it moved."""
@@ -125,15 +122,6 @@ class KeptDepth:
         blocks_of_points(*points, stride, near, far)
         return cls(view, T_wc, camera, around, stride, near, far)
 
-    def firm(self, point: Float64) -> Mask:
-        """Return which points (n, 3) lie in blocks that show one surface."""
-        from semstab.statistics.loops.moving import STEP, in_blocks_of_one_surface
-
-        firm, most = np.empty(len(point), np.bool_), math.ceil(math.log1p(EDGE_OF_POINTS) / STEP)
-        place = self.T_wc, self.camera, self.around, self.stride
-        in_blocks_of_one_surface(point, *place, self.near, self.far, most, firm)
-        return firm
-
     def votes(self, point: Float64, sigma: float) -> npt.NDArray[np.uint8]:
         """Return the vote (n,) on points (n, 3); depth of a surface differs by `sigma`, relative, between views."""
         from semstab.statistics.loops.moving import STEP, vote
@@ -185,14 +173,15 @@ class DepthMemory:
         seen, hidden, through = counts.T.copy()
         return SpotVotes(seen, hidden, through, shares, ~fits, between, gap_of(sigma))
 
-    def moving_pixels(self, frame: Frame, sigma: float, misplaced: Mask) -> Mask:
+    def moving_pixels(self, frame: Frame, sigma: float, misplaced: Mask, *, sparse: bool = False) -> Mask:
         """Return the pixels (H, W) of a frame whose surface moved: the kept views, but for misplaced ones, tell.
 
-        Places in blocks of pixels are asked; pixels next to such blocks move, too, if they go on at the same depth.
+        Places in blocks of pixels are asked, of sparse depth all pixels that have it; pixels next to such blocks move,
+        too, if they go on at the same depth.
         """
         from semstab.statistics.loops.moving import SEEN, THROUGH
 
-        step = max(1, round(math.sqrt(frame.depth.size / BLOCKS)))
+        step = 1 if sparse else max(1, round(math.sqrt(frame.depth.size / BLOCKS)))
         depth = frame.depth[step // 2 :: step, step // 2 :: step].astype(np.float64)
         valid, K = (depth > 0) & (depth < np.inf), frame.intrinsics
         row, column = (step // 2 + step * each for each in np.nonzero(valid))

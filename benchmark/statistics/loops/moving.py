@@ -144,21 +144,6 @@ def vote(point, T, camera, around, stride, near, far, reach, gap, near_by, votes
 
 
 @serial
-def in_blocks_of_one_surface(point, T, camera, around, stride, near, far, most, firm):
-    """Write for each point (n, 3) whether depth in its block and the 8 around it differs by at most `most` codes."""
-    rows, columns = near.shape
-    for i in range(len(point)):
-        row, column, _ = block_of(point, i, T, camera, around, stride, near.shape)
-        low, high = np.int64(LARGEST), np.int64(0)
-        for b in range(row - 1, row + 2):
-            for aside in range(column - 1, column + 2):
-                a = (aside + columns) % columns if around else aside
-                if row >= 0 and 0 <= b < rows and 0 <= a < columns and far[b, a]:
-                    low, high = min(low, np.int64(near[b, a] & LARGEST)), max(high, np.int64(far[b, a]))
-        firm[i] = high > 0 and high - low <= most
-
-
-@serial
 def is_farther(near, row, column, around, reach, code):
     """Return whether depth in the blocks up to `reach` from one is farther than a code, and known in the next ones."""
     rows, columns = near.shape
