@@ -32,16 +32,18 @@ def scans(street: Street, noise: float, rng: np.random.Generator) -> Iterator[tu
     """Yield scans of a street from the ground, with `noise` in metres, and the number of what each point is on."""
     up, at = np.meshgrid(np.radians(np.linspace(UP, DOWN, RINGS)), np.linspace(0, 2 * np.pi, COLUMNS, endpoint=False))
     rays = np.stack([np.cos(up) * np.cos(at), np.cos(up) * np.sin(at), np.sin(up)], axis=-1).reshape(-1, 3)
+    with np.errstate(divide="ignore"):
+        inverse = 1 / rays.T
     for index, camera in enumerate(street.poses):
         pose = np.eye(4)
         pose[:3, 3] = camera[0, 3], SIDE + camera[1, 3], HEIGHT
         distance = np.where(rays[:, 2] < 0, -HEIGHT / np.minimum(rays[:, 2], -1e-9), np.inf)
         shown = np.zeros(len(rays), np.int64)
         for number, box in enumerate(street.boxes, 1):
-            low, high = (corner - pose[:3, 3] for corner in box.at(index))
-            with np.errstate(divide="ignore"):
-                a, b = low / rays, high / rays
-            enter, leave = np.minimum(a, b).max(axis=1), np.maximum(a, b).min(axis=1)
+            enter, leave = np.full(len(rays), -np.inf), np.full(len(rays), np.inf)
+            for axis, (low, high) in enumerate(zip(*box.at(index), strict=True)):
+                a, b = ((side - pose[axis, 3]) * inverse[axis] for side in (low, high))
+                enter, leave = np.maximum(enter, np.minimum(a, b)), np.minimum(leave, np.maximum(a, b))
             hit = (enter <= leave) & (enter > 0.1) & (enter < distance)
             distance, shown = np.where(hit, enter, distance), np.where(hit, number, shown)
         there = distance < RANGE

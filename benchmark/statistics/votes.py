@@ -37,6 +37,9 @@ AROUND = 2
 """Blocks to each side of a spot that a view must show farther away to see through it: errors of poses and of edges of
 depth move things sidewards in an image. Holes count as near in the next blocks."""
 
+AROUND_OF_POINTS = 1
+"""The same for the points of a LiDAR, whose blocks are larger, and which have no edges of depth that errors displace."""
+
 REACH = 0.25
 """Blocks to each side, a pixel at least, in which a spot's surface must be smooth where it was found."""
 
@@ -77,6 +80,7 @@ class KeptDepth:
         camera: Focal lengths and principal point in pixels; of a scan, pixels in a radian.
         around: Whether columns close a circle.
         stride: Edge of a block in pixels.
+        margin: Blocks to each side of a spot that must be farther for a view to see through it.
         near, far: (rows, columns) uint16 codes of the nearest and the farthest depth.
     """
 
@@ -85,6 +89,7 @@ class KeptDepth:
     camera: tuple[float, float, float, float]
     around: bool
     stride: float
+    margin: int
     near: UInt16
     far: UInt16
 
@@ -99,7 +104,7 @@ class KeptDepth:
         near, far = np.empty((2, depth.shape[0] // stride, depth.shape[1] // stride), np.uint16)
         low, high = np.empty((2, depth.shape[1]), depth.dtype)
         blocks_of_image(depth, stride, low, high, np.empty(depth.shape[1], np.bool_), near, far)
-        return cls(view, T_wc, camera, False, float(stride), near, far)
+        return cls(view, T_wc, camera, False, float(stride), AROUND, near, far)
 
     @classmethod
     def of_points(
@@ -120,7 +125,7 @@ class KeptDepth:
         stride = shape[1] / columns if around else stride
         near, far = np.empty((2, math.ceil(shape[0] / stride), columns), np.uint16)
         blocks_of_points(*points, stride, near, far)
-        return cls(view, T_wc, camera, around, stride, near, far)
+        return cls(view, T_wc, camera, around, stride, AROUND_OF_POINTS, near, far)
 
     def votes(self, point: Float64, sigma: float) -> npt.NDArray[np.uint8]:
         """Return the vote (n,) on points (n, 3); depth of a surface differs by `sigma`, relative, between views."""
@@ -128,7 +133,8 @@ class KeptDepth:
 
         votes = np.empty(len(point), np.uint8)
         gap, near_by = (math.ceil(math.log1p(each(sigma)) / STEP) for each in (gap_of, near_by_of))
-        vote(point, self.T_wc, self.camera, self.around, self.stride, self.near, self.far, AROUND, gap, near_by, votes)
+        place = self.T_wc, self.camera, self.around, self.stride
+        vote(point, *place, self.near, self.far, self.margin, gap, near_by, votes)
         return votes
 
 
