@@ -38,7 +38,7 @@ AROUND = 2
 depth move things sidewards in an image. Holes count as near in the next blocks."""
 
 AROUND_OF_POINTS = 1
-"""The same for the points of a LiDAR, whose blocks are larger, and which have no edges of depth that errors displace."""
+"""The same for the points of a LiDAR: its blocks are larger, and it has no edges of depth that errors displace."""
 
 REACH = 0.25
 """Blocks to each side, a pixel at least, in which a spot's surface must be smooth where it was found."""
