@@ -81,10 +81,10 @@ def test_of_depth_cast_at_a_mesh_no_masks_are_written(tmp_path) -> None:  # type
 def test_exported_masks_take_the_movers_out_of_the_map(run, tmp_path) -> None:  # type: ignore[no-untyped-def]
     """The folder that a run reads gets the masks that were exported of it: VSS and SBD are without movers then."""
     (converted,) = convert(semstab.load_config(CITY), tmp_path / "data")
-    config = CITY | {"dataset": {"name": "posed_folder", "options": {"root": str(converted.path)}}, "scenes": None}
+    config = CITY | {"dataset": {"name": "posed_folder", "options": {"root": str(converted.folder)}}, "scenes": None}
     (before,) = semstab.run(config, out=tmp_path / "before", report=False).select()
     semstab.export(tmp_path / "before", tmp_path / "moving")
-    (tmp_path / "moving").rename(converted.path / "mask")
+    (tmp_path / "moving").rename(converted.folder / "mask")
     (after,) = semstab.run(config, out=tmp_path / "after", report=False).select()
     (kept,) = semstab.run(config | {"exclude": {"masks": False}}, out=tmp_path / "kept", report=False).select()
 

@@ -45,7 +45,11 @@ REACH = 0.25
 
 EDGE, EDGE_SIGMAS = 0.05, 6.0
 """Inverse depth of the pixels around a spot differs by EDGE, relative, and so many standard deviations of noise, at
-most: else the spot is at an edge of depth, or seen at a grazing angle, and it is not told whether it moved."""
+most: else the spot is at an edge of depth, or seen at a grazing angle."""
+
+SAME, SAME_SIGMAS = 0.01, 2.0
+"""At an edge a spot is told, too, if inverse depth of more than half of the pixels around differs from it by at most
+SAME, relative, and so many standard deviations of noise."""
 
 NEAR_BY, NEAR_BY_SIGMAS = 0.003, 3.0
 """A view sees a spot if depth there differs by at most this, relative, and by so many standard deviations."""
@@ -343,7 +347,8 @@ def firm(
 
     firm = np.empty(len(point), np.bool_)
     reach = max(1, round(REACH * math.sqrt(depth.size / BLOCKS)))
-    on_one_surface(point, T_wc, camera, depth, reach, EDGE + EDGE_SIGMAS * noise, firm)
+    limits = EDGE + EDGE_SIGMAS * noise, SAME + SAME_SIGMAS * noise
+    on_one_surface(point, T_wc, camera, depth, reach, *limits, firm)
     return firm
 
 

@@ -58,24 +58,24 @@ def blocks_of_image(depth, stride, low, high, hole, near, far):
 
 
 @serial
-def on_one_surface(point, T, camera, depth, reach, most, firm):
+def on_one_surface(point, T, camera, depth, reach, most, near_by, firm):
     """Write for each point (n, 3) of an image's surface whether the pixels around it are of this surface.
 
-    All pixels up to `reach` to each side have depth, and the inverse depth of more than half of them differs from the
-    point's by at most `most`, relative. A pixel at an edge often has a depth between both surfaces, at which there is
-    nothing, and which few pixels around have.
+    All pixels up to `reach` to each side have depth. Their inverse depth differs by at most `most`, relative; or more
+    than half of them, at an edge, differ from the point by at most `near_by`. A pixel at an edge often has a depth
+    between both surfaces, at which there is nothing, and which few pixels around have.
     """
     fx, fy, cx, cy = camera
     for i in range(len(point)):
         right, down, z = in_sensor(point[i, 0], point[i, 1], point[i, 2], T)
         column, row = np.int64(np.floor(right / z * fx + cx + 0.5)), np.int64(np.floor(down / z * fy + cy + 0.5))
-        low, same = np.inf, 0
+        low, high, same = np.inf, 0.0, 0
         for b in range(row - reach, row + reach + 1):
             for a in range(column - reach, column + reach + 1):
                 there = inverse(depth, b, a)
-                low = min(low, there)
-                same += abs(there * z - 1.0) <= most
-        firm[i] = low > 0.0 and 2 * same > (2 * reach + 1) ** 2
+                low, high = min(low, there), max(high, there)
+                same += abs(there * z - 1.0) <= near_by
+        firm[i] = low > 0.0 and (high - low <= most * low or 2 * same > (2 * reach + 1) ** 2)
 
 
 @serial
