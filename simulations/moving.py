@@ -1,6 +1,7 @@
 """Are the spots that moved found, and is nothing called moved that stayed?
 
-    python simulations/simulate.py moving [--scenes 20] [--noise 0 0.003 0.01] [--only made still city] [--data FOLDER]
+    python simulations/simulate.py moving [--scenes 20] [--noise 0 0.003 0.01] [--only made still scans city]
+        [--data FOLDER]
 
 Made scenes: a camera goes along a street, 3 to 15 m high, 40 frames; there are walls, parked boxes and six boxes that
 move: they drive all the time, drive and stop, or stand and start, at 0.05 to 2 of their own lengths a frame. Noise of
@@ -9,7 +10,9 @@ mover if the view that found it shows one there; recall is of the spots of mover
 while the camera filmed, *told* of those of which it is known whether they moved. The first table has these scenes;
 *share* is the mean and the largest error of the share of the disagreement that is at movers. The second one has the
 recall by speed, in lengths a frame, at the first noise. Then come the same scenes without movers (still); the built-in
-city with its cars and people; and sequences of the folder --data in which nothing moves (../shared/data).
+city with its cars and people; the made streets with and without movers, as a LiDAR sees them that drives there (scans);
+and sequences of the folder --data in which nothing moves (../shared/data). With `--only streets` the folder --data has
+streets of SemanticKITTI, as scripts/streets.py prepares them: what moves there has ids 252 to 259.
 """
 
 from __future__ import annotations
@@ -38,6 +41,9 @@ CLASSES = 4
 
 SPEEDS = (0.05, 0.2, 0.5, 1.0, 2.0)
 NOISES = (0.0, 0.003, 0.01)
+SCAN_NOISES = (0.0, 0.02, 0.05)
+"""Standard deviations of the range of a LiDAR's points, metres."""
+
 STATIC = (("livingroom", 4), ("hololens", 2), ("apc_shelf", 1), ("brighton", 1))
 """Real sequences without movers, and every n-th of their frames."""
 
@@ -187,6 +193,9 @@ class Counts:
         self.found += int((far & moved).sum())
         self.static, self.wrong = self.static + int((known & ~mover).sum()), self.wrong + int((moved & ~mover).sum())
 
+    def __add__(self, other: Counts) -> Counts:
+        return Counts(*(getattr(self, each.name) + getattr(other, each.name) for each in dataclasses.fields(self)))
+
     def cells(self) -> list[str]:
         def part(a: int, b: int) -> str:
             return f"{a / b:.3f}" if b else "-"
@@ -298,12 +307,18 @@ def main(
     only: tuple[str, ...] = ("made", "still", "city"),
     noise: tuple[float, ...] = NOISES,
 ) -> None:
+    import moving_scans  # which takes streets from here
+
     for name, movers in (("made", MOVERS), ("still", 0)):
         if name in only:
             made(scenes, seed, noise, movers)
+            print()
+    if "scans" in only:
+        for movers in (MOVERS, 0):
+            moving_scans.made(scenes, seed, SCAN_NOISES, movers)
             print()
     if "city" in only:
         city()
         print()
     if data:
-        real(Path(data))
+        (moving_scans.streets if "streets" in only else real)(Path(data))

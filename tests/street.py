@@ -11,6 +11,9 @@ from scan_writers import Scan, predict_semantickitti, rigid, write_semantickitti
 IDS = np.array([10, 40, 50, 70])
 """Stored ids: car, road, building, vegetation."""
 
+DRIVES = 252
+"""The stored id of a car that drives."""
+
 SCANS, ROWS, COLUMNS = 10, 24, 240
 
 TO_CAMERA = rigid((90.5, -89.6, 0.3), (-0.01, -0.06, -0.33))
@@ -26,9 +29,12 @@ class Street:
     poses: list
 
     @classmethod
-    def made(cls, seed, rows=ROWS, turn=0.03, sideways=0.1):
-        """A drive that turns by so many radians a scan, and moves by so many metres to the left."""
-        scans, ids, poses = _driven(seed, rows, turn, sideways)
+    def made(cls, seed, rows=ROWS, turn=0.03, sideways=0.1, oncoming=0.0):
+        """A drive that turns by so many radians a scan, and moves by so many metres to the left.
+
+        If `oncoming` is not 0 a car, of the id DRIVES, comes towards it by so many metres a scan.
+        """
+        scans, ids, poses = _driven(seed, rows, turn, sideways, oncoming)
         return cls([*scans], [*ids], [pose.copy() for pose in poses])
 
     def __iter__(self):
@@ -45,7 +51,7 @@ class Street:
 
 
 @functools.lru_cache(maxsize=8)
-def _driven(seed, rows, turn, sideways):
+def _driven(seed, rows, turn, sideways, oncoming):
     """Scans, ids and poses of a drive, made once."""
     rng = np.random.default_rng(seed)
     boxes = []
@@ -65,7 +71,9 @@ def _driven(seed, rows, turn, sideways):
         pose = np.eye(4)
         pose[:2, :2] = [[cos, -sin], [sin, cos]]
         pose[:3, 3] = 1.2 * k, sideways * k, 0.0
-        distance, label = _cast(pose[:3, 3], rays @ pose[:3, :3].T, boxes)
+        x = 22.0 - oncoming * k
+        going = [((x, 1.2, -2), (x + 4, 3.0, -0.4), DRIVES)] if oncoming else []
+        distance, label = _cast(pose[:3, 3], rays @ pose[:3, :3].T, boxes + going)
         hit = distance < 45
         scans.append((rays[hit] * (distance[hit] + rng.normal(0, 0.01, hit.sum()))[:, None]).astype(np.float32))
         ids.append(label[hit])

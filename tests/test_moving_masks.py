@@ -7,7 +7,12 @@ import numpy as np
 import pytest
 
 import semstab
+from semstab.convert import convert
+from semstab.data.measures import SBD, VSS
 from semstab.errors import ConfigError
+from semstab.recording import Recording
+from semstab.recording.voxel_maps import packed
+from semstab.statistics.moving import MOVED, STATE_COLORS, STAYED, states_of
 
 CITY = {
     "dataset": {"name": "city", "options": {"width": 256, "height": 144, "frames": 40}}, "scenes": ["scene0"],
@@ -18,7 +23,7 @@ CITY = {
 @pytest.fixture(scope="module")
 def run(tmp_path_factory):  # type: ignore[no-untyped-def]
     folder = tmp_path_factory.mktemp("moving")
-    semstab.run(CITY, out=folder / "run")
+    semstab.run(CITY, out=folder / "run", observers=[Recording(folder / "run" / "recording.rrd")])
     return folder / "run"
 
 
@@ -72,3 +77,44 @@ def test_of_depth_cast_at_a_mesh_no_masks_are_written(tmp_path) -> None:  # type
     with pytest.raises(ConfigError, match=r"depth is cast at odm_mesh\.ply"):
         write_masks(task, tmp_path / "moving")
     assert not (tmp_path / "moving").exists()
+
+
+def test_exported_masks_take_the_movers_out_of_the_map(run, tmp_path) -> None:  # type: ignore[no-untyped-def]
+    """The folder that a run reads gets the masks that were exported of it: VSS and SBD are without movers then."""
+    (converted,) = convert(semstab.load_config(CITY), tmp_path / "data")
+    config = CITY | {"dataset": {"name": "posed_folder", "options": {"root": str(converted.folder)}}, "scenes": None}
+    (before,) = semstab.run(config, out=tmp_path / "before", report=False).select()
+    semstab.export(tmp_path / "before", tmp_path / "moving")
+    (tmp_path / "moving").rename(converted.folder / "mask")
+    (after,) = semstab.run(config, out=tmp_path / "after", report=False).select()
+    (kept,) = semstab.run(config | {"exclude": {"masks": False}}, out=tmp_path / "kept", report=False).select()
+
+    def cars(record) -> int:  # type: ignore[no-untyped-def]
+        table = record.table()
+        return int(np.isin(semstab.metrics.dominant(table), [table.classes.index("moving car")]).sum())
+
+    means = [record.summary.table.recurrent for record in (before, after)]
+    assert means[1][VSS] > means[0][VSS]
+    assert means[1][SBD] < means[0][SBD]
+    assert cars(after) < 0.5 * cars(before)
+    np.testing.assert_array_equal(kept.table().index, before.table().index)
+    assert kept.summary.table.recurrent[VSS] == before.summary.table.recurrent[VSS]
+
+
+def test_the_map_and_the_recording_have_a_layer_of_what_moved(run) -> None:  # type: ignore[no-untyped-def]
+    from test_recording import read, read_blueprints
+
+    (record,) = semstab.load_result(run).select()
+    table = record.table()
+    states = states_of(record, table.centers)
+    cars = semstab.metrics.dominant(table) == table.classes.index("moving car")
+    assert (states[cars] == MOVED).mean() > 10 * (states[~cars] == MOVED).mean()
+    assert (states == STAYED).mean() > 0.3
+    rows = read(run / "recording.rrd")
+    drawn = [row["moved:colors"] for at in rows if "/map/" in at for row in rows[at] if row.get("moved:colors")]
+    shown = np.unique(np.concatenate(drawn), return_counts=True)
+    expected = packed(STATE_COLORS)[states]
+    np.testing.assert_array_equal(shown, np.unique(expected, return_counts=True))
+    views = [row for rows in read_blueprints(run / "recording.rrd") for row in rows]
+    assert ["gt: orange moved, blue stayed"] in [row.get("ViewBlueprint:display_name") for row in views]
+    assert 'data-layer="moved"' in (run / "report.html").read_text()

@@ -7,6 +7,7 @@ from collections.abc import Iterator
 
 import numpy as np
 import pytest
+from street import DRIVES, Street
 
 from semstab.data.frames import Frame, Intrinsics
 from semstab.statistics import Sampler, SpotObservations
@@ -157,3 +158,24 @@ def test_two_views_and_a_third_of_the_votes_decide() -> None:
     q = 3.5 / 1001
     expected = np.mean([q**2, 10 * q**2 * (1 - q) ** 3 + 10 * q**3, 20 * q**3, 210 * q**4])
     assert votes.false_share == pytest.approx(expected, rel=0.05)
+
+
+def test_an_oncoming_car_is_found_in_scans_by_what_it_left_behind() -> None:
+    """Nothing else is: scans see through its place before and after, and points around are farther."""
+    found, still = (asked_by_scans(oncoming) for oncoming in (4.0, 0.0))
+    drives, spots = found
+    assert spots.votes is not None
+    assert spots.votes.moved[drives].mean() > 0.5
+    assert not spots.votes.moved[classes(spots) == 0].any()
+    assert spots.votes.known[classes(spots) >= 0].mean() > 0.6
+    assert still[1].votes is not None
+    assert not still[1].votes.moved.any()
+
+
+def asked_by_scans(oncoming: float) -> tuple[np.ndarray, SpotObservations]:
+    """Return which spots are on the car that drives, and the spots."""
+    sampler = Sampler(2)
+    for k, (points, ids, T_wc) in enumerate(Street.made(5, rows=64, oncoming=oncoming)):
+        sampler.add(Frame(k, points=points, labels=(ids == DRIVES).astype(np.uint8), T_wc=T_wc))
+    spots = sampler.sample()
+    return classes(spots) == 1, spots

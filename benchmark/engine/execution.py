@@ -185,6 +185,8 @@ class _Execution:
             if self._executor.elsewhere or unit.regions:
                 frames, name = len(unit.task.indices), f"{unit.name.scene} · {unit.name.model}"
                 self._observers.tell(lambda observer: observer.advanced(frames, name))
+        if isinstance(record, Record):
+            record = dataclasses.replace(record, voxels_file=folder.record(unit, record).voxels_file)
         self._observers.tell(lambda observer: observer.unit_finished(unit, record, work.table, work.error))
 
     def _check_geometry(self, config: Config, missing: Sequence[Unit]) -> None:

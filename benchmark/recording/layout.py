@@ -24,7 +24,18 @@ from semstab.metrics import CATEGORIES, CATEGORY_COLORS
 from semstab.recording.drift import PICTURES
 from semstab.recording.target import Target, flush
 from semstab.recording.timeline import OF_VIDEOS, SERIES, entity, path
-from semstab.recording.voxel_maps import CHUNKS, DIFFERENCE, chunk, color_modes, defaults, packed, thinned, visualizer
+from semstab.recording.voxel_maps import (
+    CHUNKS,
+    DIFFERENCE,
+    MOVED,
+    chunk,
+    color_modes,
+    defaults,
+    mode_of,
+    packed,
+    thinned,
+    visualizer,
+)
 from semstab.task import Task
 
 # A view shows a map from the camera pose from which the map fills it.
@@ -209,13 +220,18 @@ def blueprint(
     legends: Mapping[str, Legend],
     bounds: Mapping[str, SceneBounds | None],
     not_assessed: Set[tuple[str, str]] = frozenset(),
+    with_movers: Set[tuple[str, str]] = frozenset(),
 ) -> rrb.Blueprint:
     """Return the layout of a plan, with the legends and bounds of its scenes so far.
 
-    `not_assessed` has scenes and models whose maps' categories say nothing.
+    `not_assessed` has scenes and models whose maps' categories say nothing, `with_movers` those in whose maps something
+    moved.
     """
     by_scene = itertools.groupby(plan.tasks, key=lambda task: task.scene.name)
-    scenes = [_scene(scene, list(tasks), legends[scene], bounds[scene], not_assessed) for scene, tasks in by_scene]
+    scenes = [
+        _scene(scene, list(tasks), legends[scene], bounds[scene], not_assessed, with_movers)
+        for scene, tasks in by_scene
+    ]
     return rrb.Blueprint(
         rrb.Tabs(*scenes) if len(scenes) > 1 else scenes[0],
         rrb.BlueprintPanel(state="collapsed"),
@@ -246,6 +262,7 @@ def _scene(
     legend: Legend,
     bounds: SceneBounds | None,
     not_assessed: Set[tuple[str, str]],
+    with_movers: Set[tuple[str, str]],
 ) -> rrb.Container:
     if not tasks[0].scene.posed:
         return _video(scene, tasks)
@@ -256,7 +273,9 @@ def _scene(
         for other in task.backends
         if other != drawn(task)
     ]
-    return rrb.Tabs(_overview(scene, tasks, legend, bounds, not_assessed), *flips, *comparisons, name=scene)
+    return rrb.Tabs(
+        _overview(scene, tasks, legend, bounds, not_assessed, with_movers), *flips, *comparisons, name=scene
+    )
 
 
 def _video(scene: str, tasks: list[Task]) -> rrb.Container:
@@ -275,11 +294,13 @@ def _overview(
     legend: Legend,
     bounds: SceneBounds | None,
     not_assessed: Set[tuple[str, str]],
+    with_movers: Set[tuple[str, str]],
 ) -> rrb.Container:
     below = legend.height(LINES) + TITLE
-    tabs: list[rrb.Container | rrb.View] = [
-        _maps(name, tasks, bounds, LEFT[1] - TITLE - below, not_assessed) for name in color_modes()
-    ]
+    height = LEFT[1] - TITLE - below
+    tabs: list[rrb.Container | rrb.View] = [_maps(name, tasks, bounds, height, not_assessed) for name in color_modes()]
+    if moved := [task for task in tasks if (scene, task.model) in with_movers]:
+        tabs.append(_maps(MOVED, moved, bounds, height, not_assessed))
     opened = [*color_modes()].index(OPENED)
     if len(legend.entries) > legend.room:
         tabs.append(_legend(scene, "all_classes", "All classes", legend.height()))
@@ -311,7 +332,7 @@ def _maps(
         silent = name == OPENED and (scene, task.model) in not_assessed
         return f"{task.model}: {'not assessed (uninformative)' if silent else mode.title}"
 
-    mode, scene = color_modes()[name], tasks[0].scene.name
+    mode, scene = mode_of(name), tasks[0].scene.name
     height -= (LINE + TITLE) * (name == OPENED)
     apart = len(tasks) > SIDE_BY_SIDE
     columns = 1 if apart else 2 if len(tasks) == SIDE_BY_SIDE else len(tasks)

@@ -20,7 +20,7 @@ from semstab.config import BACKENDS, BASE, Config
 from semstab.configure import require_named_code, settings_of_folder
 from semstab.core.prefetch import prefetch
 from semstab.core.process import available_bytes
-from semstab.core.types import Float64, Int64
+from semstab.core.types import Float64, Int64, UInt8
 from semstab.data.features import FeatureColours
 from semstab.data.frames import Frame
 from semstab.data.labels import LabelSpace
@@ -49,6 +49,7 @@ from semstab.recording.voxel_maps import (
     verdict_report,
 )
 from semstab.report.narrative import not_assessed
+from semstab.statistics.moving import states_of
 from semstab.task import Task, read
 
 logger = logging.getLogger("semstab")
@@ -119,11 +120,13 @@ class GroupLog:
             stream.log(where, image_of_features, over_camera(stride))
 
     def log_unit(
-        self, stream: rr.RecordingStream, summary: UnitSummary, table: VoxelTable, tolerance: float, factor: int = 1
-    ) -> None:
+        self, stream: rr.RecordingStream, summary: UnitSummary, table: VoxelTable, tolerance: float, factor: int = 1,
+        moved: UInt8 | None = None,
+    ) -> None:  # fmt: skip
         """Log a unit's final voxels, their differences from the drawn unit, its numbers, the agreement of its frames.
 
         - `factor`: the factor of a table that is thinned already: it is not compared
+        - `moved`: (n,) the states of the table's voxels, if movers were found
         """
         unit, first = summary.unit, drawn(self.task)
         if factor == 1:
@@ -133,7 +136,7 @@ class GroupLog:
                 if other != first:
                     self._log_difference(stream, first, other, tolerance)
         silent = not_assessed(summary)
-        note = self._map(unit.backend).finish(stream, table, factor, assessed=not silent)
+        note = self._map(unit.backend).finish(stream, table, factor, assessed=not silent, moved=moved)
         note += f"; {silent}" if silent else ""
         recurrent = summary.table.recurrent
         means = (f"{m.named} {recurrent[m]:.{m.digits[0]}f} {m.unit}".rstrip() for m in measures())
@@ -197,6 +200,7 @@ class Recording(Observer):
         self._logged: set[UnitName] = set()
         self._live: set[UnitName] = set()  # units whose rows were logged frame by frame
         self._not_assessed: set[tuple[str, str]] = set()  # scenes and models
+        self._with_movers: set[tuple[str, str]] = set()
         self._sent, self._outdated = 0, False  # layouts; whether maps have been finished since the last one
         self._others = "all other files are complete, and the same command makes the recording again"
 
@@ -237,7 +241,7 @@ class Recording(Observer):
             return
         self._unfinished.remove(unit.name)
         if isinstance(record, Record) and table is not None:
-            self._log_unit(self._group, record.summary, table)
+            self._log_unit(self._group, record, table)
         if not self._unfinished:
             self._end_group()
 
@@ -285,7 +289,7 @@ class Recording(Observer):
                     timeline.log_file(stream, record.unit, task, record.series, self._clock, only)
                 if record.pixels is None:
                     factor, table = load_map(record, group.origin)
-                    self._log_unit(group, record.summary, table, factor)
+                    self._log_unit(group, record, table, factor)
             self._end_group()
         for scene in self._scenes:
             verdict = rr.TextDocument(verdict_report(result, scene), media_type=rr.MediaType.MARKDOWN)
@@ -374,15 +378,18 @@ class Recording(Observer):
             text = f"{task.model}: drift of frames is left out, because its map would not fit into memory"
             self._opened()[0].log(path(scene, "log"), rr.TextLog(text))
 
-    def _log_unit(self, group: GroupLog, summary: UnitSummary, table: VoxelTable, factor: int = 1) -> None:
+    def _log_unit(self, group: GroupLog, record: Record, table: VoxelTable, factor: int = 1) -> None:
+        summary, moved = record.summary, states_of(record, table.centers)
         stream, background = self._opened()
         self._logged.add(summary.unit)
         if not_assessed(summary):
             self._not_assessed.add((summary.unit.scene, summary.unit.model))
+        if moved is not None:
+            self._with_movers.add((summary.unit.scene, summary.unit.model))
         tolerance = self._plan.config.tolerance
 
         def job() -> None:
-            group.log_unit(stream, summary, table, tolerance, factor)
+            group.log_unit(stream, summary, table, tolerance, factor, moved)
             self._scenes[summary.unit.scene].see(stream, group.task, table)
             self._outdated = True
             if self._sent == 1:  # later layouts wait for the end: each has all scenes
@@ -402,7 +409,7 @@ class Recording(Observer):
         """Send the layout; a viewer that follows the run keeps the first one."""
         legends = {name: scene.legend for name, scene in self._scenes.items()}
         bounds = {name: scene.bounds for name, scene in self._scenes.items()}
-        layout = blueprint(self._plan, legends, bounds, self._not_assessed)
+        layout = blueprint(self._plan, legends, bounds, self._not_assessed, self._with_movers)
         stream.send_blueprint(layout, make_default=True, make_active=self._sent == 0 or not self.target.live)
         self._sent, self._outdated = self._sent + 1, False
 

@@ -16,7 +16,7 @@ import numpy.typing as npt
 import rerun as rr
 from rerun.blueprint.encodings import ComponentSourceKind, VisualizerComponentMapping
 
-from semstab.core.types import Int64, UInt32
+from semstab.core.types import Int64, UInt8, UInt32
 from semstab.data.labels import LabelSpace
 from semstab.data.measures import Voxels, bits, measures, sbd
 from semstab.data.records import Record, Result
@@ -29,6 +29,7 @@ from semstab.recording.loops import first_of_blocks
 from semstab.report.narrative import outlying_line
 from semstab.report.ranking import answers
 from semstab.report.terminal import TEXTS, columns, row_of
+from semstab.statistics.moving import STATE_COLORS
 
 
 @dataclass(frozen=True)
@@ -61,6 +62,15 @@ def color_modes() -> dict[str, ColorMode]:
     return modes | {"category": ColorMode("Category", "category")}
 
 
+MOVED = "moved"
+"""The mode of a map whose voxels are coloured by whether they moved; only final maps with movers have it."""
+
+
+def mode_of(name: str) -> ColorMode:
+    """Return a mode by its name, that of movers, too."""
+    return ColorMode("Moved", "orange moved, blue stayed") if name == MOVED else color_modes()[name]
+
+
 MAX_VOXELS = 2_000_000
 """The most voxels of a map; a larger map is thinned at its end."""
 
@@ -91,7 +101,9 @@ def packed(colors: npt.ArrayLike) -> UInt32:
     return rgba
 
 
-def components(index: Int64, size: float, classes: LabelSpace, voxels: Voxels, *, assessed: bool = True) -> list[Any]:
+def components(
+    index: Int64, size: float, classes: LabelSpace, voxels: Voxels, *, assessed: bool = True, moved: UInt8 | None = None
+) -> list[Any]:
     """Return a grid that shows the dominant class, with the measures that it can show instead; see `visualizer`.
 
     Args:
@@ -100,15 +112,21 @@ def components(index: Int64, size: float, classes: LabelSpace, voxels: Voxels, *
         classes: The label space, with its colours.
         voxels: Evidence that is measured, so that each measure is computed in one pass.
         assessed: False for a map about whose stability its frames say nothing: its categories have no colours.
+        moved: (n,) the voxels' states, if movers were found: see `states_at`.
     """
     colors = CATEGORY_COLORS if assessed else [NOT_ASSESSED] * len(CATEGORY_COLORS)
     category = packed(colors)[categorise(voxels.op, sbd(voxels), bits(voxels))]
+    states = None if moved is None else packed(STATE_COLORS)[moved]
     values: dict[str, npt.NDArray[Any]] = {measure.key: measure.of(voxels) for measure in measures()}
     return [
         rr.VoxelGridMap.from_fields(
             voxel_indices=index.astype(np.int32), voxel_size=[size] * 3, colors=packed(classes.colors)[dominant(voxels)]
         ),
-        rr.DynamicArchetype("category", components={"colors": rr.components.ColorBatch(category)}),
+        *(
+            rr.DynamicArchetype(name, components={"colors": rr.components.ColorBatch(each)})
+            for name, each in {"category": category, MOVED: states}.items()
+            if each is not None
+        ),
         *(
             rr.DynamicArchetype(name, components={"values": rr.components.VoxelValueBatch(each.astype(np.float32))})
             for name, each in {**values, "op": voxels.op}.items()
@@ -117,13 +135,13 @@ def components(index: Int64, size: float, classes: LabelSpace, voxels: Voxels, *
 
 
 def visualizer(name: str) -> rr.blueprint.Visualizer:
-    """Return a visualizer that shows a measure, or the category, of a grid; without one a view shows the class.
+    """Return a visualizer that shows a measure, the category, or what moved, of a grid.
 
-    The view's `defaults` set the colours of values.
+    Without one a view shows the class. The view's `defaults` set the colours of values.
     """
     source = ComponentSourceKind.SourceComponent
-    if name == "category":
-        mappings = [VisualizerComponentMapping("VoxelGridMap:colors", source, source_component="category:colors")]
+    if name in ("category", MOVED):
+        mappings = [VisualizerComponentMapping("VoxelGridMap:colors", source, source_component=f"{name}:colors")]
     else:
         mappings = [
             VisualizerComponentMapping("VoxelGridMap:values", source, source_component=f"{name}:values"),
@@ -134,7 +152,7 @@ def visualizer(name: str) -> rr.blueprint.Visualizer:
 
 def defaults(name: str) -> list[rr.VoxelGridMap]:
     """Return the defaults by which a view colours the values of a measure."""
-    mode = color_modes()[name]
+    mode = mode_of(name)
     return [] if mode.range is None else [rr.VoxelGridMap.from_fields(colormap=mode.colormap, value_range=mode.range)]
 
 
@@ -197,15 +215,22 @@ class VoxelLogger:
         factor: int,
         *,
         assessed: bool = True,
+        moved: UInt8 | None = None,
     ) -> None:
         """Log rows of a table as a chunk, whose voxels stand for blocks with an edge of `factor` voxels."""
         at = np.s_[rows[0] : rows[-1] + 1] if factor == 1 else rows  # a map that is not thinned is not copied
         voxels = Voxels(table.op[at], table.evidence.take(at).measured(), table.drift_sum[at])
         index = (table.index[at] - self._origin) // factor
         size = table.voxel_size * factor
-        stream.log(chunk(self._entity, c), *components(index, size, self._classes, voxels, assessed=assessed))
+        own = None if moved is None else moved[at]
+        stream.log(
+            chunk(self._entity, c), *components(index, size, self._classes, voxels, assessed=assessed, moved=own)
+        )
 
-    def finish(self, stream: rr.RecordingStream, table: VoxelTable, factor: int = 1, *, assessed: bool = True) -> str:
+    def finish(
+        self, stream: rr.RecordingStream, table: VoxelTable, factor: int = 1, *, assessed: bool = True,
+        moved: UInt8 | None = None,
+    ) -> str:  # fmt: skip
         """Log the final map instead of the growing one; return a note on thinning where it is too large.
 
         Args:
@@ -213,12 +238,13 @@ class VoxelLogger:
             table: The final map.
             factor: Edge of the blocks of a table that is thinned already.
             assessed: See `components`.
+            moved: (n,) see `components`.
         """
         index = table.index - self._origin
         factor, rows = thinned(index) if factor == 1 else (factor, np.arange(len(index)))
         for c, part in enumerate(np.split(rows, self._edges[1:-1])):
             if len(part):
-                self._log(stream, c, table, part, factor, assessed=assessed)
+                self._log(stream, c, table, part, factor, assessed=assessed, moved=moved)
             elif c < self._drawn:
                 stream.log(chunk(self._entity, c), rr.Clear(recursive=False))
         thin = f"; drawn: one voxel of each block of {factor}x{factor}x{factor}, as large as the block"

@@ -38,7 +38,8 @@ for (const filter of document.querySelectorAll("input.filter")) {
   });
 }
 
-// Maps: two images of numbers a model, (class low, class high, category) and (VSS, OP, SBD), painted by layer.
+// Maps: images of numbers a model, (class low, class high, category), (VSS, OP, SBD) and, if something moved, its state;
+// painted by layer.
 const parsed = id => JSON.parse(document.getElementById(id)?.textContent ?? "null");
 const layers = parsed("layers"), units = parsed("maps") ?? [];
 const EMPTY = 255;
@@ -73,6 +74,7 @@ const colorOf = (unit, layer, k) => {
   }
   if (layer === "category") return layers.colors[a[k + 2]];
   if (layer === "class") return unit.palette[a[k] + 256 * a[k + 1]] ?? [128, 128, 128];
+  if (layer === "moved") return layers.states[unit.third ? unit.third[k] : 0][0];
   if (layer === "op") return shade(COOL, Math.log(b[k + 1]) / Math.log(MOST_OP));
   if (b[k + 1] < 2) return [190, 190, 190];  // seen once: nothing could contradict it
   if (layer === "vss") return shade(RAMP, (255 - b[k]) / 127);
@@ -103,6 +105,7 @@ const key = (own, layer) => {
     return names.map((name, k) => swatch(layers.colors[k], name)).reverse().join("")
       + silent.map(unit => `<span><i class="hatched"></i>${escaped(unit.silent)}</span>`).join("");
   }
+  if (layer === "moved") return layers.states.map(([color, name]) => swatch(color, name)).reverse().join("");
   if (layer === "op") return ramp(COOL, "seen once", `${MOST_OP} times or more`);
   if (layer === "vss") return ramp(RAMP, "frames agree", "half of the evidence disagrees") + swatch([190, 190, 190], "seen once");
   if (layer === "sbd") return ramp(RAMP, "0", `${layers.sbd} bits or more`) + swatch([190, 190, 190], "seen once");
@@ -149,7 +152,7 @@ const start = async scene => {
   if (!own.length || scene.dataset.painted) return;
   scene.dataset.painted = "1";
   for (const unit of own) {
-    [unit.first, unit.second] = await Promise.all(unit.numbers.map(pixels));
+    [unit.first, unit.second, unit.third] = await Promise.all(unit.numbers.map(pixels));
     unit.canvas = document.createElement("canvas");
     [unit.canvas.width, unit.canvas.height] = unit.size;
     unit.photo = new Image();

@@ -38,6 +38,7 @@ from semstab.report.tables import tables
 from semstab.report.tables.table import relations
 from semstab.report.terminal import miou
 from semstab.statistics.correctness import MIOU
+from semstab.statistics.moving import STATE_COLORS, STATE_NAMES, states_of
 from semstab.statistics.verdict import LIMITS
 
 MOST_NAMED = 3
@@ -83,7 +84,14 @@ def render(
         notes=[relations(text) for text in notes(result)],
         scenes=shown,
         maps=_script([_for_script(unit) for scene in shown for unit in scene["maps"]]),
-        layers=_script({"categories": CATEGORIES, "colors": CATEGORY_COLORS, "sbd": SBD_END}),
+        layers=_script(
+            {
+                "categories": CATEGORIES,
+                "colors": CATEGORY_COLORS,
+                "sbd": SBD_END,
+                "states": [*zip(STATE_COLORS, STATE_NAMES, strict=True)],
+            }
+        ),
         charts_all=[*_by_op(result.maps), *_sweeps(result.maps)],
         tables=views,
         failures=[_failure(row) for row in result.failures],
@@ -251,6 +259,7 @@ def _map(
     """
     step = max(1, math.ceil(math.sqrt(above.rows.size / CELLS)))
     table, names = above.table, above.table.classes or tuple(map(str, range(above.table.K)))
+    moved = states_of(record, table.centers)
     with np.errstate(invalid="ignore"):
         drift = np.nan_to_num(np.minimum(SBD.of(table) / SBD_END, 1) * (UNKNOWN - 1), nan=UNKNOWN)
     label, category = dominant(table), categories(table)
@@ -259,6 +268,7 @@ def _map(
     while True:
         rows = above.rows[::step, ::step]
         images = [_spread(rows, first), _spread(rows, second.astype(np.uint8))]
+        images += [] if moved is None else [_spread(rows, moved[:, None].repeat(3, axis=1))]
         encoded = [png(image) for image in images]
         if sum(map(len, encoded)) <= most or rows.size < 10_000:
             break
@@ -284,6 +294,7 @@ def _map(
         "names": names,
         "palette": palette.tolist(),
         "numbers": encoded,
+        "moved": moved is not None,
         "silent": silent,
         "plain": png(kinds, np.array([*shades, (255, 255, 255)], dtype=np.uint8)),
         "image": "" if overview is None or overview.color is None else jpeg(_reduced(overview.color, 960)),

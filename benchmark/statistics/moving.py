@@ -7,13 +7,20 @@ from collections.abc import Callable
 
 import numpy as np
 
-from semstab.core.types import THIS_SCENE, Float64, Int64, Mask, Scope
+from semstab.core.types import THIS_SCENE, Float64, Int64, Mask, Scope, UInt8
 from semstab.data.measures import dominant
+from semstab.data.records import Record
 from semstab.data.statistics import Interval, MisplacedFrame, MovedClass, MovedSpots
 from semstab.statistics.accumulate import sums_of_spots
 from semstab.statistics.cluster_sums import ClusterSums, chance_of, value
 from semstab.statistics.intervals import estimate, scope_of
 from semstab.statistics.observations import SpotObservations
+
+UNTOLD, STAYED, MOVED = 0, 1, 2
+"""States of a place: it is not known whether it moved, it stayed, or it moved."""
+
+STATE_COLORS = ((190, 190, 190), (86, 180, 233), (213, 94, 0))
+STATE_NAMES = ("not told", "stayed", "moved")
 
 
 def moved_spots(
@@ -68,6 +75,26 @@ def moving_percent(spots: SpotObservations) -> dict[int, float]:
     moved = np.bincount(spots.view, spots.moved, len(spots.views))
     shares = zip(spots.views.frame.tolist(), moved.tolist(), answers.tolist(), strict=True)
     return {frame: 100 * of_moved / n for frame, of_moved, n in shares if n}
+
+
+def states_at(spots: SpotObservations, point: Float64) -> UInt8:
+    """Return the state (n,) of points (n, 3): the nearest spot's, which is at most a spacing of spots away."""
+    from scipy.spatial import cKDTree
+
+    states = np.full(len(spots.point) + 1, UNTOLD, np.uint8)  # the last one is of points without a spot
+    if spots.votes is None or not len(spots.point):
+        return np.full(len(point), UNTOLD, np.uint8)
+    states[:-1][spots.votes.static], states[:-1][spots.votes.moved] = STAYED, MOVED
+    _, nearest = cKDTree(spots.point).query(point, distance_upper_bound=spots.spacing)
+    return np.asarray(states[nearest], np.uint8)
+
+
+def states_of(record: Record, point: Float64) -> UInt8 | None:
+    """Return the state (n,) of points (n, 3) of a unit's map, see `states_at`; None if no movers were found."""
+    file = record.observations_file
+    if record.statistics is None or record.statistics.static is None or file is None:
+        return None
+    return states_at(SpotObservations.load(file), point)
 
 
 def share_of_disagreement(sums: ClusterSums, rest: ClusterSums) -> float:

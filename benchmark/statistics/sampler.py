@@ -13,7 +13,7 @@ import hashlib
 import math
 import zlib
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, TypeGuard
 
 import numpy as np
 import numpy.typing as npt
@@ -266,21 +266,23 @@ class Sampler:
         self._spots += find(self._table, self._point[self._spots : end], self._hash[self._spots : end])
 
     def _remember(self, view: int, frame: Frame, T: Float64, sparse: Sparse | None) -> None:
-        """Keep depth of a view, and of the new spots which view found them and which lie at no edge of depth."""
+        """Keep depth of a view, and of the new spots which view found them and which lie at no edge of depth.
+
+        A point of a LiDAR lies on a surface, at an edge, too: it has no depth between two of them, as a pixel may have.
+        """
         if self._memory is None:
             return
         new = slice(self._known, self._spots)
         self._found[new] = view
-        if sparse is None or not (sparse.around or sparse.spacing > HOLES):
+        if not _of_points(sparse):
             self._firm[new] = firm(self._point[new], T, _camera(frame), fixed(frame.depth), self._noise)
             if self._memory.wants(view):
                 self._memory.add(KeptDepth.of_image(view, T.copy(), _camera(frame), fixed(frame.depth)))
             return
-        points, place = (sparse.u, sparse.v, sparse.w), (sparse.camera, sparse.around, sparse.spacing)
-        kept = KeptDepth.of_points(view, T.copy(), *place, sparse.grid.shape, points)
-        self._firm[new] = kept.firm(self._point[new])
+        self._firm[new] = True
         if self._memory.wants(view):
-            self._memory.add(kept)
+            points, place = (sparse.u, sparse.v, sparse.w), (sparse.camera, sparse.around, sparse.spacing)
+            self._memory.add(KeptDepth.of_points(view, T.copy(), *place, sparse.grid.shape, points))
 
     def _rebuilt(self, size: int) -> Int64:
         """Return a table of the coarse cells of all spots."""
@@ -413,7 +415,8 @@ class Sampler:
         """
         if self._memory is None:
             raise ValueError("no depth of views is kept; make the sampler with moving=True")
-        return self._memory.moving_pixels(frame, self._sigma, votes.misplaced)
+        sparse = _of_points(_sparse(frame, self.K))
+        return self._memory.moving_pixels(frame, self._sigma, votes.misplaced, sparse=sparse)
 
     def _votes(self) -> SpotVotes | None:
         """Return what views say of the spots; None without depth of views."""
@@ -425,6 +428,11 @@ class Sampler:
     def features(self) -> FeatureObservations | None:
         """Return a copy of the features of the sample so far; None without features."""
         return self._features.sample(self.sample())
+
+
+def _of_points(sparse: Sparse | None) -> TypeGuard[Sparse]:
+    """Return whether depth is of the points of a LiDAR, and not of a camera whose depth has holes."""
+    return sparse is not None and (sparse.around or sparse.spacing > HOLES)
 
 
 def _room(n: int) -> tuple[Any, ...]:

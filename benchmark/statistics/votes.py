@@ -37,15 +37,19 @@ AROUND = 2
 """Blocks to each side of a spot that a view must show farther away to see through it: errors of poses and of edges of
 depth move things sidewards in an image. Holes count as near in the next blocks."""
 
+AROUND_OF_POINTS = 1
+"""The same for the points of a LiDAR: its blocks are larger, and it has no edges of depth that errors displace."""
+
 REACH = 0.25
 """Blocks to each side, a pixel at least, in which a spot's surface must be smooth where it was found."""
 
-EDGE_OF_POINTS = 0.05
-"""Sparse depth in the blocks around a spot differs by at most this, relative."""
-
 EDGE, EDGE_SIGMAS = 0.05, 6.0
 """Inverse depth of the pixels around a spot differs by EDGE, relative, and so many standard deviations of noise, at
-most: else the spot is at an edge of depth, or seen at a grazing angle, and it is not told whether it moved."""
+most: else the spot is at an edge of depth, or seen at a grazing angle."""
+
+SAME, SAME_SIGMAS = 0.01, 2.0
+"""At an edge a spot is told, too, if inverse depth of more than half of the pixels around differs from it by at most
+SAME, relative, and so many standard deviations of noise."""
 
 NEAR_BY, NEAR_BY_SIGMAS = 0.003, 3.0
 """A view sees a spot if depth there differs by at most this, relative, and by so many standard deviations."""
@@ -80,6 +84,7 @@ class KeptDepth:
         camera: Focal lengths and principal point in pixels; of a scan, pixels in a radian.
         around: Whether columns close a circle.
         stride: Edge of a block in pixels.
+        margin: Blocks to each side of a spot that must be farther for a view to see through it.
         near, far: (rows, columns) uint16 codes of the nearest and the farthest depth.
     """
 
@@ -88,6 +93,7 @@ class KeptDepth:
     camera: tuple[float, float, float, float]
     around: bool
     stride: float
+    margin: int
     near: UInt16
     far: UInt16
 
@@ -102,7 +108,7 @@ class KeptDepth:
         near, far = np.empty((2, depth.shape[0] // stride, depth.shape[1] // stride), np.uint16)
         low, high = np.empty((2, depth.shape[1]), depth.dtype)
         blocks_of_image(depth, stride, low, high, np.empty(depth.shape[1], np.bool_), near, far)
-        return cls(view, T_wc, camera, False, float(stride), near, far)
+        return cls(view, T_wc, camera, False, float(stride), AROUND, near, far)
 
     @classmethod
     def of_points(
@@ -123,16 +129,7 @@ class KeptDepth:
         stride = shape[1] / columns if around else stride
         near, far = np.empty((2, math.ceil(shape[0] / stride), columns), np.uint16)
         blocks_of_points(*points, stride, near, far)
-        return cls(view, T_wc, camera, around, stride, near, far)
-
-    def firm(self, point: Float64) -> Mask:
-        """Return which points (n, 3) lie in blocks that show one surface."""
-        from semstab.statistics.loops.moving import STEP, in_blocks_of_one_surface
-
-        firm, most = np.empty(len(point), np.bool_), math.ceil(math.log1p(EDGE_OF_POINTS) / STEP)
-        place = self.T_wc, self.camera, self.around, self.stride
-        in_blocks_of_one_surface(point, *place, self.near, self.far, most, firm)
-        return firm
+        return cls(view, T_wc, camera, around, stride, AROUND_OF_POINTS, near, far)
 
     def votes(self, point: Float64, sigma: float) -> npt.NDArray[np.uint8]:
         """Return the vote (n,) on points (n, 3); depth of a surface differs by `sigma`, relative, between views."""
@@ -140,7 +137,8 @@ class KeptDepth:
 
         votes = np.empty(len(point), np.uint8)
         gap, near_by = (math.ceil(math.log1p(each(sigma)) / STEP) for each in (gap_of, near_by_of))
-        vote(point, self.T_wc, self.camera, self.around, self.stride, self.near, self.far, AROUND, gap, near_by, votes)
+        place = self.T_wc, self.camera, self.around, self.stride
+        vote(point, *place, self.near, self.far, self.margin, gap, near_by, votes)
         return votes
 
 
@@ -185,14 +183,15 @@ class DepthMemory:
         seen, hidden, through = counts.T.copy()
         return SpotVotes(seen, hidden, through, shares, ~fits, between, gap_of(sigma))
 
-    def moving_pixels(self, frame: Frame, sigma: float, misplaced: Mask) -> Mask:
+    def moving_pixels(self, frame: Frame, sigma: float, misplaced: Mask, *, sparse: bool = False) -> Mask:
         """Return the pixels (H, W) of a frame whose surface moved: the kept views, but for misplaced ones, tell.
 
-        Places in blocks of pixels are asked; pixels next to such blocks move, too, if they go on at the same depth.
+        Places in blocks of pixels are asked, of sparse depth all pixels that have it; pixels next to such blocks move,
+        too, if they go on at the same depth.
         """
         from semstab.statistics.loops.moving import SEEN, THROUGH
 
-        step = max(1, round(math.sqrt(frame.depth.size / BLOCKS)))
+        step = 1 if sparse else max(1, round(math.sqrt(frame.depth.size / BLOCKS)))
         depth = frame.depth[step // 2 :: step, step // 2 :: step].astype(np.float64)
         valid, K = (depth > 0) & (depth < np.inf), frame.intrinsics
         row, column = (step // 2 + step * each for each in np.nonzero(valid))
@@ -348,7 +347,8 @@ def firm(
 
     firm = np.empty(len(point), np.bool_)
     reach = max(1, round(REACH * math.sqrt(depth.size / BLOCKS)))
-    on_one_surface(point, T_wc, camera, depth, reach, EDGE + EDGE_SIGMAS * noise, firm)
+    limits = EDGE + EDGE_SIGMAS * noise, SAME + SAME_SIGMAS * noise
+    on_one_surface(point, T_wc, camera, depth, reach, *limits, firm)
     return firm
 
 

@@ -58,22 +58,24 @@ def blocks_of_image(depth, stride, low, high, hole, near, far):
 
 
 @serial
-def on_one_surface(point, T, camera, depth, reach, most, firm):
-    """Write for each point (n, 3) of an image's surface whether the pixels around it are of one surface.
+def on_one_surface(point, T, camera, depth, reach, most, near_by, firm):
+    """Write for each point (n, 3) of an image's surface whether the pixels around it are of this surface.
 
-    Inverse depth of the pixels up to `reach` to each side differs by at most `most`, relative. A pixel at an edge of
-    depth often has a depth between both surfaces, at which there is nothing.
+    All pixels up to `reach` to each side have depth. Their inverse depth differs by at most `most`, relative; or more
+    than half of them, at an edge, differ from the point by at most `near_by`. A pixel at an edge often has a depth
+    between both surfaces, at which there is nothing, and which few pixels around have.
     """
     fx, fy, cx, cy = camera
     for i in range(len(point)):
         right, down, z = in_sensor(point[i, 0], point[i, 1], point[i, 2], T)
         column, row = np.int64(np.floor(right / z * fx + cx + 0.5)), np.int64(np.floor(down / z * fy + cy + 0.5))
-        low, high = np.inf, 0.0
+        low, high, same = np.inf, 0.0, 0
         for b in range(row - reach, row + reach + 1):
             for a in range(column - reach, column + reach + 1):
                 there = inverse(depth, b, a)
                 low, high = min(low, there), max(high, there)
-        firm[i] = low > 0.0 and high - low <= most * low
+                same += abs(there * z - 1.0) <= near_by
+        firm[i] = low > 0.0 and (high - low <= most * low or 2 * same > (2 * reach + 1) ** 2)
 
 
 @serial
@@ -141,21 +143,6 @@ def vote(point, T, camera, around, stride, near, far, reach, gap, near_by, votes
             votes[i] = SEEN + part
         elif is_farther(near, row, column, around, reach, here + gap):
             votes[i] = THROUGH + part
-
-
-@serial
-def in_blocks_of_one_surface(point, T, camera, around, stride, near, far, most, firm):
-    """Write for each point (n, 3) whether depth in its block and the 8 around it differs by at most `most` codes."""
-    rows, columns = near.shape
-    for i in range(len(point)):
-        row, column, _ = block_of(point, i, T, camera, around, stride, near.shape)
-        low, high = np.int64(LARGEST), np.int64(0)
-        for b in range(row - 1, row + 2):
-            for aside in range(column - 1, column + 2):
-                a = (aside + columns) % columns if around else aside
-                if row >= 0 and 0 <= b < rows and 0 <= a < columns and far[b, a]:
-                    low, high = min(low, np.int64(near[b, a] & LARGEST)), max(high, np.int64(far[b, a]))
-        firm[i] = high > 0 and high - low <= most
 
 
 @serial
