@@ -1,6 +1,6 @@
 """Two flights over one made scene: is agreement across the flights right, and what changed found?
 
-    python simulations/simulate.py visits [--seeds 4] [--points 20000]
+    python simulations/simulate.py visits [--seeds 4] [--points 20000] [--only PATTERN]
 
 Both flights circle a yard of boxes, slopes and poles on paths of their own, 30 frames each. Labels err as in `exact`; a
 *place* errs alike in both flights. In rows with a share, the labels of that share of the places (cubes of 2 m) are of
@@ -8,12 +8,14 @@ another class in the second flight. With *boxes*, three boxes of the first fligh
 others are new. The exact values are of points that are drawn on the surface and met by each view without any pixel;
 *said - exact* and the standard error of its mean are over scenes, and so is how often the interval of the cost holds
 the exact cost. *found* is the share of the spots on boxes that are gone or new which are called so, of those that two
-views or more of the other flight tell; *wrong* the share of the spots called gone or new that are on no such box.
+views or more of the other flight tell; *wrong* the share of the spots called gone or
+new that are a pixel (.3 m) or more from all such boxes.
 """
 
 from __future__ import annotations
 
 import argparse
+import fnmatch
 from dataclasses import dataclass
 
 import numpy as np
@@ -29,8 +31,8 @@ from semstab.statistics.visits import GONE, NEW, VisitedSpots, VisitSampler, by_
 EDGE = 2.0
 """Edge of the cubes whose labels change, metres."""
 
-NEAR = 0.05
-"""Metres from a box within which a spot is on it."""
+NEAR, PIXEL = 0.05, 0.3
+"""Metres from a box within which a spot is on it; and within which it may be, as a pixel at its edge is so wide."""
 
 
 @dataclass(frozen=True)
@@ -153,10 +155,11 @@ def changes(made: Made, visited: VisitedSpots) -> Array:
     for visit, solids in enumerate(made.alone):
         its = np.zeros(len(point), bool)
         for solid in solids:
-            its |= np.abs((point @ solid.normals.T - solid.offsets).max(axis=1)) < NEAR
+            away = np.abs((point @ solid.normals.T - solid.offsets).max(axis=1))
+            its |= away < NEAR
+            on |= away < PIXEL
         told = its & (visited.votes[1 - visit].votes >= 2) & (visited.votes[visit].seen >= 2)
         counts[:2] += told.sum(), (told & (visited.change == (GONE, NEW)[visit])).sum()
-        on |= its
     counts[2:] = found.sum(), (found & ~on).sum()
     return counts
 
@@ -192,13 +195,16 @@ HEAD = (
 def main() -> None:
     """Print the table."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--only", default="*", metavar="PATTERN", help="as 'orbit*' or '*boxes'")
     parser.add_argument("--seeds", type=int, default=4, help="scenes of each condition")
     parser.add_argument("--points", type=int, default=20000, help="points of the surface")
     parser.add_argument("--size", type=int, nargs=2, default=(90, 120), metavar=("HEIGHT", "WIDTH"))
     arguments = parser.parse_args()
     print("|", " | ".join(HEAD), "|\n|---|" + "---:|" * (len(HEAD) - 1))
     for visits in CONDITIONS:
-        print("|", " | ".join(row(visits, arguments.seeds, arguments.points, tuple(arguments.size))), "|", flush=True)
+        if fnmatch.fnmatch(visits.name, arguments.only):
+            cells = row(visits, arguments.seeds, arguments.points, tuple(arguments.size))
+            print("|", " | ".join(cells), "|", flush=True)
 
 
 if __name__ == "__main__":

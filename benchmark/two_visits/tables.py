@@ -23,6 +23,9 @@ FEW = 0.1
 MOST_NAMED = 4
 """Most classes that a sentence names."""
 
+LEAST_NAMED = 0.01
+"""Share of a class with another class in the second visit from which on a sentence names it."""
+
 ON_SCREEN = ("class", "first", "second", "across", "cost", "relabelled")
 
 ALPHAS = (
@@ -153,7 +156,9 @@ def _of_scene(comparison: VisitComparison, scene: VisitedScene) -> Iterator[str]
 
 def _cost(own: TwoVisits) -> str:
     cost = own.alpha.cost
-    if cost.low > 0 or cost.high < 0:
+    if cost.high < 0:
+        return f"Views agree better across the visits than within: a cost of {cost.text()} of alpha, for {cost.scope}"
+    if cost.low > 0:
         return f"The other visit costs {cost.text()} of alpha, for {cost.scope}"
     return f"No cost of the other visit is shown: {cost.text()} of alpha, for {cost.scope}"
 
@@ -172,7 +177,8 @@ def _surface(own: TwoVisits) -> str:
 def _labels(own: TwoVisits) -> str:
     text = f"Labels: {own.relabelled:.1%} of the spots that did not change have another class"
     text += f" ({own.by_chance:.1%} would by chance)"
-    worst = sorted((each for each in own.classes if each.becomes), key=lambda each: -each.relabelled * each.spots)
+    changed = (each for each in own.classes if each.relabelled >= LEAST_NAMED)
+    worst = sorted(changed, key=lambda each: -each.relabelled * each.spots)
     named = [f"{each.relabelled:.0%} of {each.name}, to {each.becomes}" for each in worst[:MOST_NAMED]]
     return f"{text}: {'; '.join(named)}" if named else text
 

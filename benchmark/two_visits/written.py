@@ -116,6 +116,9 @@ def draw(seen: Visited, places: Sequence[ChangedPlace]) -> Canvas:
     mark_panel(panel, "a", f"spots, {view}")
     framed(panel)
     locate(panel, located, rows.shape)
-    numbers: list[Any] = [place.number for place in places]
-    number_places(panel, numbers, [place.centre for place in places], [""] * len(places), located, rows.shape)
+    centres = np.array([place.centre for place in places]).reshape(-1, 3)
+    if seen.georeference is not None:
+        centres = seen.georeference.in_scene(centres)
+    at: list[Any] = centres.tolist()
+    number_places(panel, [place.number for place in places], at, [""] * len(places), located, rows.shape)
     return figure
