@@ -27,6 +27,7 @@ if TYPE_CHECKING:
     from semstab.other_maps import compare_maps
     from semstab.report.saved_run import load
     from semstab.statistics.acceptance import AcceptanceThresholds
+    from semstab.two_visits import compare_visits
 
 __version__ = "0.4.0"
 
@@ -51,6 +52,7 @@ __all__ = [
     "backends",
     "compare",
     "compare_maps",
+    "compare_visits",
     "datasets",
     "engine",
     "export",
@@ -75,7 +77,7 @@ _HOMES = {
     "GateConfig": "gating.gate", "Intrinsics": "data.frames", "LabelSpace": "data.labels",
     "MissingDependencyError": "errors", "Result": "data.records", "SemstabError": "errors", "VoxelTable": "data.voxels",
     "FusedResult": "online", "TemporalStability": "online", "compare": "compare_runs", "compare_maps": "other_maps",
-    "fuse": "online",
+    "compare_visits": "two_visits", "fuse": "online",
     "export": "exports", "gate": "gating.gate", "load": "report.saved_run",
     "load_config": "configure", "load_result": "engine.folder", "load_study": "configure", "relabel": "exports.relabel",
     "run": "api", "run_study": "api",

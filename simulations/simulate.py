@@ -25,6 +25,7 @@ CASES = {
     "labellers": "labellers",
     "doctor": "doctor",
     "moving": "moving",
+    "visits": "visits",
 }
 
 if __name__ == "__main__":

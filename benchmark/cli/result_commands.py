@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
 from semstab.cli.options import OwnCode, Quiet, ScopeOption, Verbose, print_lines, say
+from semstab.errors import ConfigError
 
 
 def compare(
@@ -18,10 +20,22 @@ def compare(
     scope: ScopeOption = None,
     markdown: Annotated[bool, typer.Option(
         "--markdown", metavar="", help="Print Markdown, for a pull request.")] = False,
+    same_place: Annotated[bool, typer.Option(
+        "--same-place", metavar="", help="Two visits: agreement within and across, and what changed.")] = False,
+    align: Annotated[Path | None, typer.Option(
+        "--align", metavar="FILE", help="With --same-place, points of both: rows x y z of one, x y z of two.")] = None,
+    code: OwnCode = None,
     verbose: Verbose = False,
     quiet: Quiet = False,
 ) -> None:  # fmt: skip
     """Compare runs: report their differences with intervals, by class, location and frame."""
+    if same_place:
+        if scope is not None or markdown:
+            raise ConfigError("--same-place: its intervals are for these frames; leave out --scope and --markdown")
+        _compare_visits(runs, out, align, code or (), verbose=verbose, quiet=quiet)
+        return
+    if align is not None or code:
+        raise ConfigError("--align and --code belong to two visits of one place: add --same-place")
     from semstab.compare_runs import compare
     from semstab.compare_runs import markdown as as_markdown
     from semstab.core.console import Console
@@ -37,6 +51,28 @@ def compare(
         return
     if not quiet:
         print_comparison(comparison, Console(), verbose=verbose, out=out)
+    if out is not None:
+        print_lines([f"folder: {out}; report: {out / 'report.html'}"], quiet=quiet)
+
+
+def _compare_visits(
+    runs: list[str], out: Path | None, align: Path | None, code: Sequence[str], *, verbose: bool, quiet: bool
+) -> None:
+    from semstab.core.console import Console
+    from semstab.engine.folder import require_output
+    from semstab.two_visits import compare_visits
+    from semstab.two_visits.tables import print_visits
+
+    if len(runs) != 2:
+        raise ConfigError(f"--same-place compares two visits; {len(runs)} runs are named")
+    if out is not None:
+        require_output(out / "visits.json", [align])
+    with Console(stderr=True, quiet=quiet).status("opening") as status:
+        comparison = compare_visits(
+            *runs, align=align, out=out, code=code, progress=lambda scene: status.update(f"reading {scene} of both")
+        )
+    if not quiet:
+        print_visits(comparison, Console(), verbose=verbose, out=out)
     if out is not None:
         print_lines([f"folder: {out}; report: {out / 'report.html'}"], quiet=quiet)
 

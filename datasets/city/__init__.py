@@ -24,7 +24,7 @@ from semstab.datasets.city.flight import FLIGHTS
 from semstab.datasets.city.labellers import relabelled
 from semstab.datasets.city.mesh import uavid8
 from semstab.datasets.city.options import CityOptions, SimulatedModel
-from semstab.datasets.city.rendering import Caster, Rendered, render
+from semstab.datasets.city.rendering import LIGHTS, Caster, Rendered, render
 from semstab.datasets.city.simulation import Simulation, View
 from semstab.datasets.city.town import Town, build_town
 from semstab.datasets.scene import GROUND_TRUTH, Dataset, Scene, fingerprint
@@ -38,6 +38,10 @@ GENERATOR_VERSION = 2
 
 FIELD_OF_VIEW = 60.0
 """Of the camera, horizontal, degrees."""
+
+
+USUAL_LIGHT = "noon"
+"""The light of which digests say nothing."""
 
 
 class City(Dataset):
@@ -139,7 +143,8 @@ class CityScene(Scene):
         """Return a hash of all settings that the frames depend on; nothing is rendered."""
         simulated = self._simulated(model)
         errors = None if simulated is None else simulated.model_dump(mode="json")
-        content = self._drawn([int(index) for index in indices], model, errors)
+        light = [] if self._options.light == USUAL_LIGHT else [self._options.light]
+        content = self._drawn([int(index) for index in indices], model, errors, *light)
         return hashlib.sha256(content).hexdigest()
 
     def fingerprints(self, index: int) -> Mapping[str, str]:
@@ -148,7 +153,7 @@ class CityScene(Scene):
 
     def _drawn(self, *more: object) -> bytes:
         """Return all that the scene's geometry depends on, and more, as bytes to hash."""
-        options = self._options.model_dump(mode="json", exclude={"models", "cache_megabytes"})
+        options = self._options.model_dump(mode="json", exclude={"models", "cache_megabytes", "light"})
         return json.dumps([GENERATOR_VERSION, options, self.name, *more], sort_keys=True).encode()
 
     @cached_property
@@ -183,7 +188,7 @@ class CityScene(Scene):
                 return self.rendered[index]
             moving = Caster(self.town.moving(self._share(index) * self._flight.seconds, T[:3, 3]))
             size = (self._options.height, self._options.width)
-            rendered = render((self.still, moving), T, self.camera, size)
+            rendered = render((self.still, moving), T, self.camera, size, LIGHTS[self._options.light])
             stored = sum(other.nbytes for other in self.rendered.values())
             if stored + rendered.nbytes <= self._options.cache_megabytes * 1_000_000:
                 self.rendered[index] = rendered

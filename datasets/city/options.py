@@ -104,6 +104,9 @@ class CityOptions(Settings):
     origin: tuple[Coordinate, Coordinate, Coordinate] = Field(
         (0.0, 0.0, 0.0), description="world coordinates of the town's middle in metres, for example UTM"
     )
+    light: Literal["noon", "morning", "evening", "overcast"] = Field(
+        "noon", description="of the images, as of a flight at another time: labels, depth and poses stay the same"
+    )
     altitude: float = Field(45.0, ge=30, le=120, description="of the camera above the mean ground, metres")
     cache_megabytes: int = Field(256, ge=0, description="rendered frames that an open scene caches for its models")
     models: dict[str, SimulatedModel] = Field(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -16,13 +17,40 @@ from semstab.datasets.city.mesh import LOW_VEGETATION, TREE, Surface
 CHUNK = 1 << 18
 """Rays cast at a time, which bounds the memory of a large image."""
 
-SUN = np.array([0.42, -0.38, 0.82]) / np.linalg.norm([0.42, -0.38, 0.82])
-AMBIENT, SUNLIGHT = 0.52, 0.60
-SKY = np.array([0.62, 0.72, 0.85])
 SHADOW_OFFSET = 0.02
 GRAIN = np.full((256, 2), 0.06)  # by class: share by which colour varies over 0.3 m and over 2.3 m
 GRAIN[TREE] = 0.34, 0.14
 GRAIN[LOW_VEGETATION] = 0.17, 0.13
+
+
+@dataclass(frozen=True, eq=False)
+class Light:
+    """The light of a flight.
+
+    Attributes:
+        sun: (3,) unit vector towards the sun.
+        ambient, sunlight: (3,) RGB of the light from all sides, and of the sun on a surface that faces it.
+        sky: (3,) RGB of what is seen where there is nothing.
+    """
+
+    sun: Float64
+    ambient: Float64
+    sunlight: Float64
+    sky: Float64
+
+    @classmethod
+    def of(cls, sun: tuple[float, ...], ambient: Sequence[float], sunlight: Sequence[float], sky: Any) -> Light:
+        """Make it of the direction towards the sun, of any length, and colours."""
+        return cls(np.array(sun) / np.linalg.norm(sun), *(np.array(color) for color in (ambient, sunlight, sky)))
+
+
+LIGHTS = {
+    "noon": Light.of((0.42, -0.38, 0.82), [0.52] * 3, [0.60] * 3, (0.62, 0.72, 0.85)),
+    "morning": Light.of((0.85, 0.30, 0.34), (0.40, 0.44, 0.52), (0.68, 0.60, 0.48), (0.70, 0.76, 0.85)),
+    "evening": Light.of((-0.90, -0.20, 0.26), (0.36, 0.36, 0.44), (0.78, 0.56, 0.34), (0.86, 0.70, 0.56)),
+    "overcast": Light.of((0.0, 0.0, 1.0), (0.62, 0.64, 0.67), [0.08] * 3, (0.74, 0.75, 0.77)),
+}
+"""The light by the name of an option: noon, sun low in the east or in the west, or clouds."""
 
 
 @dataclass(frozen=True)
@@ -80,7 +108,9 @@ class Caster:
         return depth
 
 
-def render(casters: tuple[Caster, ...], T: Float64, intrinsics: Intrinsics, shape: tuple[int, int]) -> Rendered:
+def render(
+    casters: tuple[Caster, ...], T: Float64, intrinsics: Intrinsics, shape: tuple[int, int], light: Light
+) -> Rendered:
     """Render (H, W) pixels from the pose T (4, 4), relative to the town's origin."""
     depth, incidence = np.zeros((2, *shape), dtype=np.float32)
     classes = np.full(shape, IGNORE_8BIT, dtype=np.uint8)
@@ -89,7 +119,7 @@ def render(casters: tuple[Caster, ...], T: Float64, intrinsics: Intrinsics, shap
     for rows in row_chunks(shape):
         y = (np.arange(rows.start, rows.stop) - intrinsics.cy) / intrinsics.fy
         rays = y[:, None, None] * T[:3, 1] + x[None, :, None] * T[:3, 0] + T[:3, 2]  # their parameter is planar depth
-        z, cosine, ids, rgb = _cast(casters, T[:3, 3], rays.reshape(-1, 3))
+        z, cosine, ids, rgb = _cast(casters, T[:3, 3], rays.reshape(-1, 3), light)
         depth[rows], incidence[rows] = z.reshape(-1, shape[1]), cosine.reshape(-1, shape[1])
         classes[rows], color[rows] = ids.reshape(-1, shape[1]), rgb.reshape(-1, shape[1], 3)
     return Rendered(depth, classes, incidence, color)
@@ -101,10 +131,12 @@ def row_chunks(shape: tuple[int, ...]) -> list[slice]:
     return [slice(top, min(top + step, shape[0])) for top in range(0, shape[0], step)]
 
 
-def _cast(casters: tuple[Caster, ...], origin: Float64, directions: Float64) -> tuple[Float64, Float64, UInt8, UInt8]:
+def _cast(
+    casters: tuple[Caster, ...], origin: Float64, directions: Float64, light: Light
+) -> tuple[Float64, Float64, UInt8, UInt8]:
     """Return depth (0 where nothing is), incidence, class and colour for each ray (n, 3)."""
     n = len(directions)
-    depth, normals, material = np.full(n, np.inf), -directions, np.tile(SKY, (n, 1))
+    depth, normals, material = np.full(n, np.inf), -directions, np.tile(light.sky, (n, 1))
     classes = np.full(n, IGNORE_8BIT, dtype=np.uint8)
     for caster in casters:
         face = caster.first(np.broadcast_to(origin, directions.shape), directions)
@@ -118,21 +150,24 @@ def _cast(casters: tuple[Caster, ...], origin: Float64, directions: Float64) -> 
     towards = np.einsum("ij,ij->i", normals, directions)
     normals[towards > 0] *= -1
     incidence = np.minimum(1.0, np.abs(towards) / np.sqrt(np.einsum("ij,ij->i", directions, directions)))
-    color = material * _brightness(casters, origin + directions * depth[:, None], normals, classes)[:, None]
-    color = np.clip(np.where(seen[:, None], color, SKY) * 255, 0, 255)
+    color = material * _brightness(casters, origin + directions * depth[:, None], normals, classes, light)
+    color = np.clip(np.where(seen[:, None], color, light.sky) * 255, 0, 255)
     return depth, np.where(seen, incidence, 0.0), classes, color.astype(np.uint8)
 
 
-def _brightness(casters: tuple[Caster, ...], points: Float64, normals: Float64, classes: UInt8) -> Float64:
-    """Return Lambert's law under one sun with cast shadows, with grain that is tied to the position."""
-    light = np.maximum(normals @ SUN, 0.0)
-    lit = np.flatnonzero(light > 0)
-    start = points[lit] + SHADOW_OFFSET * (normals[lit] + SUN)
-    shadow: Mask = np.any([caster.first(start, np.broadcast_to(SUN, start.shape)) >= 0 for caster in casters], axis=0)
-    light[lit[shadow]] = 0.0
+def _brightness(
+    casters: tuple[Caster, ...], points: Float64, normals: Float64, classes: UInt8, light: Light
+) -> Float64:
+    """Return (n, 3) Lambert's law under one sun with cast shadows, with grain that is tied to the position."""
+    facing = np.maximum(normals @ light.sun, 0.0)
+    lit = np.flatnonzero(facing > 0)
+    start = points[lit] + SHADOW_OFFSET * (normals[lit] + light.sun)
+    to_sun = np.broadcast_to(light.sun, start.shape)
+    shadow: Mask = np.any([caster.first(start, to_sun) >= 0 for caster in casters], axis=0)
+    facing[lit[shadow]] = 0.0
     fine, coarse = GRAIN[classes].T
     grain = 1 + fine * _noise(points, 0.3) + coarse * _noise(points, 2.3)
-    brightness: Float64 = (AMBIENT + SUNLIGHT * light) * grain
+    brightness: Float64 = (light.ambient + light.sunlight * facing[:, None]) * grain[:, None]
     return brightness
 
 

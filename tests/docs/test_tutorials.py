@@ -43,6 +43,11 @@ def save_rule(folder: Path) -> None:
     (folder / "sharp.py").write_text(python_blocks("fusion-rules.md")[0], encoding="utf-8")
 
 
+def save_models(folder: Path) -> None:
+    """The file of two models that the reader saves."""
+    (folder / "by_colour.py").write_text(python_blocks("tutorials/two-visits.md")[0], encoding="utf-8")
+
+
 @pytest.mark.parametrize(("name", "prepare", "left"), [
     ("own-backend", save_backend, ["mine/report.html", "side-by-side/report.html"]),
     ("fusion-rules", save_rule, ["rules/report.html", "sharp/report.html"]),
@@ -50,6 +55,7 @@ def save_rule(folder: Path) -> None:
     ("lidar-camera", make_nothing, ["run/report.html"]),
     ("scans", make_nothing, [f"scans/{file}" for file in ("report.html", "tables/ranges.csv")]),
     ("two-models", make_nothing, ["both/report.html", "versus/report.html", "versus/comparison.json"]),
+    ("two-visits", save_models, ["by-colour/report.html", "balanced/visits.json"]),
     ("drone-flight", make_project, ["map/report.html", "map.ply", "map.tif", "map.class.tif", "map.laz"]),
 ])  # fmt: skip
 def test_every_block_of_a_tutorial_works_as_it_stands(name, prepare, left, tmp_path, monkeypatch) -> None:

@@ -33,12 +33,14 @@ from semstab.data.statistics.map_statistics import (
     StratumStatistics,
 )
 from semstab.data.statistics.moving import MisplacedFrame, MovedClass, MovedSpots, poses_that_do_not_fit
+from semstab.data.statistics.visits import Across, TwoVisits, VisitedClass
 
 __all__ = [
     "CONFIDENCE",
     "ORDER_KNOWN",
     "UNDEFINED",
     "UNKNOWN",
+    "Across",
     "ClassAgreement",
     "ClassAlpha",
     "Correctness",
@@ -77,6 +79,8 @@ __all__ = [
     "SpotAgreement",
     "StabilityVerdict",
     "StratumStatistics",
+    "TwoVisits",
+    "VisitedClass",
     "metres",
     "poses_that_do_not_fit",
     "short",

@@ -86,7 +86,7 @@ def lever_of(answers: Sequence[ClusterSums]) -> float:
     if not n > 0:
         return 0.0
     agreeing = [float(part["agreeing"].sum()) / n for part in answers]
-    return _lever(float(first["square"].sum()), float(second["square"].sum()), agreeing)
+    return lever_from(float(first["square"].sum()), float(second["square"].sum()), agreeing)
 
 
 LEAST_FALL, LARGEST_RATIO = 1e-3, 3.0
@@ -94,7 +94,7 @@ LEAST_FALL, LARGEST_RATIO = 1e-3, 3.0
 ratio of the further fall to it, which a parabola around 0 has."""
 
 
-def _lever(near: float, far: float, agreeing: Sequence[float]) -> float:
+def lever_from(near: float, far: float, agreeing: Sequence[float]) -> float:
     """Return the lever from sums of squared distances of first and second answers, and three agreements.
 
     It is 0 if the second answers are the first ones.
