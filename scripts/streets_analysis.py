@@ -1,6 +1,6 @@
 """Tables and figures of docs/real-networks.md from results/streets.csv, for `scripts/streets.py show`.
 
-An interval of 95 % counts networks, families and streets: 2,000 samples draw streets, families, and networks within a
+An interval of 95 % counts networks, families and streets: 1,000 samples draw streets, families, and networks within a
 drawn family, each with replacement (a two-way bootstrap; percentiles). Networks of one family have much in common, so
 that drawing networks alone would make intervals too narrow. Variants are left out but where their order is asked for.
 """
@@ -29,7 +29,7 @@ MEASURES = {
 LESS = {"sbd", "entropy", "flicker", "compensated"}
 """Measures of which less is better: their signs are turned."""
 
-SAMPLES = 2000
+SAMPLES = 1000
 APART = 0.02
 """Accuracies that differ by this or more make a pair of networks whose order is asked for."""
 
@@ -60,11 +60,11 @@ class Grid:
         sign = -1.0 if name in LESS else 1.0
         return np.array([[sign * self._cell[n, s][name] for s in self.streets] for n in self.networks], np.float64)
 
-    def samples(self, count: int = SAMPLES) -> Iterator[tuple[Any, Any]]:
-        """Yield drawn rows of networks and columns of streets."""
+    def samples(self) -> Iterator[tuple[Any, Any]]:
+        """Yield SAMPLES times drawn rows of networks and columns of streets."""
         rng, families = np.random.default_rng(0), sorted(set(self.family))
         members = {family: [k for k, own in enumerate(self.family) if own == family] for family in families}
-        for _ in range(count):
+        for _ in range(SAMPLES):
             drawn = rng.choice(families, len(families))
             networks = np.concatenate([rng.choice(members[family], len(members[family])) for family in drawn])
             yield networks, rng.choice(len(self.streets), len(self.streets))
@@ -75,13 +75,24 @@ class Grid:
 Statistic = Callable[[Array, Array], float]
 
 
+def correlations(x: Array, y: Array) -> Array:
+    """Return the rank correlation of each row of two arrays (r, n); NaN if one of the rows does not vary.
+
+    What is NaN in x is the same in all rows, and is left out.
+    """
+    known = ~np.isnan(x).any(axis=0)
+    if known.sum() < 3:
+        return np.full(len(x), math.nan)
+    x, y = (rankdata(each[:, known], axis=1) for each in (x, y))
+    x, y = (each - each.mean(axis=1, keepdims=True) for each in (x, y))
+    scale = np.sqrt((x**2).sum(axis=1) * (y**2).sum(axis=1))
+    found: Array = np.divide((x * y).sum(axis=1), scale, out=np.full(len(x), math.nan), where=scale > 0)
+    return found
+
+
 def spearman(x: Array, y: Array) -> float:
-    """Return the rank correlation of two vectors over what both have; NaN if one of them does not vary."""
-    known = ~(np.isnan(x) | np.isnan(y))
-    x, y = (rankdata(each[known]) for each in (x, y))
-    x, y = (each - each.mean() if len(each) else each for each in (x, y))
-    scale = math.sqrt(float(x @ x) * float(y @ y))
-    return float(x @ y) / scale if len(x) > 2 and scale > 0 else math.nan
+    """Return the rank correlation of two vectors."""
+    return float(correlations(x[None], y[None])[0])
 
 
 def between_networks(measure: Array, accuracy: Array) -> float:
@@ -91,29 +102,30 @@ def between_networks(measure: Array, accuracy: Array) -> float:
 
 def within_a_street(measure: Array, accuracy: Array) -> float:
     """Return the mean over streets of the correlation of networks."""
-    return _nanmean([spearman(*each) for each in zip(measure.T, accuracy.T, strict=True)])
+    return _nanmean(correlations(measure.T, accuracy.T))
 
 
 def streets_of_a_network(measure: Array, accuracy: Array) -> float:
     """Return the mean over networks of the correlation of streets."""
-    return _nanmean([spearman(*each) for each in zip(measure, accuracy, strict=True)])
+    known = ~np.isnan(measure).any(axis=1)
+    return _nanmean(correlations(measure[known], accuracy[known]))
 
 
 def streets(measure: Array, accuracy: Array) -> float:
     """Return the correlation of streets' means over networks."""
-    return spearman(np.nanmean(measure, axis=0), accuracy.mean(axis=0))
+    known = ~np.isnan(measure).any(axis=1)
+    if not known.any():
+        return math.nan
+    return spearman(measure[known].mean(axis=0), accuracy[known].mean(axis=0))
 
 
 def pairs_on_a_street(measure: Array, accuracy: Array) -> float:
     """Return the share of pairs of networks on one street, APART or more in accuracy, that a measure orders rightly."""
-    right = total = 0.0
-    for i in range(len(measure)):
-        for j in range(i):
-            gap, own = accuracy[i] - accuracy[j], measure[i] - measure[j]
-            asked = (np.abs(gap) >= APART) & ~np.isnan(own)
-            right += float(((gap * own > 0) + 0.5 * (own == 0))[asked].sum())
-            total += float(asked.sum())
-    return right / total if total else math.nan
+    one, other = np.tril_indices(len(measure), -1)
+    gap, own = accuracy[one] - accuracy[other], measure[one] - measure[other]
+    asked = (np.abs(gap) >= APART) & ~np.isnan(own)
+    right = (gap * own > 0) + 0.5 * (own == 0)
+    return float(right[asked].mean()) if asked.any() else math.nan
 
 
 def pairs_over_streets(measure: Array, accuracy: Array) -> float:
@@ -131,7 +143,7 @@ QUESTIONS: dict[str, Statistic] = {
 }
 
 
-def _nanmean(values: Sequence[float]) -> float:
+def _nanmean(values: Sequence[float] | Array) -> float:
     known = [value for value in values if not math.isnan(value)]
     return float(np.mean(known)) if known else math.nan
 
@@ -322,7 +334,14 @@ def choices_table(rows: Sequence[Mapping[str, Any]]) -> list[str]:
             measure = grid.of(name)
             cells += [signed(QUESTIONS[q](measure, main.of("accuracy"))) for q in shown]
         lines.append(row([condition, *cells]))
-    measure = main.of("vss2")
-    values = [signed(QUESTIONS[q](measure, main.of("accuracy"))) for q in shown]
-    lines.append(row(["VSS of OP >= 2", "", "", "", *values]))
+    of_main = [r for r in rows if r["condition"] == "main" and not r["of"]]
+    some = Grid([r for r in of_main if r["family"] in ("espnetv2", "dicenet")])
+    for title, grid, names in (
+        ("VSS of OP >= 2", main, ("", "vss2")),
+        ("ESPNetv2 and DiCENet", some, ("alpha", "vss")),
+    ):
+        values = [
+            signed(QUESTIONS[q](grid.of(name), grid.of("accuracy"))) if name else "" for name in names for q in shown
+        ]
+        lines.append(row([title, *values]))
     return lines

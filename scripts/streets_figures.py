@@ -43,6 +43,7 @@ def _measures(grid: Grid) -> Figure:
             axes.plot(value, k, "o", color=color, markersize=5)
         axes.axvline(0, color="#555555", linewidth=0.8)
         axes.set_xlim(-1, 1.02)
+        axes.set_xticks([-0.5, 0, 0.5, 1])
         axes.set_yticks(range(len(MEASURES)), list(MEASURES.values()))
         axes.set_title(title, fontsize=10)
         axes.grid(axis="x", color="#dddddd", linewidth=0.5)
@@ -81,7 +82,7 @@ def _accuracy(grid: Grid) -> Figure:
 
 def _places(grid: Grid) -> Figure:
     """Return the AUROC of each sign for wrong pixels: a point for each street, and the mean."""
-    figure = Figure(figsize=(7, 2.6), layout="constrained")
+    figure = Figure(figsize=(7, 2.9), layout="constrained")
     axes: Any = figure.add_subplot()
     signs = {"disagreement": "frames disagree", "entropy": "entropy of the voxel", "border": "border near",
              "softmax": "softmax low", "all": "all four"}  # fmt: skip
@@ -90,8 +91,9 @@ def _places(grid: Grid) -> Figure:
         axes.plot(areas, np.full(len(areas), k), "o", color="#56B4E9", markersize=5, alpha=0.8)
         axes.plot(areas.mean(), k, "|", color="black", markersize=16, markeredgewidth=2)
     axes.set_yticks(range(len(signs)), list(signs.values()))
-    axes.invert_yaxis()
     axes.set_xlim(0.5, 1)
-    axes.set_xlabel("AUROC for wrong pixels: a point for each street (mean of the networks), | their mean")
+    axes.set_ylim(len(signs) - 0.5, -0.5)
+    axes.set_xlabel("AUROC for wrong pixels")
+    axes.set_title("a point: a street (mean of the networks); a bar: the mean", fontsize=10)
     axes.grid(axis="x", color="#dddddd", linewidth=0.5)
     return figure

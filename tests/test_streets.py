@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 
 import numpy as np
@@ -108,9 +109,14 @@ def test_a_mistake_is_one_line(words, message, tmp_path, monkeypatch, capsys):
     assert len(said.splitlines()) == 1
 
 
-def test_the_page_has_the_tables_of_the_results():
+def test_the_page_has_the_tables_of_the_results(monkeypatch):
+    monkeypatch.setattr(analysis, "SAMPLES", 3)  # ends of intervals are left out: they take a minute
     rows, classes = (analysis.load(RESULTS / name) for name in ("streets.csv", "streets-classes.csv"))
-    text = PAGE.read_text()
+    text = values(PAGE.read_text())
     for title, lines in streets.tables(rows, classes).items():
-        if title != "questions, by mIoU":
-            assert "\n".join(lines) in text, title
+        assert values("\n".join(lines)) in text, title
+
+
+def values(text):
+    """The text without the ends of intervals."""
+    return re.sub(r" \([+-]?\d?\.\d+ to [+-]?\d?\.\d+\)", "", text)
