@@ -36,7 +36,7 @@ from semstab.predict.dataset import NAME as PREDICTED
 SUFFIX = ".semstab"
 """Suffix of the files."""
 
-LARGEST = 600_000
+LARGEST = 1_500_000
 """Bytes of a file at most: sums of the map are made coarser until they fit, which changes no number, but the ends of
 intervals. Alpha and ranks are of spots, whose cubes are the definition's."""
 
