@@ -21,7 +21,7 @@ from semstab.metrics.summary import STRATA, TableSums
 from semstab.statistics.drift import lowest, streams
 
 MOST_VOXELS = 500_000
-"""More voxels add nothing to an interval: errors of neighbours are similar, so the number of independent ones decides."""
+"""More voxels add nothing to an interval: errors of neighbours are similar, so only independent ones count."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -86,14 +86,14 @@ def _differences(comparison: RunComparison) -> Table:
         "Alpha is of the observations that all runs made, and other measures are of the voxels that all saw twice or"
         " more; coverage is of each run's whole map, and flicker is of its images. Coverage is the number of voxels"
         " seen twice or more, divided by that of the base. A difference is undecided if the frames are too few, or"
-        " where errors reach as far as the scene."
+        " if errors reach as far as the scene."
         f" {ANSWERS}{macro}"
     )
     return Table("comparison", "Differences", caption, columns, groups, "scope")
 
 
 def _others(comparison: RunComparison) -> str:
-    """Return the heading of the numbers that are compared with the base's: the name of the only other run, or 'Other'."""
+    """Return the heading of the numbers that are compared with the base's: the name of the other run, or 'Other'."""
     return comparison.runs[1].name if len(comparison.runs) == 2 else "Other"
 
 
@@ -169,8 +169,8 @@ def _areas(comparison: RunComparison) -> Table:
         "An area is neighbouring voxels of one class that got worse: by agreement, they lost a fifth or more of the"
         " agreement between frames; by truth, they were right in the base and are wrong now. Loss is the mean loss."
         " 'Confused with' is the class that these frames show instead. 'Improved as much' counts the areas that"
-        " improved by as much; where nothing changed there are as many. Top contributing frames are those whose observations"
-        " turned away from the class, with their share."
+        " improved by as much; if nothing changed, they are as many. Top contributing frames are those whose"
+        " observations turned away from the class, with their share."
     )
     systems = {scene.crs for scene in comparison.scenes if scene.crs}
     caption += f" Centres are in {' and '.join(sorted(systems)) if systems else 'the coordinates of the scene'}."

@@ -133,8 +133,8 @@ def _maps(result: Result, with_voxels: list[Record], views: Views) -> Iterator[F
                 slug("stability_map", scene, model),
                 f"Stability from above: {scene}, {model}",
                 "The topmost voxel of each column along the up axis, below a ceiling if the scene has one; of a wall,"
-                f" the foremost voxel. (a) shows its stability category, the other panels show {panels}. A grey voxel was"
-                " seen once and has no category. An arrow on a scale marks values beyond its end.",
+                f" the foremost voxel. (a) shows its stability category, the other panels show {panels}. A grey voxel"
+                " was seen once and has no category. An arrow on a scale marks values beyond its end.",
                 f"Maps of {scene} from above with the stability category, {panels} of {model}'s voxels.",
                 partial(_draw_map, record, result, views),
                 unit=record.unit.slug,
