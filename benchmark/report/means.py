@@ -119,7 +119,7 @@ def _estimate(records: Sequence[Record], take: Callable[[MapStatistics], Estimat
 
 
 def _macro(records: Sequence[Record], take: Callable[[MapStatistics], Estimate]) -> float:
-    """Return the macro mean of an estimate in the units' statistics; NaN if no unit has statistics."""
+    """Return the macro mean of an estimate in the units' statistics; NaN if no unit has the estimate."""
     return macro_mean([take(record.statistics).value for record in records if record.statistics is not None])
 
 

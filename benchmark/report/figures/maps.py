@@ -286,7 +286,7 @@ def locate(axes: Axes, located: Located, cells: tuple[int, ...], *, named: bool 
         axes: The panel that shows the map.
         located: Where the map lies.
         cells: Its height and width in cells.
-        named: True if the coordinates have numbers; else they have ticks only, and the panel next to it the numbers.
+        named: True if the coordinates have numbers; else they have ticks only, and the next panel has the numbers.
     """
     from matplotlib.patheffects import withStroke
 

@@ -170,7 +170,7 @@ def _backend_agreement_row(row: Agreement, names: Iterable[str]) -> Row:
 
 
 def largest_share(voxels: int, confidence: float = CONFIDENCE) -> float:
-    """Return the upper limit of the share of wrong voxels, at this confidence, if a random sample holds none.
+    """Return the upper limit, at this confidence, of the share of wrong voxels if a sample of `voxels` holds none.
 
     With the share p all are right with probability (1 - p)^n: the upper end of Clopper and Pearson (1934) for none.
 
