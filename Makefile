@@ -58,6 +58,7 @@ mutants: setup-dev
 lint: setup-dev
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
+	$(BIN)/python scripts/plain.py
 	$(BIN)/mypy
 	$(BIN)/lint-imports
 

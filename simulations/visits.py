@@ -3,13 +3,13 @@
     python simulations/simulate.py visits [--seeds 4] [--points 20000] [--only PATTERN]
 
 Both flights circle a yard of boxes, slopes and poles on paths of their own, 30 frames each. Labels err as in `exact`; a
-*place* errs alike in both flights. In rows with a share, the labels of that share of the places (cubes of 2 m) are of
-another class in the second flight. With *boxes*, three boxes of the first flight are gone in the second one, and three
-others are new. The exact values are of points that are drawn on the surface and met by each view without any pixel;
-*said - exact* and the standard error of its mean are over scenes, and so is how often the interval of the cost holds
-the exact cost. *found* is the share of the spots on boxes that are gone or new which are called so, of those that two
-views or more of the other flight tell; *wrong* the share of the spots called gone or
-new that are a pixel (.3 m) or more from all such boxes.
+*place* has the same error in both flights. In rows with a share, the labels of that share of the places (cubes of 2 m)
+are of another class in the second flight. With *boxes*, three boxes of the first flight are gone in the second one, and
+three others are new. The exact values are of points that are drawn on the surface and met by each view without any
+pixel; *said - exact* and the standard error of its mean are over scenes, and so is how often the interval of the cost
+holds the exact cost. *found* is the share of the spots on boxes that are gone or new which are called so, of those that
+two views or more of the other flight tell; *wrong* the share of the spots called gone or new that are a pixel (.3 m) or
+more from all such boxes.
 """
 
 from __future__ import annotations
@@ -55,7 +55,7 @@ class Visits:
 
     @property
     def name(self) -> str:
-        """What a row begins with."""
+        """Return the first cell of a row."""
         changed = f", {self.share:.0%} change" if self.share else ""
         return f"{self.path}, {self.error}{changed}{', boxes' if self.boxes else ''}"
 

@@ -253,7 +253,7 @@ def _against_all(common: Common, names: Sequence[str], number: int) -> Iterator[
             continue
         for k, name in enumerate(names):
             seen = before["observations"].sum() / max(before["voxels"].sum(), 1e-9)
-            if before["evidence"][:, k].sum() >= LEAST_VOXELS * seen:  # the evidence amounts to so many voxels
+            if before["evidence"][:, k].sum() >= LEAST_VOXELS * seen:  # evidence of LEAST_VOXELS voxels
                 yield from _row(quantity, before, after, common, k, name)
 
 
@@ -290,7 +290,7 @@ class ComparisonData:
 
     Attributes:
         changes: Changes in each voxel, by scene and run, where voxels could be paired.
-        up: The up axis of each scene, where it is known.
+        up: The up axis of each scene, if it is known.
     """
 
     result: RunComparison

@@ -47,7 +47,7 @@ class EntryNumbers:
     """Numbers of a unit that is compared.
 
     Attributes:
-        up: The scene's up axis, where it is known.
+        up: The scene's up axis, if it is known.
         seed: The seed of a simulated scene.
     """
 
@@ -117,7 +117,7 @@ class Entry(EntryNumbers):
 
     @property
     def caveat(self) -> str:
-        """Why its agreement does not assess its labels, as its verdict has it; '' where it does."""
+        """Why its agreement does not assess its labels, in the words of its verdict; '' if agreement does."""
         statistics = self.summary.statistics
         if self.record is not None and (pixels := self.record.pixels) is not None:
             silent = pixels.effective_classes < LEAST_CLASSES
@@ -132,7 +132,7 @@ class Entry(EntryNumbers):
         return self.sums.classes
 
     def with_voxels(self, purpose: str) -> Record:
-        """Return the record with its voxels. Raises DataError, which names the purpose, where there are none."""
+        """Return the record with its voxels. Raises DataError, which names the purpose, if the record has no voxels."""
         if self.record is None:
             raise DataError(
                 f"{self.where}: it is a small summary, without the voxels that {purpose} needs; give the folder"
@@ -329,7 +329,7 @@ LARGEST = 100_000_000
 """Most bytes of a file, of its unpacked content, and of the numbers in it."""
 
 LONGEST_NAME = 255
-"""Most characters of a name in it: those of a file."""
+"""The largest number of characters of a name in an archive: file systems allow a file's name as many."""
 
 LONGEST_CONTENT = 2**23
 """Most bytes of its text: of ten models in a hundred scenes it has a tenth."""
@@ -450,7 +450,7 @@ def _archive(content: str, sums: list[ClusterSums], *, single: bool) -> bytes:
 
 
 def _coarser(sums: ClusterSums, *, keep_spots: bool) -> ClusterSums:
-    """Join two groups of frames each where there are many, else cubes."""
+    """Join pairs of groups of frames if the sums have more than MANY_GROUPS groups, else join cubes."""
     coarsened = sums.map_coarsened if keep_spots else sums.coarsened
     if sums.step and sums.frames > MANY_GROUPS:
         return coarsened(sums.edge, 2 * sums.step)

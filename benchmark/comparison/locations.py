@@ -1,7 +1,7 @@
 """Areas that got worse: neighbouring voxels whose frames agree less, or that are wrong now; and the frames behind it.
 
-Chance makes areas worse and better alike where nothing changed. So each area has the number of others that improved
-by as much: its `improved_alike`.
+Chance makes areas worse as often as better if nothing changed. So each area has the number of other areas that
+improved by as much: its `improved_alike`.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ MOST = 20
 """Most areas that are reported, the largest loss first."""
 
 SHARE, MOST_FRAMES = 0.9, 8
-"""The frames that account for this share of an area's loss, so many at most."""
+"""An area lists the frames that account for this share of its loss, and at most MOST_FRAMES frames."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -46,8 +46,8 @@ class Changed:
         table: (n,) the base's voxels.
         change: (n,) agreement between frames, the run's less the base's.
         label: (n,) the class that both maps together give.
-        true: (n,) the true class, -1 where it is unknown; None without ground truth.
-        right: (n,) -1 where it was right and is wrong now, 1 the other way round, else 0; None without ground truth.
+        true: (n,) the true class, -1 for an unknown class; None without ground truth.
+        right: (n,) -1 if the base is right and the run wrong, 1 the other way round, else 0; None without ground truth.
     """
 
     table: VoxelTable
@@ -190,7 +190,7 @@ def _columns(changed: Changed, area: Int64, wrong_area: Int64 | None) -> dict[st
 def _clusters(index: Int32, label: Int64, loss: Float64, least: float) -> tuple[Int64, Int64]:
     """Return the number (n,) of each voxel's area, the largest loss first, 0 in none.
 
-    The second array (m,) counts the areas that improved alike.
+    The second array (m,) counts the areas that improved by as much.
     """
     area, mass = connected(index, label, loss, loss >= least)
     _, others = connected(index, label, -loss, loss <= -least)

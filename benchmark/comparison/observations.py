@@ -50,7 +50,7 @@ def common_observations(models: Sequence[SpotObservations]) -> CommonObservation
         DataError: If they differ in K.
     """
     if len({sample.K for sample in models}) > 1:
-        raise DataError("samples with different classes cannot be compared; fuse both alike")
+        raise DataError("samples with different classes cannot be compared; fuse both with the same classes")
     models = same_spots(models)
     of, first = _numbered(models)
     labelled, silent, near, far = np.zeros((4, len(models), len(first)))
@@ -72,7 +72,7 @@ def common_observations(models: Sequence[SpotObservations]) -> CommonObservation
 
 
 def _numbered(models: Sequence[SpotObservations]) -> tuple[list[Int64], Int64]:
-    """Return the number of each answer's observation, alike in all models, and one answer of each observation."""
+    """Return the number of each answer's observation, the same in all models, and one answer of each observation."""
     views = max((len(sample.views) for sample in models), default=1)
     key = np.concatenate([sample.spot.astype(np.int64) * views + sample.view for sample in models])
     _, first, of = np.unique(key, return_index=True, return_inverse=True)

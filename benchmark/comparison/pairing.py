@@ -70,15 +70,15 @@ class Common:
         sums: Sums of each run for the common locations; for `cubes` and `flights` of its whole map.
         mixed: True if labels are compared with scores.
         tables: Tables of the common locations; none for `cubes` and `flights`.
-        logs: Logs of the common observations of spots, where there are some.
-        label: (n,) the true class of each of their voxels, -1 where it is unknown; None without ground truth.
+        logs: Logs of the common observations of spots, if the runs have any.
+        label: (n,) the true class of each of their voxels, -1 for an unknown class; None without ground truth.
         observations: The comparison of the common observations.
-        regions: The whole maps with the ground truth, where there are voxels of the same frames, all of labels or all
+        regions: The whole maps with the ground truth, if the runs have voxels of the same frames, all of labels or all
             of scores.
         shown: The share of the unchanged voxels that figures show with those that changed.
-        scope: Scope of the intervals, where there are enough frames for it.
+        scope: Scope of the intervals, if the frames suffice for it.
         sizes_differ, frames_differ: True if voxel sizes differ, or the frames of runs that are paired on observations.
-        same_frames: True if frames are paired; None where the sums show it.
+        same_frames: True if frames are paired; None if the sums show it.
     """
 
     basis: Basis
@@ -146,7 +146,7 @@ def _truth(records: Sequence[Record]) -> Tiles[VoxelTable] | None:
 def _regions(
     names: Sequence[str], maps: Sequence[Tiles[VoxelTable]], truth: Tiles[VoxelTable] | None
 ) -> Iterator[Region]:
-    """Yield the maps of runs tile by tile, or whole, with the ground truth, where it is of their classes."""
+    """Yield the maps of runs tile by tile, or whole, with the ground truth, if it has their classes."""
     for own in side_by_side([*maps, *([] if truth is None else [truth])]):
         tables, true = own[: len(maps)], own[len(maps) :]
         known = true[0] if true and true[0].classes == tables[0].classes else None
@@ -154,7 +154,7 @@ def _regions(
 
 
 def joint_class(tables: Iterable[VoxelTable]) -> Int64:
-    """Return the dominant class (n,) of the same voxels in several maps, each counting alike."""
+    """Return the dominant class (n,) of the same voxels in several maps, each map with the same weight."""
     first, *others = (table.summing_to_op() for table in tables)
     beliefs = first.evidence[:] / first.op[:, None]
     for other in others:
@@ -219,7 +219,7 @@ def on_common_observations(
 ) -> tuple[list[Entry], ComparedObservations, tuple[str, ...]] | None:
     """Return entries of runs whose alpha is of common observations, their comparison, and notes.
 
-    None where nothing can be paired on observations: alpha is then of each run's own.
+    None if nothing can be paired on observations: alpha is then over each run's own observations.
     """
     runs = [*entries.values()]
     if _other_frame_of_reference(runs) or _no_voxels(runs):
@@ -295,7 +295,7 @@ def _other_frame_of_reference(entries: Sequence[Entry]) -> str:
 
 
 def _no_voxels(entries: Sequence[Entry]) -> str:
-    """Return why there are no voxels to pair; empty where there are."""
+    """Return why no voxels can be paired; '' if voxels can be paired."""
     for entry in entries:
         if entry.record is None:
             return f"{entry.where} is a small summary, without voxels: {BY_CUBES}"

@@ -77,7 +77,7 @@ MOST = 1 << 22
 
 
 def share_of(voxels: int) -> float:
-    """Return the largest power of 1/2 that leaves at most MOST of so many voxels."""
+    """Return the largest power of 1/2 whose product with the number of voxels is at most MOST."""
     return 1.0 if voxels <= MOST else 2.0 ** -math.ceil(math.log2(voxels / MOST))
 
 

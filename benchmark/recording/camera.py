@@ -158,7 +158,7 @@ class SceneLog:
 
 
 def color_of(frame: Frame) -> bytes | None:
-    """Return the colour as JPEG, in the size of the labels; None where the frame has none.
+    """Return the colour as JPEG, in the size of the labels; None if the frame has no colour.
 
     Raises:
         DataError: If its file cannot be read.

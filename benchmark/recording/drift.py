@@ -36,7 +36,7 @@ are not the dominant class that their voxel had before the frame."""
 
 
 OVER_COLOUR, AMONG_POINTS = (0, 0, 0, 150), (150, 150, 155, 255)
-"""What has no finding: pixels darken the colour image that they lie on, points are grey."""
+"""Colours of what has no finding: pixels darken the colour image under them, points are grey."""
 
 
 def contexts(nothing: tuple[int, int, int, int] = OVER_COLOUR) -> dict[str, rr.AnnotationContext]:
@@ -124,7 +124,7 @@ MAX_MOVES = 2_000_000
 """The most moves that are stored of a model on a scene; of more, those of the voxels that moved least are dropped."""
 
 MOVED_BITS = 0.05
-"""The drift from which on a frame is listed although the dominant class stays: that of a drifting voxel, bits."""
+"""A frame is listed from this drift on although the dominant class stays: a voxel with it is drifting, bits."""
 
 NUMBER = np.array([[0.04, 0.04], [0.04, 0.1]])
 """The margins of a number, as shares of an image's longer side: left of its point and above, right of it and below."""
@@ -212,7 +212,7 @@ class DriftLog:
         file = PurePath(frame.files.get("labels") or frame.files.get("scores") or "")
         name = file.name if file.suffix else ""
         self._views[frame.index] = View(frame.timestamp, frame.intrinsics, np.array(frame.T_wc), frame.shape, name)
-        if sum(map(len, self._moves)) > MAX_MOVES:  # half of them stay: those of the voxels that were moved most
+        if sum(map(len, self._moves)) > MAX_MOVES:  # keep half of them: the moves of the voxels that were moved most
             every = np.concatenate(self._moves)
             _, voxel = np.unique(every["voxel"], return_inverse=True)
             order = np.argsort(-np.bincount(voxel, every["bits"])[voxel], kind="stable")[: MAX_MOVES // 2]

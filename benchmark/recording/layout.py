@@ -60,7 +60,7 @@ class SceneBounds:
     Attributes:
         points: (n, 3) metres, of the voxels or a sample of them.
         cameras: (m, 4, 4) poses in the same world.
-        up: (3,), where it is known.
+        up: (3,), if it is known.
     """
 
     points: Float64
@@ -69,7 +69,7 @@ class SceneBounds:
 
 
 def camera_pose(bounds: SceneBounds | None, aspect: float) -> rrb.EyeControls3D | None:
-    """Return the pose of a view of a scene, of that width by height; None where the viewer chooses it."""
+    """Return the pose of a view of a scene, of that width by height; None if the viewer chooses it."""
     if bounds is None:
         return None
     target, distance = fit(bounds, aspect)
@@ -101,9 +101,9 @@ def direction(bounds: SceneBounds) -> tuple[Float64, Float64]:
 def fit(bounds: SceneBounds, aspect: float) -> tuple[Float64, float]:
     """Return the target of an eye, and its distance, at which points and cameras fill a view of that width by height.
 
-    With the depth z of a point towards the eye, and its position (x, y) across, the view holds it where
-    |x - x0| <= aspect * h * (d - z) and |y - y0| <= h * (d - z), h the tangent of half the field of view: so the edges
-    of x - aspect * h * z and x + aspect * h * z say what d has to be, and likewise those of y.
+    A point has the depth z towards the eye and the position (x, y) across; h is the tangent of half the field of view.
+    The view holds the point if |x - x0| <= aspect * h * (d - z) and |y - y0| <= h * (d - z). So the extremes of
+    x - aspect * h * z and x + aspect * h * z give the least d, and the extremes of y -+ h * z do so as well.
     """
     toward, up = direction(bounds)
     right = np.cross(up, toward)

@@ -53,7 +53,7 @@ def draw_changes(
 
 @serial
 def level_of(drift, edges):
-    """Return the level of drift in bits: how many of the ascending edges it reaches; NaN where a voxel is new."""
+    """Return the level of drift in bits: how many of the ascending edges it reaches; FIRST_SEEN for NaN."""
     if np.isnan(drift):
         return FIRST_SEEN
     if drift == 0:
@@ -94,7 +94,7 @@ def key_of(x, y, z):
 
 @serial
 def find(wanted, key, rows):
-    """Return the place of a key in a table of rows, or the free one where it belongs."""
+    """Return the place of a key in a table of rows, or the free place for the key."""
     at = np.int64(mix(wanted) & np.uint64(len(rows) - 1))
     while rows[at] >= 0 and key[rows[at]] != wanted:
         at = (at + 1) & (len(rows) - 1)

@@ -62,7 +62,7 @@ class GroupLog:
     """The recording of one model on a scene.
 
     Attributes:
-        fused: The map whose growth and drift are drawn; None where none is fused.
+        fused: The map whose growth and drift are drawn; None if no map is fused.
     """
 
     def __init__(self, task: Task, voxel_size: float, origin: Int64, fused: FusionBackend | None) -> None:

@@ -47,7 +47,7 @@ def record_maps(
         file: The recording.
         scene: Name of the scene.
         maps: The differences, then the two maps, by the name of each other map.
-        places: Names and centres of the places where it differs.
+        places: Names and centres of the places at which the maps differ.
         size: Edge of a voxel, metres.
         up: The scene's up axis, if it is known.
     """

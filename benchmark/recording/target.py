@@ -71,7 +71,7 @@ class Target:
 
     @classmethod
     def parse(cls, text: str | None, default: Path) -> Target:
-        """Read `--rerun`; `default` is the file where it names none.
+        """Read `--rerun`; `default` is the file if the option names no file.
 
         Raises:
             ConfigError: For any other text.
@@ -188,7 +188,7 @@ def _is_free(address: tuple[str, int]) -> bool:
 
 
 def _why_no_viewer(url: str) -> str | None:
-    """Return None where a gRPC server answers; without one the SDK would wait at the end of the run."""
+    """Return None if a gRPC server answers; without one the SDK would wait at the end of the run."""
     try:
         with socket.create_connection(_address(url), timeout=ANSWER_SECONDS) as connection:
             if not url.startswith("rerun+http:"):

@@ -29,7 +29,7 @@ def path(*parts: str) -> str:
 
 
 class Clock:
-    """The time of a stream: the frame's number, and its timestamp where there is one."""
+    """The time of a stream: the frame's number, and its timestamp if it has one."""
 
     def __init__(self) -> None:
         self._dated: bool | None = None  # a timeline has one type: the first timestamp decides

@@ -39,7 +39,7 @@ class ColorMode:
     Attributes:
         tab: Its short name.
         title: The title of its views.
-        range: The range of values that the colour map spans; None where voxels have a colour of their own.
+        range: The range of values that the colour map spans; None if each voxel has its own colour.
     """
 
     tab: str
@@ -196,7 +196,7 @@ class VoxelLogger:
     def update(
         self, stream: rr.RecordingStream, voxels: int, table: Callable[[], VoxelTable]
     ) -> list[Callable[[], None]]:
-        """Return jobs that log the map if the budget allows so many voxels; later frames do not alter them."""
+        """Return jobs that log the map if the budget allows its voxels; later frames do not alter them."""
         self._allowed += self._share
         if not 0 < voxels <= min(self._allowed, MAX_VOXELS):
             return []
@@ -231,7 +231,7 @@ class VoxelLogger:
         self, stream: rr.RecordingStream, table: VoxelTable, factor: int = 1, *, assessed: bool = True,
         moved: UInt8 | None = None,
     ) -> str:  # fmt: skip
-        """Log the final map instead of the growing one; return a note on thinning where it is too large.
+        """Log the final map instead of the growing one; return a note on thinning if the map is too large.
 
         Args:
             stream: The recording.

@@ -71,7 +71,7 @@ def write_report(result: Result, folder: str | Path, above: Mapping[str, FromAbo
     Args:
         result: The result of the run or study.
         folder: Its folder.
-        above: Of units, by their slugs, the voxels that are seen from above; those of the others are read.
+        above: The voxels that are seen from above, by the unit's slug; the voxels of other units are read.
     """
     from semstab.report.page import render
 

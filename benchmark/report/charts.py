@@ -19,7 +19,7 @@ ROW = 24
 """Sizes of a chart, of its margins and of a row of dots, in units of the drawing: pixels at its own size."""
 
 POINTS = 400
-"""The most points of a line; a longer line is drawn by the means of so many equal parts."""
+"""The largest number of points of a line; a longer line is cut into POINTS equal parts, and their means are drawn."""
 
 
 @dataclass(frozen=True)

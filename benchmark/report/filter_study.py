@@ -38,7 +38,7 @@ MEANS = (
 
 @dataclass(frozen=True)
 class FilterResult:
-    """A filter over a model: macro means over the scenes, shares 0 to 1, NaN where undefined; see `FrameQuality`.
+    """A filter over a model: macro means over the scenes, shares 0 to 1, NaN if undefined; see `FrameQuality`.
 
     Attributes:
         filters: The names of the filters; '' for the model itself.

@@ -77,7 +77,7 @@ def table_block(table: Table) -> dict[str, Any]:
 
 
 def _cell(text: str) -> str:
-    """Return a cell in typographic form: with minus signs, and a dash where it is undefined."""
+    """Return a cell in typographic form: with minus signs, and a dash if the number is undefined."""
     if text == "--":
         return "\N{EN DASH}"
     is_number = text[-1:].isdigit() or re.fullmatch(r"[-+]?[\d.,]+ \([-+\d., ]+\)", text)
@@ -136,9 +136,9 @@ def jpeg(image: UInt8) -> str:
 def lone_pictures(
     color: UInt8 | None, labels: npt.NDArray[Any], alone: Mask, palette: npt.ArrayLike
 ) -> list[tuple[str, str]]:
-    """Return a frame as named images: its colour (h, w, 3), its labels (h, w), and the pixels where it stands alone.
+    """Return a frame as named images: its colour (h, w, 3), its labels (h, w), and the pixels that stand alone.
 
-    Labels are rows of the palette (K, 3), and above where there is none.
+    Labels are rows of the palette (K, 3); K and above: no label.
     """
     classes = np.asarray(palette, np.uint8).reshape(-1, 3)
     shades = np.vstack([classes, np.full((1, 3), 128, np.uint8)])
@@ -152,7 +152,7 @@ def lone_pictures(
 
 
 def label_picture(labels: npt.NDArray[Any], palette: npt.ArrayLike) -> str:
-    """Return labels (h, w) as a PNG: rows of the palette (K, 3), grey where there is none."""
+    """Return labels (h, w) as a PNG: rows of the palette (K, 3), grey for K and above."""
     shades = np.vstack([np.asarray(palette, np.uint8).reshape(-1, 3), np.full((1, 3), 128, np.uint8)])
     return _indexed(np.minimum(labels.astype(np.int64), len(shades) - 1), shades)
 

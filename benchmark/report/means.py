@@ -23,7 +23,7 @@ standard error is up to 0.5 / sqrt(1000) = 0.016, even if the voxels were indepe
 class Pooled:
     """The voxels of several units together: a mean runs over all of them, so that a scene counts by its voxels.
 
-    PSA, alpha and drift are macro means over the units, with intervals at CONFIDENCE; NaN where no unit has statistics.
+    PSA, alpha and drift are macro means over the units, with intervals at CONFIDENCE; NaN if no unit has statistics.
 
     Attributes:
         every: All voxels.
@@ -34,7 +34,7 @@ class Pooled:
         psa: Pairwise semantic agreement.
         alpha: Krippendorff's alpha.
         drift: SBD in bits.
-        drift_null: SBD of the same observations in random order, where it is known.
+        drift_null: SBD of the same observations in random order, if it is known.
     """
 
     voxels: int
@@ -68,7 +68,7 @@ class Pooled:
 
     @property
     def once(self) -> float:
-        """Return the share of the voxels that were seen once; NaN where the strata do not contain it."""
+        """Return the share of the voxels that were seen once; NaN if the strata do not contain it."""
         return next((row.share for row in self.strata if row.name == "OP=1"), math.nan)
 
 
@@ -119,7 +119,7 @@ def _estimate(records: Sequence[Record], take: Callable[[MapStatistics], Estimat
 
 
 def _macro(records: Sequence[Record], take: Callable[[MapStatistics], Estimate]) -> float:
-    """Return the macro mean of an estimate in the units' statistics; NaN where none has it."""
+    """Return the macro mean of an estimate in the units' statistics; NaN if no unit has the estimate."""
     return macro_mean([take(record.statistics).value for record in records if record.statistics is not None])
 
 

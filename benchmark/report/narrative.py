@@ -152,7 +152,7 @@ def outlying_line(outlying: OutlyingFrames, of: str = "", *, most: int = MOST_FR
 
 
 def not_assessed(run: UnitSummary) -> str:
-    """Return why agreement does not assess a map: nearly all of it is one class; '' where it does."""
+    """Return why agreement does not assess a map: nearly all of it is one class; '' if agreement assesses it."""
     statistics = run.statistics
     if statistics is None or statistics.spots is None or statistics.verdict.level != "uninformative":
         return ""

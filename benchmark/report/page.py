@@ -64,7 +64,7 @@ def render(
         result: The result of the run or study.
         folder: Its folder.
         digest: Digest of the files that the page is made from.
-        above: Of units, by their slugs, the voxels that are seen from above; those of the others are read.
+        above: The voxels that are seen from above, by the unit's slug; the voxels of other units are read.
     """
     everything, result = result, of_interest(result)
     shown, views = list(_scenes(result, folder, above)), [table_block(table) for table in tables(everything)]
@@ -303,7 +303,7 @@ def _map(
 
 
 def _spread(rows: Any, values: UInt8) -> UInt8:
-    """Return the values (n, 3) of each cell's voxel (H, W, 3); (0, 0, UNKNOWN) where there is none."""
+    """Return the values (n, 3) of each cell's voxel (H, W, 3); (0, 0, UNKNOWN) for a cell without a voxel."""
     image = values[rows]
     image[rows == EMPTY] = (0, 0, UNKNOWN)
     return image  # type: ignore[no-any-return]
@@ -340,7 +340,7 @@ def _outlying(record: Record, *, alone: bool) -> Iterator[str]:
 
 
 def _lone(record: Record, overview: Overview | None) -> Iterator[dict[str, Any]]:
-    """Yield frames that stand out as small images: the image, its labels, and the pixels where it stands alone."""
+    """Yield frames that stand out as small images: the image, its labels, and the pixels that stand alone."""
     outlying = record.outlying_frames
     if overview is None or overview.lone is None or outlying is None:
         return

@@ -24,7 +24,7 @@ END = 0.04
 
 
 def frame_names(record: Record) -> dict[int, str]:
-    """Return the names of a unit's frames by their index, as its time series has them; none where it has no file."""
+    """Return the names of a unit's frames by their index, as its time series has them; no names without a file."""
     file = record.series
     if file is None or not file.exists():
         return {}

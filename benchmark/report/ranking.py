@@ -83,7 +83,7 @@ def least_flicker_first(models: Mapping[str, Sequence[Record]]) -> list[str]:
 
 
 def _silence(records: Sequence[Record]) -> str:
-    """Return why flicker of videos says nothing: nearly all of each is one class; '' where it does."""
+    """Return why flicker of videos says nothing: nearly all of each is one class; '' if flicker is informative."""
     pixels = [record.pixels for record in records if record.pixels is not None]
     if not pixels or not all(each.effective_classes < LEAST_CLASSES for each in pixels):
         return ""
@@ -134,7 +134,7 @@ def _against(better: Sequence[Record], worse: Sequence[Record]) -> list[str]:
 
 
 def _measured(records: Sequence[Record]) -> dict[str, float]:
-    """Return the measures of a model beside alpha, over its scenes; NaN where unknown."""
+    """Return the measures of a model other than alpha, over its scenes; NaN if unknown."""
     recurrent = pooled(records).recurrent
     enough = recurrent.voxels >= ENOUGH
     known = [record.statistics.correctness for record in records if record.statistics is not None]

@@ -123,7 +123,7 @@ def load(folder: str | Path) -> Run:
 
 
 def read_series(file: Path) -> dict[str, npt.NDArray[Any]]:
-    """Read the time series in a file: (n,) values by column, one per frame, NaN or None where a value is missing.
+    """Read the time series in a file: (n,) values by column, one per frame, NaN or None for a missing value.
 
     Raises:
         DataError: If it cannot be read.

@@ -125,13 +125,13 @@ def cluster_sums_of(
     Args:
         table: The map.
         events: Its log; without it a location counts as a whole, and the frames are unknown.
-        true_label: (n,) the true class of each voxel, -1 where it is not known.
+        true_label: (n,) the true class of each voxel, -1 for an unknown class.
         spots: Labels that views give spots, from which alpha follows.
-        sbd_excess: (n,) SBD of each voxel less that in random order, NaN where that is not known.
+        sbd_excess: (n,) SBD of each voxel minus its SBD in random order, NaN if the latter is unknown.
         edge: Edge of the cubes in metres, a power of 2, where several maps must have the same; the smallest that
             leaves at most MOST_CELLS by default.
-        cubes: The cubes, where they are known already.
-        consistent: (n,) the stability posterior, where it is known already.
+        cubes: The cubes, if they are known already.
+        consistent: (n,) the stability posterior, if it is known already.
     """
     cubes = Cubes.of(table, edge) if cubes is None else cubes
     likely = (

@@ -41,7 +41,7 @@ ONE_HOT = 1e-9
 def psa(table: VoxelTable) -> Float64:
     """Return pairwise semantic agreement (n,): the mean of s_t . s_u over pairs of different frames, in [0, 1].
 
-    PSA = (||e||^2 - sum_t ||s_t||^2) / (T (T - 1)); NaN where T < 2. For frames that are independent draws from pi its
+    PSA = (||e||^2 - sum_t ||s_t||^2) / (T (T - 1)); NaN if T < 2. For frames that are independent draws from pi its
     expectation is ||pi||^2 for every T >= 2.
     """
     T = table.op.astype(np.float64)
@@ -52,8 +52,8 @@ def psa(table: VoxelTable) -> Float64:
 def fleiss_kappa(table: VoxelTable) -> float:
     """Return Fleiss' kappa of the voxels with OP >= 2, each counting once (Fleiss 1971, Psychological Bulletin 76).
 
-    1 - (1 - mean PSA) / (1 - ||p||^2) with p the mean belief. OP may vary from voxel to voxel: where it does not, this
-    is Fleiss' own definition. NaN where no two frames saw one location, or only one class was predicted.
+    1 - (1 - mean PSA) / (1 - ||p||^2) with p the mean belief. OP may vary from voxel to voxel: if it does not, this
+    is Fleiss' own definition. NaN if no two frames saw one location, or only one class was predicted.
     """
     return float(kappa_of(_sums(kappa_columns, table)))
 
@@ -64,7 +64,7 @@ def krippendorff_alpha(table: VoxelTable) -> float:
     12).
 
     1 - (1 - A) / (1 - A_e): A is the mean of PSA weighted by OP, and A_e is the same agreement between all
-    observations, as if they were of one voxel. NaN where no two frames saw one location, or only one class was
+    observations, as if they were of one voxel. NaN if no two frames saw one location, or only one class was
     predicted.
     """
     return float(alpha_of(alpha_sums(table)))
@@ -122,7 +122,7 @@ def psa_columns(table: VoxelTable) -> Float64:
 
 
 def ratio_of(sums: Float64) -> Float64:
-    """Return a mean (...,) from the sums (..., 2) of values and of weights; NaN where the weights sum to 0."""
+    """Return a mean (...,) from the sums (..., 2) of values and of weights; NaN if the weights sum to 0."""
     with np.errstate(invalid="ignore", divide="ignore"):
         ratio: Float64 = sums[..., 0] / sums[..., 1]
     return ratio
@@ -186,7 +186,7 @@ def class_alpha_of(sums: Float64) -> Float64:
 
 
 def disagreement(table: VoxelTable) -> tuple[Float64, Float64]:
-    """Return 1 - PSA of each voxel as a sum (n,), (n,): within a frame, and between frames; NaN where OP < 2.
+    """Return 1 - PSA of each voxel as a sum (n,), (n,): within a frame, and between frames; NaN if OP < 2.
 
     The part within is the mean of 1 - ||s_t||^2, of two pixels of one frame; the part between is half the mean
     ||s_t - s_u||^2 of two frames. The expectation of neither depends on OP where frames are independent draws.
@@ -266,7 +266,7 @@ def one_hot_where(table: VoxelTable, where: Mask) -> bool:
 
 
 def beyond_chance(observed: Float64, expected: Float64) -> Float64:
-    """Return 1 - D_o / D_e from disagreement, observed and by chance; NaN where chance alone would always agree."""
+    """Return 1 - D_o / D_e from disagreement, observed and by chance; NaN if chance alone would always agree."""
     with np.errstate(invalid="ignore", divide="ignore"):
         ratio = observed / expected
     beyond: Float64 = np.where(expected.real > ONE_HOT, 1 - ratio, np.nan)
@@ -332,7 +332,7 @@ def shares_of(table: VoxelTable) -> Float64:
 def consistency_posterior(
     table: VoxelTable, shares: Float64 | None = None, *, consistent: float = CONSISTENT
 ) -> Float64:
-    """Return (n,) the probability that a location is consistent, given its frames and all locations; NaN where OP < 2.
+    """Return (n,) the probability that a location is consistent, given its frames and all locations; NaN if OP < 2.
 
     Of T frames m vote for the dominant class, which happens with the probability b(m; T, p) + b(T - m; T, p) where its
     share is p. How many locations have which p is estimated from all of them without any form of its distribution

@@ -41,7 +41,7 @@ class Truth:
 
     Attributes:
         known: (n,) true where the ground truth saw the voxel and has a majority there.
-        label: (n,) the true class; -1 where it is unknown.
+        label: (n,) the true class; -1 for an unknown class.
     """
 
     known: Mask
@@ -106,7 +106,7 @@ def correctness(belief: Float64 | Evidence, label: Int64, name: str = "all") -> 
 
 @dataclass(frozen=True, eq=False)
 class PredictionSums:
-    """Sums over predictions, from which their correctness and calibration follow; those of disjoint parts add up.
+    """Sums over predictions, from which their correctness and calibration follow; sums of disjoint parts add up.
 
     Attributes:
         error: Sum of the squared distances, for Brier's score.

@@ -120,7 +120,7 @@ Lag = tuple[Int64, Int64, Int64]
 def _sums(
     log: Events, labels: UInt16, square: Float64, by_lag: Sequence[Lag], cluster: Int64, clusters: int
 ) -> Float64:
-    """Return the sums (bins + 1, clusters, 4 + K) of pairs: those of `ALPHA_SUMS`, then squared distances."""
+    """Return the sums (bins + 1, clusters, 4 + K) of pairs: the sums of `ALPHA_SUMS`, then squared distances."""
     from semstab.statistics.loops.pairs import add_pairs
 
     sums = np.zeros((len(BINS) + 1, clusters, 4 + len(labels)))

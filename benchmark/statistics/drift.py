@@ -23,12 +23,12 @@ FLIP_RATE = Quantity(key="flip_rate", title="Flip rate", better="lower", needs="
 
 @dataclass(frozen=True, eq=False)
 class Flips:
-    """Changes of the predicted class between successive observations of a voxel (n,); NaN where undefined.
+    """Changes of the predicted class between successive observations of a voxel (n,); NaN if undefined.
 
     Attributes:
         rate: Share of the steps from one observation to the next at which the class changes; OP >= 2.
         null: Its expectation in random order: the share of all pairs of observations that differ.
-        since: Frames from the last change to the last observation; NaN where the class never changed.
+        since: Frames from the last change to the last observation; NaN if the class never changed.
     """
 
     rate: Float64

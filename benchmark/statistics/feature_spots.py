@@ -138,7 +138,7 @@ class FeatureObservations:
     Attributes:
         spots: The spots and views; all labels are class 0.
         vectors: (a, D) float16 of the answers of `spots`, a row each.
-        one_in: One in so many spots of the sample is kept.
+        one_in: The share of the spots of the sample that is kept is 1 / one_in.
     """
 
     spots: SpotObservations

@@ -47,7 +47,7 @@ SIDE, MOST_PLACES, LEAST_SPOTS, MOST_FRAMES = 8, 10, 8, 5
 
 @dataclass(frozen=True, eq=False)
 class Likeness:
-    """What is known of each observation (m,) from the vectors of its spot.
+    """Agreement of each observation (m,) with the others of its spot, from their vectors.
 
     Attributes:
         views: Views T of its spot.
@@ -92,8 +92,8 @@ def likeness(seen: FeatureObservations) -> Likeness:
 def feature_sums(seen: FeatureObservations, of: Likeness, edge: float | None = None) -> ClusterSums:
     """Return the sums by cube and group of frames from which `FEATURE_ALPHA` follows.
 
-    The mean cosine P of a spot is shared out among its T views as P + 2 (T - 1) / (T - 2) (a_t - P), with the mean
-    cosine a_t of view t with the others, as labels' is.
+    The mean cosine P of a spot is shared out among its T views, as the agreement of labels is:
+    P + 2 (T - 1) / (T - 2) (a_t - P), where a_t is the mean cosine of view t with the others.
     """
     log = seen.log
     cubes, step, groups = Cubes.of_log(log, edge), 1, np.unique(log.frame)

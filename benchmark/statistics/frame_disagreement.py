@@ -1,4 +1,4 @@
-"""Which frames stand alone: at places where the views before and after them agree, they give another class.
+"""Frames that stand alone: at places where the views before and after them agree, they give another class.
 
 A place is a spot of the sample (`Sampler`). The neighbours of a view at a place are the NEIGHBOURS other views that saw
 it next before and after. A frame next to a bad one is not blamed: its neighbours do not agree with each other where the

@@ -45,7 +45,7 @@ def ceiling(
         frames: The frames as they were fused, noise included; one is held at a time.
         make_backend: Makes a new, empty map of the same voxels: `lambda: create("numba", voxel_size=0.2,
             num_classes=7)`.
-        world: A map whose dominant labels are rendered into the frames; where there is none, the frames' own labels
+        world: A map whose dominant labels are rendered into the frames; without a map, the frames' own labels
             count, which must be the ground truth.
         views: The same frames free of the noise that was added to them: labels are seen from there.
 
@@ -63,7 +63,7 @@ def rendered(frames: Iterable[Frame], world: VoxelTable, views: Iterable[Frame] 
 
     Each pixel has the dominant label of the voxel it sees.
 
-    A pixel that sees no voxel of the map is ignored. `views` (the frames themselves where not given) show which
+    A pixel that sees no voxel of the map is ignored. `views` (the frames themselves by default) show which
     point a pixel sees.
 
     Raises:

@@ -1,7 +1,7 @@
 """Merge classes until views agree on the groups, which tells which distinctions hold.
 
 One matrix of coincidences, how often two views of a spot give it two classes, tells alpha of any groups of classes
-(Krippendorff 2011, Computing Krippendorff's Alpha-Reliability, where it is named so). So merges are tried without the
+(Krippendorff 2011, Computing Krippendorff's Alpha-Reliability, has the name). So merges are tried without the
 labels.
 """
 
@@ -25,7 +25,7 @@ from semstab.statistics.observations import SpotObservations
 from semstab.statistics.verdict import DECIDED, LIMITS, Limits
 
 MOST_CLASSES = 300
-"""Most classes whose merges are looked for: a matrix of coincidences of so many takes .7 MB."""
+"""The largest number of classes whose merges are looked for: their matrix of coincidences takes .7 MB."""
 
 LEAST_APART = 1e-6
 """Probability that two observations from anywhere differ below which nothing is left to agree about."""
@@ -159,7 +159,7 @@ def groupings(
     Args:
         spots: Labels that views give spots.
         sums: Sums with these spots.
-        scope: Scope of the intervals, where there are enough views for it.
+        scope: Scope of the intervals, if the views suffice for it.
         limits: Limits of 'stable' and 'usable'.
     """
     K = spots.K

@@ -46,7 +46,7 @@ NO_LOCATIONS = "no two locations were seen twice: more overlap between frames is
 
 @dataclass(frozen=True, eq=False)
 class EstimateSpec:
-    """A number, the influences on it (None where it is undefined or all is in one cube), and its kind of interval."""
+    """A number, the influences on it (None if it is undefined or all is in one cube), and its kind of interval."""
 
     value: float
     grid: Influences | None
@@ -113,10 +113,10 @@ def difference(
 ) -> Interval:
     """Return a number of map a less that of map b, paired on locations, and on frames where both have the same ones.
 
-    - `same_frames`: False for another flight, whose frames have nothing to do with these; where it is not given, frames
-      are paired if both maps have the same
+    - `same_frames`: False for another flight, whose frames have nothing to do with these; by default, frames are paired
+      if both maps have the same
 
-    Each map counts with all its voxels: those of the cubes that only one holds add to the variance. Identical sums
+    Each map counts with all its voxels: voxels in cubes that only one map holds add to the variance. Identical sums
     have no difference anywhere: exactly 0, without a p-value.
     """
     a, b = aligned(a, b)
@@ -192,7 +192,7 @@ def _answer(spec: EstimateSpec, grid: Influences) -> Interval:
 
 
 def influences_of(sums: ClusterSums, number: Functional) -> Influences | None:
-    """Return the influences on a number; None where it is not defined, or all is in one cube."""
+    """Return the influences on a number; None if it is undefined, or all is in one cube."""
     total = None
     for part, weight in parts_of(sums, number):
         halves = number.pair_weight * part.of(number.pairs) if number.pairs else None
@@ -204,7 +204,7 @@ def influences_of(sums: ClusterSums, number: Functional) -> Influences | None:
 
 
 def probability_above(interval: Interval, threshold: float, scale: Scale) -> float:
-    """Return how probable a number is above a threshold, from its interval; NaN where nothing is claimed."""
+    """Return how probable a number is above a threshold, from its interval; NaN if nothing is claimed."""
     from scipy import special
 
     low, high = interval.low, interval.high
@@ -278,7 +278,7 @@ def _ends(result: float, spread: Spread, unseen: float, scale: Scale, level: flo
 
 
 def _up_to_one(high: float) -> float:
-    """Return the upper end of an agreement's interval: 1 where it cannot be told from 1."""
+    """Return the upper end of an agreement's interval: 1 if it cannot be distinguished from 1."""
     return 1.0 if 1 - high <= RESOLUTION else high
 
 
@@ -359,7 +359,7 @@ def standard_error(interval: Interval) -> float:
 
 
 def mean_over_frames(frame: npt.NDArray[np.integer], values: Float64, level: float = CONFIDENCE) -> Interval:
-    """Return the mean of values (F,), NaN where undefined, of frames (F,) by their index, for another flight."""
+    """Return the mean of values (F,), NaN if undefined, of frames (F,) by their index, for another flight."""
     defined = ~np.isnan(values)
     if defined.sum() < 2:
         return UNKNOWN
@@ -413,14 +413,14 @@ GROWTH = Functional(("voxels",), lambda sums: ratio_of(sums[..., [0, 2]]), -math
 def shares_of(new: ClusterSums, base: ClusterSums) -> dict[str, float]:
     """Return how many voxels with OP >= 2, and labelled observations in them, a map has for each one of another.
 
-    The numbers are NaN where the other map has none.
+    The numbers are NaN if the other map has no voxels or observations.
     """
     totals = {name: [round(float(part[name].sum())) for part in (new, base)] for name in ("voxels", "observations")}
     return {name: after / before if before else math.nan for name, (after, before) in totals.items()}
 
 
 def counted(value: float, sums: ClusterSums) -> Interval:
-    """Return a change that is a count of the frames of some sums, and no estimate; undecided where it is undefined."""
+    """Return a change that is a count of the frames of some sums, and no estimate; undecided if it is undefined."""
     of = sums if sums.step or not sums.answers else sums.answers[0]
     return Interval(
         value, value, value, frames=of.frame_count, locations=sums.cells, degrees=math.inf,

@@ -110,7 +110,7 @@ class Analysis:
         return {frame: alone.get(frame, {}) | moving.get(frame, {}) for frame in alone.keys() | moving.keys()}
 
     def columns(self, table: VoxelTable, truth: VoxelTable | None = None) -> Columns:
-        """Return one value per voxel (n,) by name for the map or any part of it, NaN where undefined.
+        """Return one value per voxel (n,) by name for the map or any part of it, NaN if undefined.
 
         Columns that need the log are NaN for voxels that were not drawn. True labels are known for the drawn voxels
         (-1 elsewhere), and for all where `truth`, the true labels' map of the part, is given.
@@ -186,12 +186,12 @@ def analyse(
         spots: Labels that views give spots, taken of the same frames by a `Sampler`; without them there is no alpha and
             no verdict.
         features: Features that views give spots, taken by the same sampler.
-        limit: The map of view-independent labels; the ground truth's where it is not given.
+        limit: The map of view-independent labels; the ground truth's by default.
         name: Name of the model, for the verdict.
         seed: Seed of random orders.
         edges: Upper bounds of the strata of OP.
-        critical: The classes that the verdict depends on; where none is named, all with enough locations.
-        scope: Scope of the headline and of alpha by class, where there are enough views for it.
+        critical: The classes that the verdict depends on; by default, all with enough locations.
+        scope: Scope of the headline and of alpha by class, if the views suffice for it.
         limits: Limits of the verdict.
         frame_name: Returns the name of a frame's file by its index.
         moving_untold: Why it is not told which spots moved.
@@ -321,7 +321,7 @@ def _correctness(
     predictions = Predictions.of(table.evidence, truth.label)
     repeated = prediction_sums(predictions, truth.known & (table.op >= 2))
     miou = estimate(sums, MIOU.key, scope=scope_of(sums, headline.accuracy_op2.scope, MIOU.key))
-    if math.isnan(miou.value):  # there are no sums of so many classes
+    if math.isnan(miou.value):  # more than MOST_CLASSES classes have no sums by class
         miou = dataclasses.replace(miou, value=correctness_of(repeated).miou)
     return CorrectnessStatistics(
         accuracy_op2=headline.accuracy_op2,

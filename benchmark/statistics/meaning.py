@@ -1,7 +1,7 @@
 """Agreement with distances between classes: two views that say 'cabinet' and 'cupboard' differ less than by a class.
 
 Classes are points: z_a with |z_a - z_b|^2 = d(a, b), by classical scaling (Torgerson 1952, Psychometrika 17). Then
-observed and expected disagreement follow from sums of points, as they follow from counts for labels that are alike or
+observed and expected disagreement follow from sums of points, as they follow from counts for labels that are equal or
 not, and sums of clusters give intervals and differences.
 """
 

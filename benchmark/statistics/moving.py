@@ -1,4 +1,4 @@
-"""What moved in a flight: the numbers of its spots that other views see through, and agreement of the others."""
+"""Movers in a flight: the numbers of its spots that other views see through, and agreement of the other spots."""
 
 from __future__ import annotations
 

@@ -39,7 +39,7 @@ class Views:
     Attributes:
         frame: (V,) indices of frames.
         centre: (V, 3) camera centres in metres.
-        timestamp: (V,) time stamps in seconds, NaN where unknown.
+        timestamp: (V,) time stamps in seconds, NaN if unknown.
         footprint: (V,) median width of a pixel on the surface that it shows, in metres.
     """
 
@@ -121,7 +121,7 @@ class SpotObservations:
         share: Sampled share of the coarse cells, times 2^32.
         classes: Names of the classes.
         frames: Number of frames, of which some may share a view.
-        distances: (K, K) distances between the classes, symmetric, 0 on the diagonal; None if all are alike.
+        distances: (K, K) distances between the classes, symmetric, 0 on the diagonal; None if all are equal.
         votes: How many views see each spot, or see through it; None if that was not asked.
     """
 
@@ -170,7 +170,7 @@ class SpotObservations:
         return mean((2 * with_label >= views)[views >= 2].astype(np.float64))
 
     def without(self, classes: Sequence[int]) -> SpotObservations:
-        """Return the answers for spots whose dominant class is none of these."""
+        """Return the answers for spots whose dominant class is not one of these."""
         if not len(classes) or not len(self):
             return self
         log, order, _ = self._first
@@ -369,10 +369,10 @@ def _taken(views: Views) -> list[tuple[float, ...]]:
 
 
 def same_spots(samples: Sequence[SpotObservations]) -> list[SpotObservations]:
-    """Return the answers for the spots that all samples have, numbered alike, with the views of all numbered alike.
+    """Return the answers for the spots that all samples have; spots and views have the same numbers in all samples.
 
     Samples of the same frames have the same spots. Of other frames of one flight they have other points of the same
-    coarse cells: those of one cell are taken for one spot.
+    coarse cells: points of one cell are taken for one spot.
     """
     share, spacing = min(sample.share for sample in samples), max(sample.spacing for sample in samples)
     views = Views.joined([sample.views for sample in samples])

@@ -17,7 +17,7 @@ from semstab.statistics.agreement import psa
 from semstab.statistics.observations import SpotObservations
 
 DISAGREES = 0.5
-"""Of a voxel of a place at most this share of the pairs of frames agree."""
+"""The largest share of the pairs of frames that agree on a voxel of a place."""
 
 LEAST = 4
 """Least voxels of a place: a smaller one is where two surfaces meet in a voxel."""
@@ -38,7 +38,7 @@ class PlaceView:
 
     Attributes:
         frame: Its index.
-        label: The class that it gives most of the spots of the place; -1 where it gives none.
+        label: The class that it gives most of the spots of the place; -1 if it gives no class.
         spots: Number of the spots that it sees.
     """
 
@@ -86,7 +86,7 @@ def places_of(record: Record, most: int = MOST) -> list[Place]:
 
 
 def worst_places(tables: Iterable[VoxelTable], spots: SpotObservations | None, most: int = MOST) -> list[Place]:
-    """Return the worst places of a map in parts, at most so many; without spots no views are known.
+    """Return up to `most` of the worst places of a map in parts; without spots no views are known.
 
     The disagreement of a place is the sum of 1 - PSA over its voxels.
     """

@@ -28,7 +28,7 @@ LEAST_SEEN_TWICE = 200
 def range_agreement(
     spots: SpotObservations, scope: Scope = THIS_SCENE, limits: Limits = LIMITS
 ) -> RangeAgreement | None:
-    """Return alpha by range, from spots; None where all were seen from about one distance.
+    """Return alpha by range, from spots; None if all were seen from about one distance.
 
     A stratum is assessed, and has an alpha, where two views saw LEAST_SEEN_TWICE spots or more and they have
     LEAST_CLASSES effective classes or more.

@@ -21,7 +21,7 @@ from semstab.metrics.summary import STRATA, TableSums
 from semstab.statistics.drift import lowest, streams
 
 MOST_VOXELS = 500_000
-"""More voxels add nothing to an interval: errors of neighbours are alike, so the number of independent ones decides."""
+"""More voxels add nothing to an interval: errors of neighbours are similar, so only independent ones count."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -30,8 +30,8 @@ class MapSample:
 
     Attributes:
         table: Rows of the drawn voxels, sorted as a VoxelTable is.
-        events: Their observations, where there is a log.
-        truth: The rows of the true labels' map at those voxels, where there is ground truth.
+        events: Their observations, if the map has a log.
+        truth: The rows of the true labels' map at those voxels, if ground truth is known.
         summary: Additive sums over ALL voxels of the map.
     """
 
@@ -83,7 +83,7 @@ class MapSample:
         return cls(table, events, truth, functools.reduce(operator.add, (part.summary for part in parts)))
 
     def bound(self, *, most: int = MOST_VOXELS) -> int | None:
-        """Return the highest hash of a voxel in a full sample; None where there is room for others."""
+        """Return the highest hash of a voxel in a full sample; None if the sample is not full."""
         return int(streams(self.table, slice(None), 0).max()) if len(self.table) >= most else None
 
     def below(self, bound: int | None) -> MapSample:

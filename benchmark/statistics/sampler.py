@@ -74,7 +74,7 @@ SURE, SMOOTH = 4.0, 0.0005
 relative, from which on depth comes from planes through the pixels around."""
 
 GATE, ENOUGH = 0.05, 50
-"""That standard deviation comes from differences up to GATE, relative, of frames that have ENOUGH of them."""
+"""The standard deviation of depth comes from relative differences up to GATE, of frames with ENOUGH such pixels."""
 
 SPARSE, ALONE, DENSE = 0.3, 0.7, 0.1
 """Depth of an image is sparse, as from a LiDAR, if fewer than this share of its pixels have depth, and fewer than this
@@ -83,7 +83,7 @@ where a spot falls, not at the next pixel with depth."""
 
 HOLES = 3.0
 """Distance of the pixels with depth, in pixels, up to which sparse depth of an image is of a camera, and has holes:
-whether a view sees through a spot is then told only where there are none."""
+whether a view sees through a spot is then told only away from holes."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -1,4 +1,4 @@
-"""What a model leaves out of its own observations: pixels that have depth and no label."""
+"""Observations that a model leaves out: pixels that have depth and no label."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from semstab.statistics.observations import SpotObservations
 
 @dataclass(frozen=True)
 class Silence:
-    """What a model labels of the observations with depth.
+    """Shares of the observations with depth that a model labels.
 
     Attributes:
         pixels: Share of the answers that are a label.

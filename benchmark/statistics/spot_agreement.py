@@ -39,8 +39,8 @@ def spot_agreement(
         spots: Labels that views give spots.
         sums: Sums of the map with these spots.
         table: The map, by which locations of a class are counted.
-        scope: Scope of the intervals, where there are enough views for it.
-        critical: Classes that the verdict depends on; where none is named, those with enough locations.
+        scope: Scope of the intervals, if the views suffice for it.
+        critical: Classes that the verdict depends on; by default, the classes with enough locations.
         limits: Limits of the verdict.
     """
     first = sums.answers[0]

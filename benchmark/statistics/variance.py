@@ -5,8 +5,8 @@ effect, a frame's effect and noise:
 
     x_gf = n_gf (l_g + q_f) + e_gf,    var e_gf = s^2 n_gf
 
-Effects of frames are alike by rho^d, d frames apart; those of locations by exp(-d / reach). The same scene flown again
-has the same l and new q and e; other scenes have all three anew. The size and reach of effects are not
+Effects of frames d apart correlate by rho^d; effects of locations d apart by exp(-d / reach). The same scene flown
+again has the same l and new q and e; other scenes have new l, q and e. The size and reach of effects are not
 decided: the variance is a mean over a grid of both, weighted by the restricted likelihood (Harville 1977, Journal of
 the American Statistical Association 72).
 """
@@ -59,7 +59,7 @@ class Spread:
     degrees: float
 
     def half(self, level: float) -> float:
-        """Return half the width of the confidence interval; NaN where it is unknown."""
+        """Return half the width of the confidence interval; NaN if it is unknown."""
         from scipy import special
 
         if not self.degrees > 0:
@@ -112,7 +112,7 @@ NOTHING = Variances(np.ones(1), np.zeros(1))
 def variances(
     effect: Float64, weight: Float64, noise: Float64, distance: Float64, ranges: Mapping[float, float]
 ) -> Variances:
-    """Return the possible variances of sum(weight * effect) if the effects (n,) are drawn anew.
+    """Return the possible variances of sum(weight * effect) if the effects (n,) are drawn again.
 
     Args:
         effect: (n,) estimated effects.
@@ -200,7 +200,7 @@ class Influences:
 def influences(
     index: ClusterIndex, columns: Float64, of: Statistic, halves: Float64 | None = None
 ) -> Influences | None:
-    """Return the influences of sums (m, C) by cube and group of frames; None where all is in one cube.
+    """Return the influences of sums (m, C) by cube and group of frames; None if all is in one cube.
 
     halves (m, 2) are the parts of the first two sums, at locations that two frames saw, that count for both frames
     instead of half for each.
@@ -239,7 +239,7 @@ class Effects:
 
     Attributes:
         noise: The variance from noise; unit is that of a single observation.
-        frame: (F,) effects of the frames, error (F, F) the covariance of their errors; None where frames are unknown.
+        frame: (F,) effects of the frames, error (F, F) the covariance of their errors; None if frames are unknown.
     """
 
     grid: Influences
@@ -311,7 +311,7 @@ def _contrasts(n: int) -> Float64:
 
 def _of_frames(effect: Float64, weight: Float64, noise: Float64, at: Float64) -> Variances:
     """Return the variances over new frames; `at` (F,) is when they were taken, ascending."""
-    step = float(np.median(np.diff(at)))  # effects last for so many frames that were fused
+    step = float(np.median(np.diff(at)))  # effects last for a number of fused frames
     ranges = {-step / math.log(rho) if rho > 0 else 0.0: prior for rho, prior in LASTING.items()}
     return variances(effect, weight, noise, np.abs(np.subtract.outer(at, at)), ranges)
 
@@ -398,19 +398,19 @@ AT_ONCE = 2**20
 def slope(statistic: Statistic, totals: Float64, direction: Float64) -> Float64:
     """Return the derivative (...,) of a statistic at totals (..., C) along a direction (..., C).
 
-    NaN where it is undefined.
+    The derivative is NaN if the statistic is undefined.
 
     It is a step into the complex plane, which takes no difference and so loses no digit (Squire and Trapp 1998, SIAM
     Review 40).
     """
-    with np.errstate(all="ignore"):  # complex numbers warn of NaN where real ones do not
+    with np.errstate(all="ignore"):  # complex numbers warn of NaN, real numbers do not
         value = statistic(totals + STEP * 1j * direction)
     derivative: Float64 = np.where(np.isnan(value.real), np.nan, value.imag / STEP)
     return derivative
 
 
 def gradient_of(statistic: Statistic, total: Float64) -> Float64:
-    """Return the gradient (C,) of a statistic at sums (C,), 0 where there is nothing to sum."""
+    """Return the gradient (C,) of a statistic at sums (C,), 0 for sums that are 0."""
     gradient = np.zeros_like(total)
     nonzero = np.flatnonzero(total)
     for at in np.array_split(nonzero, len(nonzero) * len(total) // AT_ONCE + 1):

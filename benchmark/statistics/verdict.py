@@ -30,7 +30,7 @@ class Limits:
         stable: Alpha from which data may be relied on (Krippendorff 2018, Content Analysis, ch. 12).
         usable: Alpha from which tentative conclusions are allowed.
         labelled: Least share of the locations that a stable model labels.
-        class_locations: Least number of voxels that a class dominates to count, where no critical classes are named.
+        class_locations: Least number of voxels that a class dominates to count, if no critical classes are named.
     """
 
     stable: float = 0.8
@@ -109,7 +109,7 @@ def why_undecided(alpha: Interval, limits: Limits = LIMITS) -> str:
 
 
 def _below(p: float, limit: float) -> str:
-    """Return a probability with two digits, and with more of them where it would be rounded up to a limit."""
+    """Return a probability with two digits, or with more digits if two would round it up to a limit."""
     for digits in range(2, 5):
         if p >= limit or round(p, digits) < limit:
             return short(p, digits=digits)
@@ -130,9 +130,9 @@ def verdict(
 ) -> StabilityVerdict:
     """Return the most probable level of alpha, and the level if what the model leaves out counts as disagreeing.
 
-    It is undecided where the interval of alpha holds both limits, whatever the probabilities are, and where no level
-    has DECIDED. If movers were found, alpha is that of what stayed. The second level is that of all pairs of views of a
-    spot: a pair of which one has no label disagrees.
+    It is undecided if the interval of alpha holds both limits, whatever the probabilities are, or if no level has the
+    probability DECIDED. If movers were found, alpha is over what stayed. The second level is over all pairs of views of
+    a spot: a pair of which one has no label disagrees.
 
     Args:
         model: Its name.
@@ -182,7 +182,7 @@ def verdict(
 
 
 def _missing(spots: SpotAgreement | None, voxels: int) -> str:
-    """Return why there is no verdict; empty where there is one."""
+    """Return why the model has no verdict; '' if it has one."""
     if spots is None:
         return NO_SPOTS
     if not spots.views:

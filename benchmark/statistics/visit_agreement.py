@@ -12,8 +12,8 @@ beside itself costs nothing. All three are of the same spots with the same weigh
 
     mean of both within - across
 
-is 0 in expectation if the views of both visits label alike: disagreement across exceeds that within by half the squared
-distance |p_s - q_s|^2.
+is 0 in expectation if the views of both visits give the same labels: disagreement across exceeds disagreement within by
+half the squared distance |p_s - q_s|^2.
 """
 
 from __future__ import annotations
@@ -65,7 +65,7 @@ def two_visits(visited: VisitedSpots) -> TwoVisits:
 
 
 KINDS = {"stayed": STAYED, "gone": GONE, "new": NEW, "moved": MOVED, "unknown": UNKNOWN}
-"""What happened to the surface at a spot, by name."""
+"""Fates of the surface at a spot, by name."""
 
 
 def _classes(visited: VisitedSpots, levers: Levers) -> list[VisitedClass]:

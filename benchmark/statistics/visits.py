@@ -39,7 +39,7 @@ DRAWS = 10
 """How often two visits are drawn from the answers of one, to see which share of the spots differs by chance."""
 
 UNKNOWN, STAYED, GONE, NEW, MOVED = range(5)
-"""What happened to the surface at a spot between two visits."""
+"""Fates of the surface at a spot between two visits."""
 
 
 class VisitSampler(Sampler):
@@ -184,8 +184,8 @@ class VisitedSpots:
     def from_one_place(self, label: npt.NDArray[np.integer[Any]]) -> Float64:
         """Return (2, n) pairs of an answer of each visit that were taken from one place, and those that agree.
 
-        Two views of one visit are of two places. So are those of a pair across: views from one place show the same
-        pixels and err alike.
+        Two views of one visit are of two places. So are the views of a pair across: views from one place show the
+        same pixels and make the same errors.
         """
         answers, n = self.answers, len(self.spots.point)
         of, place = self.visit[answers.view], self.place[answers.view]
@@ -207,7 +207,7 @@ class VisitedSpots:
         return self.common & _differ(*self.shares, self.counts, self.from_one_place(self.answers.label))
 
     def relabelled_by_chance(self) -> float:
-        """Return the share of the common spots that two visits give other classes though their views label alike.
+        """Return the share of the common spots that two visits give other classes by chance, without any change.
 
         The answers of both visits are drawn with replacement from those of one, as often as each visit answers; it is
         the mean over draws from the first visit and from the second one.

@@ -1,4 +1,4 @@
-"""Which spots moved: views that see the surface at a spot, and views that see through it.
+"""Votes on which spots moved: views that see the surface at a spot, and views that see through it.
 
 The depth of up to MOST_KEPT views is kept, coarsely, so that each spot is looked up in views before it was found and
 after it. A view sees through a spot if all that it shows there, some pixels around included, is farther than the spot
@@ -30,8 +30,8 @@ POINTS = 3.0
 """Distances of the points of sparse depth along the edge of a block."""
 
 GAP, GAP_SIGMAS = 0.01, 5.0
-"""A surface is farther than a spot if it is by more than GAP, relative, and by more than so many standard deviations of
-how depth differs between views."""
+"""A surface is farther than a spot if it is by more than GAP, relative, and by more than GAP_SIGMAS standard deviations
+of how depth differs between views."""
 
 AROUND = 2
 """Blocks to each side of a spot that a view must show farther away to see through it: errors of poses and of edges of
@@ -41,21 +41,22 @@ AROUND_OF_POINTS = 1
 """The same for the points of a LiDAR: its blocks are larger, and it has no edges of depth that errors displace."""
 
 REACH = 0.25
-"""Blocks to each side, a pixel at least, in which a spot's surface must be smooth where it was found."""
+"""Blocks to each side, a pixel at least, in which the view that found a spot must see a smooth surface."""
 
 EDGE, EDGE_SIGMAS = 0.05, 6.0
-"""Inverse depth of the pixels around a spot differs by EDGE, relative, and so many standard deviations of noise, at
-most: else the spot is at an edge of depth, or seen at a grazing angle."""
+"""Inverse depth of the pixels around a spot differs by EDGE, relative, and EDGE_SIGMAS standard deviations of noise,
+at most: else the spot is at an edge of depth, or seen at a grazing angle."""
 
 SAME, SAME_SIGMAS = 0.01, 2.0
 """At an edge a spot is told, too, if inverse depth of more than half of the pixels around differs from it by at most
-SAME, relative, and so many standard deviations of noise."""
+SAME, relative, and SAME_SIGMAS standard deviations of noise."""
 
 NEAR_BY, NEAR_BY_SIGMAS = 0.003, 3.0
-"""A view sees a spot if depth there differs by at most this, relative, and by so many standard deviations."""
+"""A view sees a spot if depth there differs by at most NEAR_BY, relative, and by NEAR_BY_SIGMAS standard deviations."""
 
 LEAST_THROUGH, SHARE_THROUGH = 2, 1 / 3
-"""A spot moved if so many views see through it, and more than this share of those that see it or see through it."""
+"""A spot moved if LEAST_THROUGH views see through it, and more than SHARE_THROUGH of the views that see it or through
+it."""
 
 LEAST_VOTES = 2
 """Views that see a spot or see through it, below which it is unknown whether it moved."""
@@ -150,7 +151,7 @@ class DepthMemory:
         self._step = 1
 
     def wants(self, view: int) -> bool:
-        """Return whether the depth of a view is to be kept: it is new, and one of every so many."""
+        """Return whether the depth of a view is to be kept: it is new, and its number is a multiple of the step."""
         return view % self._step == 0 and (not self.kept or view > self.kept[-1].view)
 
     def add(self, depth: KeptDepth) -> None:

@@ -11,7 +11,7 @@ from semstab.data.georeference import Georeference
 from semstab.statistics.visits import GONE, NEW, VisitedSpots
 
 REACH = 2.0
-"""Edges of coarse cells up to which spots that changed alike are neighbours."""
+"""Edges of coarse cells up to which spots with the same change are neighbours."""
 
 LEAST = 5
 """Least number of spots of a place."""
@@ -22,7 +22,7 @@ MOST = 50
 
 @dataclass(frozen=True)
 class ChangedPlace:
-    """Neighbouring spots that changed alike.
+    """Neighbouring spots with the same change.
 
     Attributes:
         number: From 1, the largest first.

@@ -34,7 +34,7 @@ CONTENT, REPORT, FIGURES = "visits.json", "report.html", "figures"
 KINDS = ("not told", "same class", "other class", "gone", "new", "moved")
 COLORS = ((236, 236, 236), (196, 196, 196), (213, 94, 0), (0, 114, 178), (0, 158, 115), (204, 121, 167))
 RANK = np.array([0.0, 1.0, 3.0, 4.0, 5.0, 2.0])
-"""Of the spots in a column the one with the highest rank is shown."""
+"""Ranks of the kinds: a column shows its spot with the highest rank."""
 
 COARSER = 2.0
 """Edge of a cell of the map, in mean distances of spots."""

@@ -37,7 +37,7 @@ GENERATOR_VERSION = 2
 
 
 FIELD_OF_VIEW = 60.0
-"""Of the camera, horizontal, degrees."""
+"""Horizontal field of view of the camera, degrees."""
 
 
 USUAL_LIGHT = "noon"

@@ -1,4 +1,4 @@
-"""The flights: five scenes whose frames overlap as differently as those of UAVid-3D in the paper's scene table."""
+"""The flights: five scenes whose overlaps of frames differ as UAVid-3D's do in the paper's scene table."""
 
 from __future__ import annotations
 

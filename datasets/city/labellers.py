@@ -72,7 +72,7 @@ LABELLERS: Mapping[str, Labeller] = {
 
 
 def relabelled(model: Simulation, view: View) -> UInt8:
-    """Return the labels of a model, changed by its labeller if it has one; 255 where there is nothing."""
+    """Return the labels of a model, changed by its labeller if it has one; 255 for pixels without a surface."""
     predicted = model.labels(view)
     if not model.model.labeller:
         return predicted

@@ -34,7 +34,7 @@ class Surface:
     Attributes:
         vertices, faces: (n, 3) metres; (m, 3) vertices of each triangle.
         classes: (m,) uavid8 ids.
-        colors: (m, 3) RGB in [0, 1]; NaN where a copy's tint is taken.
+        colors: (m, 3) RGB in [0, 1]; NaN for the tint of a copy.
     """
 
     vertices: Float64

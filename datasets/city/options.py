@@ -60,7 +60,7 @@ class SimulatedModel(Settings):
     Attributes:
         place: The world cell: the same mistake in every view and frame (consistent but wrong).
         view: The world cell, and the direction and distance it is seen from, in steps of 15 degrees and 12 m.
-        flicker: The world cell and the frame's index: anew in every frame.
+        flicker: The world cell and the frame's index: independent in every frame.
         border: The pixel and the frame's index: a smooth random field displaces the label map.
     """
 
@@ -72,7 +72,7 @@ class SimulatedModel(Settings):
     softness: float = Field(0.0, ge=0, le=0.49, description="largest score that goes to other classes; 0: class ids")
     labeller: Labeller = Field("", description="labeller that changes the labels so that they agree for a wrong reason")
     difficulty: dict[ClassName, Annotated[float, Field(ge=0, le=100)]] = Field(
-        default_factory=dict, description="factors on place, view and flicker by true class; 1 where not given"
+        default_factory=dict, description="factors on place, view and flicker by true class; 1 by default"
     )
 
 

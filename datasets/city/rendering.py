@@ -30,7 +30,7 @@ class Light:
     Attributes:
         sun: (3,) unit vector towards the sun.
         ambient, sunlight: (3,) RGB of the light from all sides, and of the sun on a surface that faces it.
-        sky: (3,) RGB of what is seen where there is nothing.
+        sky: (3,) RGB of pixels without a surface.
     """
 
     sun: Float64

@@ -58,14 +58,14 @@ class Simulation:
         self._factors = np.array([model.difficulty.get(name, 1.0) for name in names] + [0.0])
 
     def labels(self, view: View) -> UInt8:
-        """Return predicted ids (H, W); 255 where there is nothing."""
+        """Return predicted ids (H, W); 255 for pixels without a surface."""
         predicted = self._displaced_borders(view)
         for rows in row_chunks(predicted.shape):
             self._put_errors(view, rows, predicted[rows])
         return predicted
 
     def scores(self, view: View) -> Float32:
-        """Return soft scores (H, W, 8) that sum to 1, the predicted class the largest; 0 where there is nothing."""
+        """Return soft scores (H, W, 8) that sum to 1, the predicted class the largest; 0 without a surface."""
         predicted = self.labels(view)
         scores = np.zeros((*predicted.shape, len(self._weights)), dtype=np.float32)
         for rows in row_chunks(predicted.shape):

@@ -37,7 +37,7 @@ def houses(rows: Float64, ground: Ground, rng: np.random.Generator) -> list[Surf
 
 
 def flats(rows: Float64, ground: Ground, rng: np.random.Generator) -> list[Surface]:
-    """Return buildings under flat roofs; rows (n, 5) as those of houses."""
+    """Return buildings under flat roofs; rows (n, 5) are as for houses."""
     size = np.stack([rows[:, 2] - 1, rows[:, 3] - 1, np.full(len(rows), 0.5)], axis=1)
     return _buildings(rows, box(BUILDING), size, FELT, ground, rng)
 

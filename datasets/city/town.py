@@ -85,7 +85,7 @@ class _Lot(NamedTuple):
     side: int
 
     def t(self, into: float) -> float:
-        """Return the plan coordinate of what is so many metres behind the front."""
+        """Return the plan coordinate at `into` metres behind the front."""
         return self.front + self.side * into
 
     def part(self, left: float, right: float, near: float, far: float) -> Rectangle:
@@ -94,7 +94,7 @@ class _Lot(NamedTuple):
 
 
 def _lots(land: Rectangle, wide: float) -> list[_Lot]:
-    """Return two rows of lots back to back, about so many metres wide."""
+    """Return two rows of lots back to back, about `wide` metres wide."""
     borders = np.linspace(land.s0, land.s1, round((land.s1 - land.s0) / wide) + 1)
     deep = (land.t1 - land.t0) / 2
     rows = ((land.t0, 1), (land.t1, -1))

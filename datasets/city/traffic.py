@@ -1,4 +1,4 @@
-"""What moves: cars and people, who go along straight lanes at a constant speed and start again at the other end."""
+"""Moving cars and people, who go along straight lanes at a constant speed and start again at the other end."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ class Street(NamedTuple):
 
 
 class Kind(NamedTuple):
-    """What moves, how high above the ground, about how many metres apart, how far from the middle of a street."""
+    """A kind of movers: surface; height, mean spacing and offset from a street's middle in metres; possible speeds."""
 
     template: Surface
     above: float
@@ -41,8 +41,8 @@ class Movers:
     """Moving things of one kind.
 
     Attributes:
-        lanes: (6, n) whether a thing's lane runs along the plan's axis s, its place on the other axis, where it begins
-            and its length in metres; where the thing starts along it, and its speed, negative towards the beginning.
+        lanes: (6, n) 1 if a thing's lane runs along the plan's axis s; its place on the other axis, its beginning and
+            its length in metres; the start of the thing along it, and its speed, negative towards the beginning.
         size, tint: (n, 3) each.
     """
 
@@ -53,7 +53,7 @@ class Movers:
 
     @classmethod
     def random(cls, kind: Kind, streets: Sequence[Street], rng: np.random.Generator) -> Movers:
-        """Return movers on both sides of each street, who keep right; those of one lane share a speed."""
+        """Return movers on both sides of each street, who keep right; movers on one lane share a speed."""
         rows: list[tuple[float, ...]] = []
         for street in streets:
             length = street.high - street.low

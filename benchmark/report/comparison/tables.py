@@ -35,7 +35,7 @@ IN_CLASSES = (ALPHA, PSA, RECALL, IOU)
 """Measures that the table of classes shows side by side."""
 
 ANSWERS = (
-    f"Brackets hold intervals at {CONFIDENCE:.0%}, for this scene flown again where there are {LEAST_FRAMES} frames or"
+    f"Brackets hold intervals at {CONFIDENCE:.0%}, for this scene flown again if it has {LEAST_FRAMES} frames or"
     " more, else for these frames, that is, for other locations in the same frames. p (Holm) is the p-value of no"
     " difference: of alpha corrected for the runs that are compared, of what describes for all of it in the scene, or"
     " over all scenes."
@@ -52,7 +52,7 @@ def tables(comparison: RunComparison) -> list[Table]:
 
 
 def scopes(comparison: RunComparison) -> Iterator[tuple[str, Against]]:
-    """Yield each run against the base: over all scenes where there are several, then scene by scene."""
+    """Yield each run against the base: over all scenes if the runs have several, then scene by scene."""
     if len(comparison.scenes) > 1:
         yield from ((ALL_SCENES, against) for against in comparison.overall)
     for scene in comparison.scenes:
@@ -85,15 +85,15 @@ def _differences(comparison: RunComparison) -> Table:
     caption = (
         "Alpha is of the observations that all runs made, and other measures are of the voxels that all saw twice or"
         " more; coverage is of each run's whole map, and flicker is of its images. Coverage is the number of voxels"
-        " seen twice or more, divided by that of the base. A difference is undecided where there are too few frames, or"
-        " where errors reach as far as the scene."
+        " seen twice or more, divided by that of the base. A difference is undecided if the frames are too few, or"
+        " if errors reach as far as the scene."
         f" {ANSWERS}{macro}"
     )
     return Table("comparison", "Differences", caption, columns, groups, "scope")
 
 
 def _others(comparison: RunComparison) -> str:
-    """Return the heading of the numbers that are compared with the base's: the run's name where there is one run."""
+    """Return the heading of the numbers that are compared with the base's: the name of the other run, or 'Other'."""
     return comparison.runs[1].name if len(comparison.runs) == 2 else "Other"
 
 
@@ -158,7 +158,7 @@ def _areas(comparison: RunComparison) -> Table:
         Column("number", "Area", 0), Column("what", "Lost"), Column("class", "Class"),
         Column("confused_with", "Confused with"), Column("voxels", "Voxels", 0), Column("loss", "Loss", 2),
         *(Column(axis, axis, 2, over="Centre (m)") for axis in "xyz"), Column("size", "Size (m)", 2),
-        Column("improved_alike", "Improved alike", 0), Column("frames", "Top contributing frames"),
+        Column("improved_alike", "Improved as much", 0), Column("frames", "Top contributing frames"),
     )  # fmt: skip
     groups = tuple(
         Group(heading(comparison, scene.scene, against), tuple(_area_row(area) for area in against.areas))
@@ -168,9 +168,9 @@ def _areas(comparison: RunComparison) -> Table:
     caption = (
         "An area is neighbouring voxels of one class that got worse: by agreement, they lost a fifth or more of the"
         " agreement between frames; by truth, they were right in the base and are wrong now. Loss is the mean loss."
-        " 'Confused with' is the class that these frames show instead. 'Improved alike' counts the areas that improved"
-        " by as much; where nothing changed there are as many. Top contributing frames are those whose observations"
-        " turned away from the class, with their share."
+        " 'Confused with' is the class that these frames show instead. 'Improved as much' counts the areas that"
+        " improved by as much; if nothing changed, they are as many. Top contributing frames are those whose"
+        " observations turned away from the class, with their share."
     )
     systems = {scene.crs for scene in comparison.scenes if scene.crs}
     caption += f" Centres are in {' and '.join(sorted(systems)) if systems else 'the coordinates of the scene'}."
@@ -465,7 +465,7 @@ def print_comparison(
 
 
 def _fitting(table: Table, comparison: RunComparison) -> Table:
-    """Return a table whose groups are scenes, where there is one other run, and whose title has names that are long."""
+    """Return a table with scenes as groups if the base is compared with one run, and with long names in the title."""
     if len(comparison.runs) == 2:
         pair = heading(comparison, "", comparison.overall[0])
         groups = (dataclasses.replace(group, name=group.name.removesuffix(pair)) for group in table.groups)

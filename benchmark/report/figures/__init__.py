@@ -38,7 +38,7 @@ def write_figures(result: Result, folder: str | Path, out: Path | None = None, *
     Without `out` they are written into FOLDER/figures, where earlier figures are removed.
     """
     target = out or Path(folder) / "figures"
-    drawn = sorted(figures(result, folder), key=lambda figure: figure.unit)  # those of a unit read its voxels once
+    drawn = sorted(figures(result, folder), key=lambda figure: figure.unit)  # a unit's figures read its voxels once
     written = [path for figure in drawn for path in figure.save(target, svg=svg)]
     if out is None:
         keep_only(written, target)
@@ -76,8 +76,8 @@ def _overview(record: Record, result: Result, views: Views, path: Path) -> Figur
     return Figure(
         slug("overview", scene, model),
         f"Overview: {scene}, {model}",
-        "A frame, its prediction, and the map of all sampled frames. The map is seen from above, below a ceiling where"
-        " there is one, or from the side where that shows more. It shows the dominant class of the topmost voxels, in"
+        "A frame, its prediction, and the map of all sampled frames. The map is seen from above, below a ceiling if"
+        " the scene has one, or from the side if that shows more. It shows the dominant class of the topmost voxels, in"
         " the colours of the prediction.",
         f"A camera image of {scene}, the classes that {model} predicts for it, and the fused map from above in the"
         " same colours.",
@@ -132,9 +132,9 @@ def _maps(result: Result, with_voxels: list[Record], views: Views) -> Iterator[F
             yield Figure(
                 slug("stability_map", scene, model),
                 f"Stability from above: {scene}, {model}",
-                "The topmost voxel of each column along the up axis, below a ceiling where there is one; of a wall, the"
-                f" foremost voxel. (a) shows its stability category, the other panels show {panels}. A grey voxel was"
-                " seen once and has no category. An arrow on a scale marks values beyond its end.",
+                "The topmost voxel of each column along the up axis, below a ceiling if the scene has one; of a wall,"
+                f" the foremost voxel. (a) shows its stability category, the other panels show {panels}. A grey voxel"
+                " was seen once and has no category. An arrow on a scale marks values beyond its end.",
                 f"Maps of {scene} from above with the stability category, {panels} of {model}'s voxels.",
                 partial(_draw_map, record, result, views),
                 unit=record.unit.slug,

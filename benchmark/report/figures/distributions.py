@@ -117,7 +117,7 @@ def draw_ecdf(scenes: Mapping[str, Histograms], ends: Mapping[Measure, float]) -
 
 
 def _draw_curves(axes: Axes, measure: Measure, scenes: Mapping[str, Float64], everything: Float64) -> None:
-    """Draw one curve a scene, and a dashed one of all recurrent voxels, where there are any."""
+    """Draw one curve a scene, and a dashed one of all recurrent voxels, if any."""
     ends = upper_ends(measure)
     for k, (name, counts) in enumerate(scenes.items()):
         axes.step(ends, ecdf(counts), where="post", color=color(k), label=f"{name}, all voxels")

@@ -24,7 +24,7 @@ NORTH = np.array([0.0, 1.0, 0.0])
 
 @dataclass(frozen=True)
 class Edge:
-    """An edge of a picture: the name of its coordinate, '' where it has none, and where its ticks are.
+    """An edge of a picture: the name of its coordinate, '' without a coordinate, and where its ticks are.
 
     Attributes:
         ticks: Share of the edge from its lower or left end, 0 to 1, and the coordinate there in metres.
@@ -36,7 +36,7 @@ class Edge:
 
 @dataclass(frozen=True, eq=False)
 class Located:
-    """A picture of a map in the coordinates of the exports: global where there is a georeference, else the scene's.
+    """A picture of a map in the coordinates of the exports: global with a georeference, else the scene's.
 
     Attributes:
         matrix: (3, 3): coordinates are `matrix` times (metres to the right, metres up in the picture, 1), on the mean
@@ -44,7 +44,7 @@ class Located:
         size: Width and height in metres.
         to_picture: (3, 3) rows right, up in the picture and towards the viewer, in the scene's axes.
         corner: Metres to the right and up at which the lower left corner lies from the scene's origin.
-        georeference: None where the scene has none.
+        georeference: None if the scene has none.
     """
 
     matrix: Float64
@@ -91,7 +91,7 @@ class Located:
 
     @property
     def edges(self) -> tuple[Edge, Edge]:
-        """The lower and the left edge; without ticks where no coordinate runs along it."""
+        """The lower and the left edge; without ticks if no coordinate runs along it."""
         lower, left = (self._edge(k) for k in range(2))
         return lower, left
 
@@ -105,12 +105,12 @@ class Located:
 
     @property
     def system(self) -> str:
-        """What the coordinates are, in words."""
+        """The name of the coordinate system."""
         return "coordinates of the scene" if self.georeference is None else self.georeference.name
 
     @property
     def north(self) -> float | None:
-        """Degrees clockwise from the top of the picture to grid north; None where it is not known, or a side view."""
+        """Degrees clockwise from the top of the picture to grid north; None if north is unknown, or in a side view."""
         if self.georeference is None:
             return None
         right, up, towards = self.to_picture @ np.linalg.solve(np.array(self.georeference.linear), NORTH)
@@ -123,7 +123,7 @@ class Located:
 
 
 def ticks(low: float, high: float, most: int = MOST_TICKS) -> list[float]:
-    """Return round numbers between two ends, at most one more than so many: multiples of 1, 2 or 5 times 10^n."""
+    """Return round numbers between two ends, at most `most` + 1 of them: multiples of 1, 2 or 5 times 10^n."""
     least = (high - low) / most
     power = 10.0 ** math.floor(math.log10(least))
     step = next(s * power for s in (1, 2, 5, 10) if s * power >= least * (1 - 1e-9))

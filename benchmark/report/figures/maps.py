@@ -74,7 +74,7 @@ class LoneFrames:
         frames: (n,) their indices.
         labels: (n, h, w) rows 0..K-1, and above where a pixel has none.
         alone: (n, h, w) pixels whose label differs from those of the frames before and after.
-        color: (n, h, w, 3); None where the dataset has no images.
+        color: (n, h, w, 3); None if the dataset has no images.
     """
 
     frames: Int64
@@ -93,7 +93,7 @@ class PlacePictures:
         frame: (n,) index of the frame.
         labels: (n, h, w) rows 0..K-1, and above where a pixel has none.
         ring: (n, 3) centre x, y and radius of a circle around the place, shares of the image.
-        color: (n, h, w, 3); None where the dataset has no images.
+        color: (n, h, w, 3); None if the dataset has no images.
     """
 
     of: Int64
@@ -111,10 +111,10 @@ class Overview:
     Attributes:
         frame: Its index.
         labels: (H, W) predicted rows 0..K-1; K and above: ignored.
-        color: (H, W, 3) the image; None where the dataset has none.
+        color: (H, W, 3) the image; None if the dataset has none.
         palette: (K, 3) RGB of the classes.
-        lone: Frames that stand out; None where none does.
-        places: Places where frames disagree; None where there are no pictures of any.
+        lone: Frames that stand out; None if no frame does.
+        places: Places where frames disagree; None without pictures of places.
     """
 
     frame: int
@@ -126,7 +126,7 @@ class Overview:
 
     @classmethod
     def load(cls, path: Path) -> Overview:
-        """Read SCENE__MODEL.npz with the arrays frame, labels, palette and, where there is one, color.
+        """Read SCENE__MODEL.npz with the arrays frame, labels, palette and, if the dataset has images, color.
 
         Raises:
             DataError: If the file is damaged or of another kind.
@@ -205,7 +205,7 @@ def map_panels(rows: Int64, n: int) -> tuple[Figure, Sequence[Axes]]:
 
 
 def _painted(rows: Int64, label: npt.NDArray[Any], colors: Colors) -> Image:
-    """Return the map in the colours of its voxels' labels (H, W, 3), blank where there are none."""
+    """Return the map in the colours of its voxels' labels (H, W, 3), blank in cells without a voxel."""
     return _colored(np.where(rows == EMPTY, EMPTY, label.astype(np.int64)[rows]), colors)
 
 
@@ -280,13 +280,13 @@ def scale_text(length: float) -> str:
 
 
 def locate(axes: Axes, located: Located, cells: tuple[int, ...], *, named: bool = True) -> None:
-    """Draw a bar of round length, an arrow to grid north where it is known, and coordinates along two edges.
+    """Draw a bar of round length, an arrow to grid north if it is known, and coordinates along two edges.
 
     Args:
         axes: The panel that shows the map.
         located: Where the map lies.
         cells: Its height and width in cells.
-        named: Whether the coordinates have their numbers; else they have ticks alone, as those of the panel beside it.
+        named: True if the coordinates have numbers; else they have ticks only, and the next panel has the numbers.
     """
     from matplotlib.patheffects import withStroke
 
@@ -321,7 +321,7 @@ def locate(axes: Axes, located: Located, cells: tuple[int, ...], *, named: bool 
 
 
 def _north(axes: Axes, degrees: float) -> None:
-    """Draw an arrow to north in the upper right corner, so many degrees clockwise from the top."""
+    """Draw an arrow to north in the upper right corner, by its angle in degrees clockwise from the top."""
     from matplotlib.patheffects import withStroke
 
     along = np.array([math.sin(math.radians(degrees)), math.cos(math.radians(degrees))])
@@ -371,7 +371,7 @@ class Views:
 # The differences of two maps, seen from above or from the side.
 
 SAME = "#dedede"
-"""The colour of voxels that did not change; the paper stays blank where there is no voxel."""
+"""The colour of voxels that did not change; the paper stays blank in cells without a voxel."""
 
 
 @dataclass(frozen=True)
@@ -431,7 +431,7 @@ def number_places(
     located: Located,
     cells: tuple[int, ...],
 ) -> None:
-    """Draw the numbers of places at their centres, in a picture of so many rows and columns of cells."""
+    """Draw the numbers of places at their centres, in a picture of `cells` (rows, columns)."""
     from matplotlib.patheffects import withStroke
 
     for number, centre, link in zip(numbers, centres, links, strict=True):

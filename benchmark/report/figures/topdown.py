@@ -22,7 +22,7 @@ LID, LIDDED = 0.4, 0.2
 share of its height, that have others below them at half of its height or more: a ceiling, or a shelf's board."""
 
 SLENDER = 2.0
-"""A map that is seen to be so many times as large from a side is shown from there: a wall, a facade."""
+"""A map is shown from a side if it covers SLENDER times the area there that it covers from above: a wall, a facade."""
 
 SPARSE = 16
 """The number of columns per voxel from which on sorting finds the columns that have voxels."""
@@ -40,7 +40,7 @@ def topmost(tiles: Iterable[VoxelTable], up: npt.ArrayLike) -> VoxelTable:
 
 
 def _tops(table: VoxelTable, up: npt.ArrayLike, factor: int) -> VoxelTable:
-    """Return the topmost voxel of each cell of so many voxels' width."""
+    """Return the topmost voxel of each cell, which is `factor` voxels wide."""
     right, ahead, up_axis = level_axes(up)
     cells = np.floor(table.centers @ np.stack([right, ahead], axis=1) / (factor * table.voxel_size)).astype(np.int64)
     order = np.lexsort([-(table.centers @ up_axis), cells[:, 1], cells[:, 0]])
@@ -101,7 +101,7 @@ class FromAbove:
     Attributes:
         table: These voxels alone.
         shown: (n,) mask of these voxels in the map.
-        rows: (H, W) the row of each cell's voxel in `table`, EMPTY where there is none.
+        rows: (H, W) the row of each cell's voxel in `table`, EMPTY for a cell without a voxel.
         cell: The edge of a cell in metres.
         view: The name of the view.
         whole: Width and height of all voxels that the view has, metres: the outermost ones are not in the picture.

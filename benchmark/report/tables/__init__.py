@@ -55,7 +55,7 @@ BUILDERS = (
 """The functions that make tables, in the paper's order; without numbers for its tables a function returns none."""
 
 OF_IMAGES = (flicker, video_measures, frames)
-"""Those of them that also have rows for videos, which have no map."""
+"""Functions of tables that also have rows for videos, which have no map."""
 
 WRITTEN = (
     "filters", "findings", "overview", "verdicts", "features", "scenes", "persistence", "classes", "class_agreement",

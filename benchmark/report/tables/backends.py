@@ -170,7 +170,7 @@ def _backend_agreement_row(row: Agreement, names: Iterable[str]) -> Row:
 
 
 def largest_share(voxels: int, confidence: float = CONFIDENCE) -> float:
-    """Return the largest share of wrong voxels of which, at this confidence, some would be among so many at random.
+    """Return the upper limit, at this confidence, of the share of wrong voxels if a sample of `voxels` holds none.
 
     With the share p all are right with probability (1 - p)^n: the upper end of Clopper and Pearson (1934) for none.
 

@@ -105,7 +105,7 @@ def _quadrants(result: Result) -> list[Table]:
 
 
 def _lost(take: Callable[[Losses], float | Estimate]) -> Number:
-    """Return a function that takes a number of geometry's part; NaN where that is not known."""
+    """Return a function that takes a number of geometry's part; NaN if geometry's part is unknown."""
     return lambda stats: math.nan if stats.geometry is None else take(stats.geometry)
 
 

@@ -40,7 +40,7 @@ def features(result: Result) -> list[Table]:
     caption = (
         "Alpha of features is 1 - (1 - cosine of two views at a spot) / (1 - cosine of any two observations): 1 is"
         " perfect, 0 is chance. Features of one network cannot be compared with those of another by the size of alpha."
-        f" If memory does not suffice, one in so many spots is kept. {INTERVALS}"
+        f" If memory does not suffice, a fraction of the spots is kept. {INTERVALS}"
     )
     return [Table("features", "Agreement of features", caption, columns, tuple(groups))]
 

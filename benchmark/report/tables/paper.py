@@ -25,7 +25,7 @@ STANDS_FOR = {"sim-flicker": OPEN, "sim-steady": CLOSED, "segearth-ov": OPEN, "s
 """The model of a study that stands for one of the paper's."""
 
 NEARLY = 1 / 3
-"""A change is little where it is less than so much of the one that it is held against."""
+"""A change is little if it is less than this fraction of the change that it is compared with."""
 
 Numbers = tuple[float, float, float, float]
 """Percent of the voxels, VSS, SBD in bits, normalised entropy."""
@@ -70,11 +70,11 @@ def paper(result: Result) -> list[Table]:
 
 @dataclass(frozen=True)
 class Finding:
-    """What the paper finds, by numbers of the paper and of the study in the same order.
+    """A finding of the paper, by numbers of the paper and of the study in the same order.
 
     Attributes:
         digits: Decimals in print.
-        holds: Whether the study's numbers show it, too; None where it has none of them.
+        holds: True if the study's numbers show it, too; None without such numbers in the study.
     """
 
     text: str
@@ -98,7 +98,7 @@ def falls(values: Sequence[float]) -> bool:
 
 
 def _finding(text: str, theirs: Sequence[float], ours: Sequence[float], digits: int) -> Finding:
-    """Return a finding that numbers fall, or rise, as those of the paper do."""
+    """Return a finding that numbers fall, or rise, as the paper's numbers do."""
     known = len(ours) == len(theirs) and not any(map(math.isnan, ours))
     shown = falls(ours) if falls(theirs) else falls([-value for value in ours])
     return Finding(text, theirs, ours, digits, shown if known else None)

@@ -56,7 +56,7 @@ def runs_table(results: Mapping[str, Result]) -> Table:
     """Return one row for each model and scene of each run, at its own settings."""
     caption = (
         "Each row is a model on a scene at the settings of its run; runs differ in what else varies, and only `compare`"
-        f" says whether two differ. VSS and SBD are means over voxels with OP >= 3, where there are {ENOUGH:,} or more."
+        f" says whether two differ. VSS and SBD are means over voxels with OP >= 3, if a map has {ENOUGH:,} or more."
         f" Brackets hold the interval of alpha at {CONFIDENCE:.0%}, that of the verdict; one for these frames alone"
         " says nothing of another flight, and looks surer than it is."
     )

@@ -225,7 +225,7 @@ def frames(result: Result) -> list[Table]:
     )
     caption = (
         "A frame stands alone at a place where the views that saw it next before and after agree on another class. It"
-        " is named where it does so more often than other frames do at the same places, beyond the spread of the frames"
+        " is named if it does so more often than other frames do at the same places, beyond the spread of the frames"
         f" (generalized extreme studentized deviate test, at {LEVEL:g}), and by {LEAST_EXCESS:.0%} of the places or"
         " more. Places are the sampled ones that the frame saw, as two other views did at least. Frames with fewer than"
         f" {LEAST_PLACES} places are not judged, and none is where fewer than {LEAST_JUDGED} frames can be."
@@ -341,7 +341,7 @@ def assessed_records(result: Result) -> dict[str, list[tuple[Record, MapStatisti
 
 
 def ordered(take: Callable[[DriftStatistics], float | Estimate]) -> Number:
-    """Return a function that takes a number of drift; NaN where too few locations give the drift of a random order."""
+    """Return a function that takes a number of drift; NaN if too few locations give the drift of a random order."""
     return lambda stats: take(stats.drift) if stats.order_known else math.nan
 
 

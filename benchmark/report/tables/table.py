@@ -22,7 +22,7 @@ UNDEFINED = "--"
 """The text of an undefined number in print; in JSON it is null, in CSV an empty field."""
 
 ALL_VOXELS, OF_ROW = "All voxels", "Of these voxels"
-"""What stands over the columns of measures whose population is all voxels, or the one that the row names."""
+"""Headings over columns of measures whose population is all voxels, or the population that the row names."""
 
 POPULATIONS = {ALL_VOXELS: "_all", OF_ROW: "", "OP>=2": "_op2", "OP>=3": "_op3"}
 """Headings over columns of measures, and the suffix that their keys have for it."""
@@ -61,7 +61,7 @@ class Column:
         return cls(key, title, digits, quantity.better, over=over)
 
     def number(self, value: float) -> str:
-        """Return the rounded number; UNDEFINED where there is none."""
+        """Return the rounded number; UNDEFINED for NaN."""
         if math.isnan(value):
             return UNDEFINED
         if self.scientific and value:
@@ -87,7 +87,7 @@ class Column:
 
 @dataclass(frozen=True)
 class Group:
-    """A group of rows under a name, with a last row that sums them up, where there is one."""
+    """A group of rows under a name, with or without a last row that sums them up."""
 
     name: str
     rows: tuple[Row, ...]
@@ -257,7 +257,7 @@ def to_json(table: Table) -> dict[str, Any]:
 
 
 def sections(table: Table) -> Iterator[tuple[str, list[list[str]]]]:
-    """Yield the rows between two rules: those of a group under its name, then its total.
+    """Yield the rows between two rules: the rows of a group under its name, then its total.
 
     A single group has no heading.
     """
@@ -324,7 +324,7 @@ def _width(table: Table) -> int:
 
 
 def _latex_headers(table: Table) -> list[str]:
-    """Return the headers, under a line of those that columns share, where there are any."""
+    """Return the headers, under a line of the headings that columns share, if any."""
     headers = " & ".join(_latex(f"{column.header} {ARROWS[column.better]}") for column in table.columns) + r" \\"
     if not any(column.over for column in table.columns):
         return [headers]

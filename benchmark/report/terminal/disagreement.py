@@ -85,7 +85,7 @@ def _class_shares(records: Sequence[Record]) -> dict[str, float]:
 
 
 def outlying_lines(records: Sequence[Record]) -> Iterator[str]:
-    """Yield the frames that stand out; of several maps only where there are some."""
+    """Yield the frames that stand out; of several maps, only the maps that have such frames."""
     for record in records:
         outlying = record.outlying_frames
         if outlying is None or (len(records) > 1 and not outlying.frames):

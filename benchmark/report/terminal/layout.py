@@ -41,7 +41,7 @@ def laid_out(rows: Sequence[Sequence[str]], width: int, texts: int = TEXTS) -> l
 
 
 def cut(name: str, size: int) -> str:
-    """Return a name without its middle where it is too long: names differ at their ends."""
+    """Return a name without its middle if it is too long: names differ at their ends."""
     if len(name) <= size:
         return name
     first = (size - 3) // 2
@@ -53,7 +53,7 @@ LONG_NAME = 16
 
 
 def common_beginning(names: Sequence[str]) -> str:
-    """Return the common beginning of the names of models, up to a space, '_' or '-'; '' where it is short."""
+    """Return the common beginning of the names of models, up to a space, '_' or '-'; '' if it is short."""
     same = itertools.takewhile(lambda letters: len({*letters}) == 1, zip(*names, strict=False))
     to_last_sign = re.match(r".*[ _-]", "".join(letters[0] for letters in same))
     begin = to_last_sign[0] if to_last_sign and len(names) > 1 else ""
@@ -80,7 +80,7 @@ def percent(share: float) -> str:
 
 
 def number(value: float, digits: int) -> str:
-    """Return a number with so many digits after its point; '-' where undefined."""
+    """Return a number with `digits` digits after its point; '-' if undefined."""
     return "-" if math.isnan(value) else f"{value:z.{digits}f}"
 
 

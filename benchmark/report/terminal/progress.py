@@ -17,7 +17,7 @@ from semstab.engine.units import Plan
 from semstab.task import Task
 
 SECONDS_A_LINE = 10.0
-"""The seconds between two lines of progress, where there is no terminal for a bar."""
+"""The seconds between two lines of progress, without a terminal for a bar."""
 
 
 class ProgressBar(Observer):
@@ -43,7 +43,7 @@ class ProgressBar(Observer):
         self.begin(sum(len(units[identity].task.indices) for identity in missing))
 
     def begin(self, frames: int) -> None:
-        """Show the bar, of so many frames."""
+        """Show the bar, which is full after `frames` frames."""
         self.bar.update(self.work, total=frames)
         if self.bar.console.is_interactive:
             self.bar.start()

@@ -58,7 +58,7 @@ def print_summary(
 def screen(
     result: Result, *, out: Path | None = None, seconds: float | None = None, width: int = WIDTH
 ) -> Iterator[str]:
-    """Yield the lines of a run or a study for a terminal of so many columns; sentences are wrapped at 80.
+    """Yield the lines of a run or a study for a terminal of `width` columns; sentences are wrapped at 80.
 
     They are verdicts, the classes that disagree most, warnings, the check, the time and the files to open.
     """

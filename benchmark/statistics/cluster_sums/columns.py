@@ -11,7 +11,7 @@ from typing import NamedTuple
 from semstab.metrics.correctness import BINS
 
 MOST_CLASSES = 64
-"""Sums by class are stored up to so many classes."""
+"""The largest number of classes for which sums by class are stored."""
 
 PLAIN = (
     "voxels", "psa", "observations", "agreeing", "own", "twice", "twice_agreeing", "recurrent", "vss", "entropy",
@@ -54,7 +54,7 @@ def layout(K: int, *, truth: bool, measured: tuple[str, ...] = (), meaning: bool
 
 
 def side_by_side(widths: Mapping[str, int]) -> Mapping[str, slice]:
-    """Return the columns by name of sums that have so many each."""
+    """Return the columns of each name, given the number of columns of each name."""
     ends = itertools.accumulate(widths.values())
     slices = {name: slice(end - width, end) for (name, width), end in zip(widths.items(), ends, strict=True)}
     return MappingProxyType(slices)

@@ -54,7 +54,7 @@ class Functional:
         pair_weight: Weight of an observation of these pairs in the first two sums.
         by_location: What a location adds is no frame's more than another's, so that frames do not show how much the
             number varies between flights: its intervals are for these frames (docs/validity.md).
-        k: The class whose columns are taken of sums by class; all of them where it is None.
+        k: The class whose columns are taken from sums by class; None for the columns of all classes.
     """
 
     names: tuple[str, ...]
@@ -70,7 +70,7 @@ class Functional:
 
     @property
     def of_space_alone(self) -> bool:
-        """Whether frames do not show how much it varies, so that its intervals are for these frames."""
+        """Return whether frames do not show how much the number varies, so that its intervals are for these frames."""
         return self.by_location or set(self.names) <= set(WITHOUT_FRAMES)
 
 
@@ -146,8 +146,8 @@ BY_CLASS: Mapping[str, Functional] = {
     "precision": Functional(("class_right", "class_predicted"), ratio_of),
     "iou": Functional(("class_right", "known", "class_known", "class_predicted"), iou_of),
 }
-"""Numbers of one class by key: alphas against all others, accuracy where it is the true one (recall) and where it is
-predicted (precision), and intersection over union."""
+"""Numbers of one class by key: alphas against all others, accuracy over its true voxels (recall) and over its
+predicted voxels (precision), and intersection over union."""
 
 
 def summed() -> tuple[Measure, ...]:
@@ -156,7 +156,7 @@ def summed() -> tuple[Measure, ...]:
 
 
 def mean_over_voxels(measure: Measure) -> Functional:
-    """Return the mean of a measure of the register over the voxels with OP >= 3 where it is defined."""
+    """Return the mean of a measure of the register over the voxels with OP >= 3 that have a value."""
     scale: Scale = "share" if measure.largest == 1 else "plain"
     return Functional(of_measure(measure.key), ratio_of, 0.0, measure.largest, scale, by_location=True)
 
@@ -202,7 +202,7 @@ def columns_of(part: ClusterSums, number: Functional) -> Float64:
 
 
 def value(sums: ClusterSums, key: str | Functional, k: int | None = None) -> float:
-    """Return the number; NaN where undefined."""
+    """Return the number; NaN if undefined."""
     number = functional(key, k)
     parts = parts_of(sums, number)
     if not parts:

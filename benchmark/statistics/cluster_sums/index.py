@@ -28,7 +28,7 @@ class ClusterIndex:
 
     Attributes:
         cubes: (G, 3) sorted, of an edge in metres; row (m,) the cube of each row.
-        frames: (F,) the groups of frames, sorted, of so many each on average (per_group, 0 where they are unknown).
+        frames: (F,) the groups of frames, sorted; per_group is their mean number of frames, 0 if frames are unknown.
         known: (r,) the rows that belong to a group, column (r,) that group.
     """
 
@@ -84,7 +84,7 @@ def count_distinct(rows: npt.NDArray[np.integer]) -> int:
 
 
 def _keys(rows: npt.NDArray[np.integer]) -> Int64 | None:
-    """Return a number for each row, in their order; None where 64 bits are too few."""
+    """Return a number for each row, in their order; None if 64 bits are too few."""
     low = [int(column.min(initial=0)) for column in rows.T]
     size = [int(column.max(initial=0)) - least + 1 for column, least in zip(rows.T, low, strict=True)]
     if math.prod(size) >= 2**63:

@@ -29,11 +29,11 @@ SCHEMA = 7
 
 @dataclass(frozen=True, eq=False)
 class ClusterSums:
-    """Sums by name, a row for each cube of space and group of frames; those of parts of a map add up to the map's.
+    """Sums by name, a row for each cube of space and group of frames; sums of parts of a map add up to the map's.
 
-    Those of a whole map are over the observations in voxels with OP >= 2, and have the `layout` of its classes; a
+    Sums of a whole map are over the observations in voxels with OP >= 2, and have the `layout` of its classes; a
     location counts 1 / T for each of its T frames in `voxels`, 1 in `observations`, and its pairwise agreement is
-    shared out among them in `psa` and `agreeing`. Those of any values of voxels have their own names and no frames.
+    shared out among them in `psa` and `agreeing`. Sums of any values of voxels have their own names and no frames.
 
     Attributes:
         cell: (m, 3) int32 cube: floor(voxel centre / edge), so that the cubes of all maps of a scene are the
@@ -42,8 +42,8 @@ class ClusterSums:
             for sums that belong to none (`WITHOUT_FRAMES`).
         columns: (m, C) float64.
         layout: The columns of each name.
-        edge: Metres, a power of 2; that of spots is their own, so that alpha and its interval are the same whatever the
-            voxels of the map.
+        edge: Metres, a power of 2; spots have another edge, so that alpha and its interval are the same for maps of any
+            voxel size.
         step: Frames of a group, a power of 2; 0 where they are unknown.
         voxel_size: Metres.
         fused: Number of frames that they come from.
@@ -98,7 +98,7 @@ class ClusterSums:
 
     @property
     def truth(self) -> bool:
-        """Whether sums of ground truth are included."""
+        """Return whether sums of ground truth are included."""
         return "known" in self.layout
 
     @functools.cached_property
@@ -267,7 +267,7 @@ class SumsMeta:
 
 
 def _joined(index: Int32, times: float) -> Int64:
-    """Return the larger cubes, or groups of frames, that join so many of these; -1 of frames stays."""
+    """Return the indices of larger cubes, or groups of frames, that join `times` of these; -1 for frames stays."""
     wide: Int64 = index.astype(np.int64) // round(min(times, 2.0**40))
     return wide
 

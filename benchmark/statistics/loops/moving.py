@@ -99,7 +99,7 @@ def blocks_of_points(u, v, w, stride, near, far):
 def block_of(point, i, T, camera, around, stride, shape):
     """Return the row and the column of the block that a point falls into, and its depth; -1 if it is outside.
 
-    `around` says that columns close a circle, as those of a scan, whose depth is the distance.
+    `around` is True if columns close a circle, as in a scan, whose depth is the distance.
     """
     fx, fy, cx, cy = camera
     rows, columns = shape

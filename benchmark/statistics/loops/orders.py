@@ -20,7 +20,7 @@ GOLDEN = np.uint64(0x9E3779B97F4A7C15)
 """The distance between successive states of splitmix64."""
 
 TURNS = 8
-"""A random order begins at so many observations, as far apart as possible, and goes round."""
+"""The number of observations at which random orders begin, as far apart as possible; each order goes round."""
 
 
 @intrinsic

@@ -61,7 +61,7 @@ def surface(grid, u, v, w, x, y, reach, around):
     """Return what points around (x, y) say of the surface there, by a plane through their inverse depth.
 
     reach is in pixels; around is True if the columns of the image close a circle. It returns the inverse depth, 0
-    where there is no plane; the root mean square of what the plane leaves over, relative; the number of the nearest
+    without a plane; the root mean square of what the plane leaves over, relative; the number of the nearest
     point, -1 without any; the squared distance to it in pixels; and the slopes of the plane in a pixel, relative.
     """
     rows, columns = grid.shape
