@@ -472,3 +472,8 @@ def test_a_scene_of_files_and_a_scene_without_have_hashes_of_geometry_alone(tmp_
     plain = semstab.datasets.Scene.fingerprints(scene, 0)
     assert [*plain] == ["depth of 0000", "pose of 0000"]
     assert plain["pose of 0000"] == found[0]["pose/0000.txt"]
+
+
+def test_images_with_depth_by_lidar_may_have_other_classes_in_voxels_than_at_spots() -> None:
+    assert load_benchmark("semantickitti-images@1").is_sparse
+    assert not load_benchmark("city@1").is_sparse

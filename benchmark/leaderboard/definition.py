@@ -46,6 +46,10 @@ IN_A_RUN = (
 """The settings of a run that a definition fixes, in addition to its dataset."""
 
 
+SPARSE = frozenset({"kitti360_images", "semantickitti_images"})
+"""Datasets whose images have depth at the points of a LiDAR alone."""
+
+
 class Benchmark(Settings):
     """A definition: with the same labels everybody gets the same numbers from it.
 
@@ -127,6 +131,7 @@ class Benchmark(Settings):
         content: dict[str, Any] = self.model_dump(mode="json", include={*IN_A_RUN})
         content |= {"name": self.id, "description": self.description, "dataset": self._dataset(data, labels)}
         content["benchmark"] = {"id": self.id, "digest": self.digest, "file": self.file}
+        content["truth"] = self.statistics
         if taxonomy is not None:
             own, given = self._classes, LabelSpace.load(taxonomy)
             if own != given.classes:
@@ -142,6 +147,11 @@ class Benchmark(Settings):
         if labels is not None and predictors:
             raise ConfigError("--labels and --predict: label maps are read or predicted; leave one out")
         return predicted_config(predictors, None, content) if predictors else load_config(content)
+
+    @property
+    def is_sparse(self) -> bool:
+        """Return whether its images have depth at the points of a LiDAR alone."""
+        return self.dataset.name in SPARSE
 
     def changed(self, config: Config) -> list[str]:
         """Return the settings of a run that are not those of the definition."""

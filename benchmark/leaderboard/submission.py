@@ -30,7 +30,7 @@ from semstab.engine.folder import load_result
 from semstab.errors import ConfigError, DataError
 from semstab.leaderboard.definition import Benchmark, load_benchmark
 from semstab.leaderboard.geometry import Spots
-from semstab.leaderboard.sums import checked
+from semstab.leaderboard.sums import LARGEST_SHIFT, SPARSE_SHIFT, checked
 from semstab.predict.dataset import NAME as PREDICTED
 
 SUFFIX = ".semstab"
@@ -172,7 +172,7 @@ def _checked(path: Path, benchmark: Benchmark, handle: RunHandle) -> dict[str, E
         entry = handle.scenes[scene]
         sums = checked(
             f"{path}: {scene}", entry.sums, benchmark.geometry[scene], truth=benchmark.statistics,
-            voxel_size=benchmark.voxel_size,
+            voxel_size=benchmark.voxel_size, shift=SPARSE_SHIFT if benchmark.is_sparse else LARGEST_SHIFT,
         )  # fmt: skip
         made[scene] = dataclasses.replace(entry, small=(sums, {}))
     return made
