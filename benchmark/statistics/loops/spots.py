@@ -26,6 +26,9 @@ PHASE = 25 / 64
 """Part of its edge by which coarse cells are moved from the origin, near the golden section, so that floors and walls
 of models do not lie in their faces; a multiple of the 64ths in which a log tells places, see `SpotObservations`."""
 
+MOST_PLACES = 1 << 16
+"""Most places that are looked at in a block of pixels: a pixel of damaged depth may show thousands of kilometres."""
+
 STEEPEST = 32.0
 """Largest area that a pixel shows, in those that it would show if the surface faced it."""
 
@@ -241,8 +244,8 @@ def area(here, along_x, along_y, x, y, fx, fy):
 
 @serial
 def number_of(expected, chance):
-    """Return how many places to look at if `expected` are expected, by a number from 0 to 1."""
-    return np.int64(np.floor(expected + chance))
+    """Return how many places to look at if `expected` are expected, by a number from 0 to 1; at most MOST_PLACES."""
+    return np.int64(min(np.floor(expected + chance), MOST_PLACES))
 
 
 @serial
