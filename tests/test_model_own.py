@@ -377,7 +377,9 @@ def test_from_the_command_line(file, tmp_path, monkeypatch):
     assert (done.exit_code, done.output.count("\n")) == (2, 1)
     assert "own.py: has no 'light'; did you mean 'bright'?" in done.output
     done = CliRunner().invoke(app, ["--classes", "a,b", "--data", scene])
-    assert done.output.startswith("error: --classes names the classes of a model that --predict chooses; name the classes of label maps")
+    assert done.output.startswith(
+        "error: --classes names the classes of a model that --predict chooses; name the classes of label maps"
+    )
 
 
 # --- The border -------------------------------------------------------------------------------------------------------

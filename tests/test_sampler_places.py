@@ -1,4 +1,4 @@
-"""Places that the sampler looks at: a damaged pixel that shows thousands of kilometres takes no more time than others."""
+"""Places that the sampler looks at: a damaged pixel that shows thousands of kilometres takes no more time."""
 
 from __future__ import annotations
 
