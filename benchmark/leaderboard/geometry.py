@@ -120,7 +120,7 @@ def few_rows(scenes: Mapping[str, Spots]) -> dict[str, Spots]:
 
 def _sampled(frames: Iterable[Frame], K: int) -> tuple[SpotObservations, int]:
     """Return the sample of what frames see, and how many frames there are."""
-    sampler, count = Sampler(K), 0
+    sampler, count = Sampler(K, moving=False), 0
     for frame in frames:
         sampler.add(frame)
         count += 1

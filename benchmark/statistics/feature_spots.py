@@ -115,10 +115,13 @@ class FeatureStore:
             column[: len(rows)] = column[: self._count][rows]
         self._count = len(rows)
 
-    def sample(self, spots: SpotObservations) -> FeatureObservations | None:
+    @property
+    def is_empty(self) -> bool:
+        """Return whether no frame had features."""
+        return not self._D
+
+    def sample(self, spots: SpotObservations) -> FeatureObservations:
         """Return a copy of the answers so far, whose spots and views a sample of the same frames has."""
-        if not self._D:
-            return None
         n, one_in = self._count, max(1, spots.share // self.share)
         answers = self._spot[:n].copy(), self._view[:n].copy(), self._vectors[:n].copy()
         return FeatureObservations.of(*answers, spots, one_in)

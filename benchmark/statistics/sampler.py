@@ -12,7 +12,7 @@ import functools
 import hashlib
 import math
 import zlib
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, TypeGuard
 
 import numpy as np
@@ -391,6 +391,10 @@ class Sampler:
 
     def sample(self, classes: tuple[str, ...] = (), distances: Float64 | None = None) -> SpotObservations:
         """Return a copy of the sample so far, without the pixels that are left out; distances are (K, K)."""
+        return replace(self._observed(), classes=classes, distances=distances, votes=self._votes())
+
+    def _observed(self) -> SpotObservations:
+        """Return a copy of the answers so far, without the votes of views."""
         counted = np.flatnonzero(self._columns["label"][: self._answers] <= self.K)
         answers: dict[str, Any] = {name: column[counted] for name, column in self._columns.items()}
         return SpotObservations(
@@ -401,10 +405,7 @@ class Sampler:
             spacing=self._edge if len(self._views) else 1.0,
             K=self.K,
             share=self._share,
-            classes=classes,
             frames=self._frames,
-            distances=distances,
-            votes=self._votes(),
         )
 
     def moving_pixels(self, votes: SpotVotes, frame: Frame) -> Mask:
@@ -427,7 +428,7 @@ class Sampler:
 
     def features(self) -> FeatureObservations | None:
         """Return a copy of the features of the sample so far; None without features."""
-        return self._features.sample(self.sample())
+        return None if self._features.is_empty else self._features.sample(self._observed())
 
 
 def _of_points(sparse: Sparse | None) -> TypeGuard[Sparse]:
