@@ -31,7 +31,6 @@ from semstab.statistics.cluster_sums import value
 from semstab.statistics.feature_spots import MOST_BYTES, FeatureObservations
 from semstab.statistics.features import alpha_of_features
 from semstab.statistics.sampler import BUDGET
-from semstab.statistics.votes import SpotVotes
 
 MOST_VOXELS = 2_000_000
 
@@ -287,7 +286,7 @@ class TemporalStability:
 
     def _new_map(self) -> _Map:
         backend = create(self.backend, voxel_size=self.voxel_size, num_classes=self.num_classes)
-        sampler = Sampler(self.num_classes) if self.alpha else None
+        sampler = Sampler(self.num_classes, moving=False) if self.alpha else None
         return _Map(backend, self.voxel_size, sampler, self.max_voxels)
 
     def _frames(
@@ -431,8 +430,7 @@ def _joined(a: SpotObservations, b: SpotObservations) -> SpotObservations:
     views = dataclasses.replace(views, frame=np.arange(len(views)))
     both = SpotObservations.stacked([a, later])
     point, drawn = np.concatenate([a.point, b.point]), np.concatenate([a.drawn, b.drawn])
-    votes = None if a.votes is None or b.votes is None else SpotVotes.joined([a.votes, b.votes])
     return dataclasses.replace(
         both, point=point, drawn=drawn, views=views, share=share, spacing=max(a.spacing, b.spacing),
-        frames=a.frames + b.frames, votes=votes,
+        frames=a.frames + b.frames,
     )  # fmt: skip

@@ -10,7 +10,7 @@ from __future__ import annotations
 import dataclasses
 import itertools
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -330,14 +330,6 @@ class SpotVotes:
     def take(self, rows: Any) -> SpotVotes:
         """Return the votes on some of the spots."""
         return dataclasses.replace(self, seen=self.seen[rows], hidden=self.hidden[rows], through=self.through[rows])
-
-    @classmethod
-    def joined(cls, parts: Sequence[SpotVotes]) -> SpotVotes:
-        """Return the votes of several parts, each on its own spots by its own views, one after the other."""
-        names = (*OF_SPOTS, "through_of_view", "misplaced")
-        columns: dict[str, Any] = {name: np.concatenate([getattr(part, name) for part in parts]) for name in names}
-        between = np.sum([part.between for part in parts], axis=0)
-        return cls(**columns, between=between, gap=max(part.gap for part in parts))
 
 
 def firm(
