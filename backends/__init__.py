@@ -32,28 +32,28 @@ REGISTRY = Registry(
     {
         "numpy": Entry(
             "semstab.backends.numpy_reference:NumpyReference",
-            "the reference: it stores every observation and computes each metric from its definition",
+            "the reference: each metric from its definition",
         ),
         "numba": Entry(
             "semstab.backends.numba_hash:NumbaHash",
-            "the fast one on a CPU: an open-addressing hash map in compiled parallel code",
+            "the fastest on a CPU: a hash map in compiled code",
             install="pip install semstab",
         ),
         "open3d": Entry(
             "semstab.backends.open3d_blocks:Open3DBlocks",
-            "Open3D VoxelBlockGrid with semantic attributes on hashed voxel blocks; CPU or CUDA",
+            "Open3D's VoxelBlockGrid with semantics; CPU or CUDA",
             install=WITH_OPEN3D,
             needs=("open3d",),
         ),
         "torch": Entry(
             "semstab.backends.torch_map:TorchMap",
-            "the fast one on an accelerator: a hash map on a CUDA device, fed from tensors; runs on a CPU too",
+            "the fastest on a CUDA device: a hash map of tensors",
             install="pip install 'semstab[torch]'",
             needs=("torch",),
         ),
         "open3d-projective": Entry(
             "semstab.backends.open3d_projective:Open3DProjective",
-            "voxels look up their pixel, as Open3D's integration does; to compare: differs from the others by design",
+            "voxels look up their pixel, as Open3D's integration",
             install=WITH_OPEN3D,
             needs=("open3d",),
         ),

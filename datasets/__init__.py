@@ -38,75 +38,69 @@ REGISTRY = Registry(
     {
         "predicted": Entry(
             "semstab.predict.dataset:PredictedDataset",
-            "another dataset with labels that models make while it is fused: `run --predict`",
+            "used by --predict: labels that a model makes",
         ),
         "vocabularies": Entry(
             "semstab.predict.vocabulary_dataset:VocabularyDataset",
-            "another dataset with labels that vocabularies give to its features: `run --vocabulary`",
+            "used by --vocabulary: labels from a model's features",
         ),
-        "frames": Entry("semstab.online.frames:Frames", "frames that a Python program gives to `semstab.fuse`"),
+        "frames": Entry("semstab.online.frames:Frames", "frames from a Python program, by semstab.fuse"),
         "city": Entry(
             "semstab.datasets.city:City",
-            "the built-in scene: a simulated UAV flight over a procedural city, with simulated models",
+            "built in: simulated drone flights over a made city",
         ),
         "posed_folder": Entry(
             "semstab.datasets.posed_folder:PosedFolder",
-            "folders depth/, pose/, labels/MODEL/ and intrinsics.txt, one file a frame",
+            "a folder of frames: depth/, pose/, labels/MODEL/",
         ),
         "uavid3d": Entry(
             "semstab.datasets.uavid3d:Uavid3d",
-            "UAVid-3D-Scenes: UAV scenes with metric depth; every path and format is an option",
+            "UAVid-3D-Scenes: drone scenes with metric depth",
         ),
         "scannet": Entry("semstab.datasets.scannet:ScanNet", "ScanNet as its SensReader exports it"),
-        "replica": Entry("semstab.datasets.replica:Replica", "Replica in the export of NICE-SLAM or Semantic-NeRF"),
-        "tum": Entry("semstab.datasets.tum:Tum", "TUM RGB-D: rgb.txt, depth.txt, groundtruth.txt by time stamp"),
+        "replica": Entry("semstab.datasets.replica:Replica", "Replica as NICE-SLAM or Semantic-NeRF export it"),
+        "tum": Entry("semstab.datasets.tum:Tum", "TUM RGB-D: rgb.txt, depth.txt, groundtruth.txt"),
         "seven_scenes": Entry("semstab.datasets.seven_scenes:SevenScenes", "7-Scenes: frame-NNNNNN.depth.png, ..."),
         "transforms_json": Entry(
             "semstab.datasets.transforms_json:TransformsJson",
-            "transforms.json of nerfstudio or instant-ngp, with depth maps",
+            "transforms.json of nerfstudio or instant-ngp, depth",
         ),
         "colmap": Entry("semstab.datasets.colmap:Colmap", "COLMAP models, text or binary, with depth maps"),
-        "odm": Entry("semstab.datasets.odm:Odm", "projects of OpenDroneMap and OpenSfM, depth from their mesh or DSM"),
-        "metashape": Entry(
-            "semstab.datasets.metashape:Metashape", "cameras of Agisoft Metashape (XML), depth from its mesh or DEM"
-        ),
-        "pix4d": Entry("semstab.datasets.pix4d:Pix4d", "cameras of Pix4Dmapper (params), depth from its mesh or DSM"),
+        "odm": Entry("semstab.datasets.odm:Odm", "OpenDroneMap and OpenSfM projects, with mesh or DSM"),
+        "metashape": Entry("semstab.datasets.metashape:Metashape", "Agisoft Metashape cameras (XML), with mesh or DEM"),
+        "pix4d": Entry("semstab.datasets.pix4d:Pix4d", "Pix4Dmapper cameras (params), with mesh or DSM"),
         "realitycapture": Entry(
             "semstab.datasets.realitycapture:RealityCapture",
-            "cameras of RealityCapture and RealityScan (CSV), depth from their mesh",
+            "RealityCapture, RealityScan cameras (CSV), with mesh",
         ),
-        "uavscenes": Entry(
-            "semstab.datasets.uavscenes:UavScenes", "UAVScenes: flights over four places, depth from their maps"
-        ),
+        "uavscenes": Entry("semstab.datasets.uavscenes:UavScenes", "UAVScenes: drone flights over four places"),
         "bag": Entry(
             "semstab.datasets.bag:Bag",
-            "ROS 1 and ROS 2 bags with colour, depth, camera info and poses",
+            "ROS bags with colour, depth, camera info and poses",
             "pip install 'semstab[bags]'",
             ("rosbags",),
         ),
         "bag_scans": Entry(
             "semstab.datasets.bag.scans:BagScans",
-            "ROS 1 and ROS 2 bags with clouds (PointCloud2) and poses: LiDAR scans",
+            "ROS bags with LiDAR clouds (PointCloud2) and poses",
             "pip install 'semstab[bags]'",
             ("rosbags",),
         ),
         "stray_scanner": Entry("semstab.datasets.stray_scanner:StrayScanner", "recordings of the app Stray Scanner"),
         "polycam": Entry("semstab.datasets.polycam:Polycam", "raw data of the app Polycam: keyframes/"),
         "record3d": Entry("semstab.datasets.record3d:Record3D", "EXR and JPG sequences of the app Record3D"),
-        "arkitscenes": Entry("semstab.datasets.arkitscenes:ArkitScenes", "ARKitScenes, raw data"),
+        "arkitscenes": Entry("semstab.datasets.arkitscenes:ArkitScenes", "ARKitScenes raw data"),
         "tartanair": Entry("semstab.datasets.tartanair:TartanAir", "TartanAir: simulated flights, NED poses"),
         "syndrone": Entry("semstab.datasets.syndrone:Syndrone", "Syndrone: flights simulated by CARLA"),
-        "carla": Entry("semstab.datasets.carla:Carla", "CARLA: images as its cameras save them, and KITTI-CARLA"),
-        "airsim": Entry("semstab.datasets.airsim:AirSim", "AirSim: its recordings, airsim_rec.txt and images/"),
+        "carla": Entry("semstab.datasets.carla:Carla", "CARLA camera images as it saves them, KITTI-CARLA"),
+        "airsim": Entry("semstab.datasets.airsim:AirSim", "AirSim recordings: airsim_rec.txt and images/"),
         "hypersim": Entry(
             "semstab.datasets.hypersim:Hypersim",
             "Hypersim: rendered rooms, classes of NYU40",
             "pip install 'semstab[midair]'",
             ("h5py",),
         ),
-        "habitat": Entry(
-            "semstab.datasets.habitat:Habitat", "walks that Habitat rendered: GT_Pose.txt, ids of instances"
-        ),
+        "habitat": Entry("semstab.datasets.habitat:Habitat", "walks that Habitat rendered, with GT_Pose.txt"),
         "virtual_kitti": Entry(
             "semstab.datasets.virtual_kitti:VirtualKitti", "Virtual KITTI 2: KITTI's sequences, rendered"
         ),
@@ -117,24 +111,24 @@ REGISTRY = Registry(
             ("h5py",),
         ),
         "semantickitti": Entry(
-            "semstab.datasets.semantickitti:SemanticKitti", "SemanticKITTI: LiDAR scans, a class a point"
+            "semstab.datasets.semantickitti:SemanticKitti", "SemanticKITTI: LiDAR scans with a class per point"
         ),
         "semantickitti_images": Entry(
             "semstab.datasets.semantickitti_images:SemanticKittiImages",
-            "SemanticKITTI: camera images, with depth and true classes of the LiDAR's points",
+            "SemanticKITTI: images, depth and classes by LiDAR",
         ),
-        "nuscenes": Entry("semstab.datasets.nuscenes:NuScenes", "nuScenes lidarseg: LiDAR key frames, a class a point"),
-        "kitti360": Entry("semstab.datasets.kitti360:Kitti360", "KITTI-360: velodyne scans of its raw data"),
+        "nuscenes": Entry("semstab.datasets.nuscenes:NuScenes", "nuScenes lidarseg: LiDAR key frames"),
+        "kitti360": Entry("semstab.datasets.kitti360:Kitti360", "KITTI-360: velodyne scans of the raw data"),
         "kitti360_images": Entry(
             "semstab.datasets.kitti360_images:Kitti360Images",
-            "KITTI-360: rectified camera images, with depth of the LiDAR's points",
+            "KITTI-360: rectified images, depth of LiDAR points",
         ),
         "points_folder": Entry(
             "semstab.datasets.points_folder:PointsFolder",
-            "folders points/ (LAS, LAZ, PLY, NPY), pose/ and labels/MODEL/, one file a scan",
+            "a folder of scans: points/, pose/, labels/MODEL/",
         ),
         "hololens": Entry("semstab.datasets.hololens:HoloLens", "DeepVideoMVS and HoloLens: poses.txt and K.txt"),
-        "video": Entry("semstab.datasets.video:Video", "images in a row without depth and poses: folders, video files"),
+        "video": Entry("semstab.datasets.video:Video", "images without depth and poses: a video or a folder"),
     },
 )
 

@@ -37,45 +37,41 @@ REGISTRY = Registry(
     {
         "colour-clusters": Entry(
             "semstab.models.colour_clusters:ColourClusters",
-            "k-means of colour and texture, one codebook a sequence: a baseline without weights",
+            "baseline without weights: k-means of colour, texture",
         ),
         "transformers": Entry(
             SEGMENTER,
-            "any transformers checkpoint that segments: SegFormer, UPerNet, Mask2Former, OneFormer, EoMT, CLIPSeg, ...",
+            "any segmentation checkpoint of transformers",
             install=WITH_SEGFORMER,
             needs=NETWORKS,
         ),
-        "segformer": Entry(SEGMENTER, "`transformers` by its first name", install=WITH_SEGFORMER, needs=NETWORKS),
-        "sam-raw": Entry(
-            SAM + "SamRaw", "Segment Anything's proposals as regions without classes", install=WITH_SAM, needs=NETWORKS
-        ),
+        "segformer": Entry(SEGMENTER, "the same as transformers", install=WITH_SEGFORMER, needs=NETWORKS),
+        "sam-raw": Entry(SAM + "SamRaw", "Segment Anything; regions without classes", install=WITH_SAM, needs=NETWORKS),
         "sam-heuristic": Entry(
             SAM + "SamHeuristic",
-            "Segment Anything's proposals with classes from rules on colour, size and shape",
+            "Segment Anything; classes by rules on colour, size",
             install=WITH_SAM,
             needs=NETWORKS,
         ),
         "sam-vote": Entry(
             SAM + "SamVote",
-            "another model's labels, by majority inside Segment Anything's proposals",
+            "another model's labels, by majority in SAM's regions",
             install=WITH_SAM,
             needs=NETWORKS,
         ),
         "segearth-ov": Entry(
             "semstab.models.segearth_ov:SegEarthOV",
-            "SegEarth-OV: CLIP as an open-vocabulary segmenter, for views from above, without training",
+            "SegEarth-OV: open-vocabulary CLIP for aerial views",
             install="pip install 'semstab[segearth]'",
             needs=NETWORKS,
         ),
         "smp": Entry(
             "semstab.models.smp:SmpNetwork",
-            "a network of segmentation_models_pytorch by the names of its architecture and encoder (timm's too)",
+            "networks of segmentation_models_pytorch, by name",
             install="pip install 'semstab[smp]'",
             needs=("torch", "segmentation_models_pytorch"),
         ),
-        "stored": Entry(
-            "semstab.predict.predictor:Stored", "labels that a scene has already, for --filter: --set source=NAME"
-        ),
+        "stored": Entry("semstab.predict.predictor:Stored", "labels that the scene has already, for --filter"),
     },
 )
 

@@ -67,16 +67,23 @@ def test_stored_labels_that_predictions_stand_for_are_named(tmp_path) -> None:
 
 def test_list_names_what_there_is(tmp_path) -> None:
     text = bench("list", cwd=tmp_path, columns=200).stdout
-    assert {"open3d", "numpy", "city", "posed_folder", "uavid7", "ready"} <= set(text.split())
-    studies = [line.split() for line in text.splitlines() if line.split()[:1] == ["study"]]
-    assert [row[2] for row in studies] == ["filters", "ladder", "paper", "rules", "uavid3d"]
+    assert {"open3d", "numpy", "city", "posed_folder", "uavid7"} <= set(text.split())
+    names = [line.split()[0] for line in bench("list", "studies", cwd=tmp_path).stdout.splitlines()[1:]]
+    assert names == ["filters", "ladder", "paper", "rules", "uavid3d"]
+
+
+def test_list_fits_80_columns_and_cuts_no_dataset(tmp_path) -> None:
+    lines = bench("list", cwd=tmp_path, columns=80).stdout.splitlines()
+    assert max(map(len, lines)) <= 80
+    of_datasets = bench("list", "datasets", cwd=tmp_path, columns=80).stdout
+    assert "..." not in of_datasets.replace(".depth.png, ...", "")
 
 
 def test_a_run_on_a_folder(wall, tmp_path) -> None:
     arguments = ("--backend", "open3d", "--data", wall, "--model", "a", "--voxel-size", "0.25", "--out", "run")
     text = bench(*arguments, cwd=tmp_path, report=True, recording=True).stdout
     for words in (
-        "wall", "no verdict", "checked open3d against numpy on", "semstab-bench view run", "semstab-bench show run",
+        "wall", "no verdict", "fusion by open3d equals numpy in", "semstab-bench view run", "semstab-bench show run",
         "report  run/report.html",
     ):  # fmt: skip
         assert words in text

@@ -20,4 +20,4 @@ def test_the_built_in_city_from_the_command_line(tmp_path) -> None:
     assert len(summary["agreement"]) == len(units)
     assert all(row["agrees"] and row["only_in"] == [0, 0] for row in summary["agreement"])
     assert {run["K"] for run in summary["runs"]} == {7}
-    assert "seen once" in result.stdout
+    assert "seen in one frame only" in result.stdout

@@ -294,9 +294,9 @@ def run(folder: Path, *words: str, code: int = 0):
 def test_rules_stand_side_by_side(folder) -> None:
     said = " ".join(run(folder, "--rule", "mean", "--rule", "bayes", "--rule", "own.py:sharp").stdout.split())
     for rule in ("bayes", "sharp"):
-        assert re.search(rf"checked numba\+{rule} against numpy on \d+ voxels drawn at random, 1 in 16: equal", said)
+        assert re.search(rf"fusion by numba\+{rule} equals numpy in \d+ voxels of a random sample \(1 in 16\)", said)
         assert f"numba+{rule} differs from numba by design" in said
-    assert "numba+bayes, numba+sharp: evidence by this rule does not count frames" in said
+    assert "numba+bayes, numba+sharp: this rule does not count frames" in said
     result = load_result(folder / "out")
     assert [row.backends for row in result.compared] == [("numba", "numba+bayes"), ("numba", "numba+sharp")]
     mean, bayes = (result.record(backend=name).table() for name in ("numba", "numba+bayes"))
@@ -319,12 +319,12 @@ def test_rules_stand_side_by_side(folder) -> None:
 
 def test_a_rule_alone_is_checked_by_the_reference_with_that_rule(folder) -> None:
     said = run(folder, "--rule", "recent", "--check", "numpy").stdout
-    assert "checked numba+recent against numpy+recent on 60 voxels: equal" in " ".join(said.split())
+    assert "fusion by numba+recent equals numpy+recent in all 60 voxels" in " ".join(said.split())
 
 
 def test_a_backend_of_one_method_fuses_by_any_rule(folder) -> None:
     said = run(folder, "--backend", "own.py:Mine", "--rule", "votes", "--check", "numpy").stdout
-    assert "checked Mine+votes against numpy+votes on all 60 voxels: equal" in " ".join(said.split())
+    assert "fusion by Mine+votes equals numpy+votes in all 60 voxels" in " ".join(said.split())
 
 
 def test_settings_name_rules_with_options(folder) -> None:

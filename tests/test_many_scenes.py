@@ -53,7 +53,7 @@ def test_a_model_that_truth_refutes_is_named_once_for_all_scenes(result):
 
     records = [misleading(r) if r.unit.model == "random" and r.unit.scene < "scene03" else r for r in result.records]
     text = " ".join(" ".join(screen(dataclasses.replace(result, records=tuple(records)))).split())
-    assert "random: MISLEADING in 3 of 11 scenes, 57 % of the consistent locations are wrong" in text
+    assert "random: MISLEADING in 3 of 11 scenes, 57 % of the voxels whose frames agree have a wrong class" in text
 
 
 def test_the_interval_over_scenes_is_students():

@@ -122,8 +122,8 @@ def test_the_screen_has_the_numbers_of_the_record(run):
     for record in result.select():
         numbers = numbers_of(record)
         if len(result.models) == 1:
-            (paper,) = (line for line in lines if "paper (OP>=3)" in line)
-            found = re.search(r"VSS (\S+)\s+SBD (\S+)", paper)
+            (paper,) = (line for line in lines if "in 3 frames or more: " in line)
+            found = re.search(r"VSS (\S+), SBD (\S+)", paper)
             shown = dict(zip(("VSS (OP>=3)", "SBD (OP>=3)"), found.groups(), strict=True))
             text = " ".join(" ".join(lines).split())
             if (static := record.statistics.static) is None:

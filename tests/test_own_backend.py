@@ -46,7 +46,7 @@ def run(folder: Path, *words: str, code: int = 0):
 
 def test_it_is_called_by_the_name_of_its_class_and_checked(folder) -> None:
     said = run(folder, "--backend", "fusion.py:Mine", "--check", "numpy").stdout
-    assert "checked Mine against numpy on all 60 voxels: equal" in said
+    assert "fusion by Mine equals numpy in all 60 voxels" in said
     assert load_result(folder / "out").backend == "Mine"
 
 
@@ -63,7 +63,7 @@ def test_all_voxels_are_compared_where_that_takes_less_than_the_fusion(folder) -
     """Its sample would be 1 in 16 of them."""
     (folder / "fusion.py").write_text(ALIKE + SLEEPS, encoding="utf-8")
     said = " ".join(run(folder, "--backend", "fusion.py:Mine").stdout.split())
-    assert "checked Mine against numpy on all 60 voxels: equal" in said
+    assert "fusion by Mine equals numpy in all 60 voxels" in said
 
 
 def test_a_single_wrong_voxel_is_found_without_naming_a_check(folder) -> None:
@@ -85,7 +85,9 @@ def test_a_fast_one_is_checked_on_a_sample_with_its_bound(folder, monkeypatch) -
     """The screen says how many wrong voxels the sample may have missed: of n at random none is wrong."""
     monkeypatch.setattr("semstab.backends.numpy_reference.MOST_OF_ALL", 30)
     said = " ".join(run(folder, "--backend", "fusion.py:Mine").stdout.split())
-    found = re.search(r"numpy on (\d+) voxels drawn at random, 1 in \d+: equal; at most ([\d.]+) % of all voxels", said)
+    found = re.search(
+        r"numpy in (\d+) voxels of a random sample \(1 in \d+\); with 95% confidence at most ([\d.]+) % of all", said
+    )
     assert found, said
     n, percent = int(found[1]), float(found[2])
     assert 0 < n <= 30

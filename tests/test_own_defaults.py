@@ -51,8 +51,8 @@ def test_they_lie_in_the_folder_of_configurations_and_are_listed(folder, monkeyp
     assert own_defaults() is None
     own.write_text("voxel_size: 0.3\n")
     said = bench("list", cwd=folder, columns=400, SEMSTAB_CONFIG=str(own)).stdout
-    assert said.endswith(f"your settings, without --config: {own}\n  voxel_size: 0.3\n")
-    assert "you have no settings" in bench("list", cwd=folder, columns=400).stdout
+    assert said.endswith(f"settings used without --config: {own}\n  voxel_size: 0.3\n")
+    assert "no settings in" in bench("list", cwd=folder, columns=400).stdout
 
 
 def test_a_wrong_one_is_named_by_its_file(folder) -> None:

@@ -610,8 +610,8 @@ def test_time_in_the_network_stands_apart_from_reading(scene, tmp_path):
     assert 290 < summary.stages_ms["network"] < 1000
     assert seconds["network"] > 0.1 * frames
     assert seconds["network"] > 2 * seconds["read"]
-    (line,) = [line for line in screen(result, seconds=9.0) if line.startswith("  predicted: ")]
-    assert re.fullmatch(r"  predicted: slow [1-3](\.\d+)? frames/s", line), line
+    (line,) = [line for line in screen(result, seconds=9.0) if line.startswith("  speed of prediction: ")]
+    assert re.fullmatch(r"  speed of prediction: slow [1-3](\.\d+)? frames/s", line), line
 
 
 @pytest.mark.parametrize(

@@ -57,13 +57,13 @@ def test_own_data_is_checked_on_a_sample_of_the_voxels(tmp_path) -> None:
         assert row.agrees
         assert (row.backends, row.one_in) == (("numba", "numpy"), 16)
         assert 0 < row.voxels[0] == row.voxels[1] < result.select()[0].summary.table.voxels / 4
-    assert "checked numba against numpy on" in printed(result)
+    assert "fusion by numba equals numpy in" in printed(result)
     longest = {"seconds": {"reference": 3.6, "statistics": 5.1, "keep": 0.4, "all": 9.0}}
     timed = dataclasses.replace(result, manifest=result.manifest | longest)
-    assert "9 s (longest stages: statistics 5, check of the backend 4)" in printed(timed, seconds=9.2)
+    assert "9 s (longest: statistics 5 s, check of the fusion 4 s)" in printed(timed, seconds=9.2)
     elsewhere = {"units": {"executor": "2 local processes"}}
     timed = dataclasses.replace(timed, manifest=timed.manifest | elsewhere)
-    assert "9 s (longest stages, all workers: statistics 5, check of the backend 4)" in printed(timed, seconds=9.2)
+    assert "9 s (longest, sums of all workers: statistics 5 s, check of the fusion 4 s)" in printed(timed, seconds=9.2)
     assert semstab.run(config, out=tmp_path / "run", report=False).manifest["units"]["kept"] == 2
 
 

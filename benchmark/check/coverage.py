@@ -171,8 +171,8 @@ class Coverage:
     """The share of a scene that the views of a sample have in common under the configured convention."""
 
     reasons = (
-        "{:.0%} of the points stay in such a voxel when another frame sees them",
-        "successive frames share {:.0%} of their view",
+        "another frame puts {:.0%} of the points into the same voxel",
+        "a frame and the next share {:.0%} of their view",
     )
 
     def __init__(self, sample: Sample) -> None:

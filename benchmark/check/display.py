@@ -19,7 +19,7 @@ from semstab.data.labels import IGNORE_16BIT
 STATES = {"sound": "green", "imprecise": "yellow", "unsound": "bold red", "unclear": "yellow"}
 NOTHING = "-"
 OF_IMAGES = "predict them (--predict), or put the label maps of a model into its folder"
-OF_SCANS = "put the labels of a model into predictions/MODEL (docs/tutorials/scans.md), or check the truth, --model gt"
+OF_SCANS = "put the labels of a model into predictions/MODEL (docs/tutorials/scans.md), or check the truth: --model gt"
 """Advice for a scene without labels."""
 
 MOST_UNKNOWN = 4
@@ -38,7 +38,7 @@ def print_check(checked: SceneCheck, console: Console, *, verbose: bool = False)
     console.print()
     say(f"  {state.upper()}  {_conclusion(checked)}", 4, STATES[state])
     if not checked.labels:
-        which = "of no model but the truth" if _of_truth(checked) else "none"
+        which = "only ground truth" if _of_truth(checked) else "none"
         say(f"  labels   {which}: {OF_SCANS if checked.of_scans else OF_IMAGES}", 11)
     for text in checked.problems_of_labels:
         say(f"  LABELS  {text}", 4, STATES["unsound"])
@@ -100,7 +100,7 @@ def _of_truth(checked: SceneCheck) -> bool:
 
 
 def _convention_table(checked: SceneCheck) -> Table:
-    table = _table(("read",), ("error\n%", "co-visible\n%", "points"))
+    table = _table(("depth and poses read",), ("error\n%", "co-visible\n%", "points"))
     for name, fit in checked.verdict.fits:
         table.add_row(escape(name), _percent(fit.error, 2), _percent(fit.share, 1), f"{fit.points:,}")
     return table
@@ -160,29 +160,29 @@ def _advice(checked: SceneCheck, *, verbose: bool) -> Iterator[str]:
     if verbose and checked.persistence and checked.fused_frames < checked.selected:
         times = checked.selected / checked.fused_frames
         yield (
-            f"OP       is that of {checked.fused_frames} frames (at most {FUSED_FRAMES} are fused here); all"
-            f" {checked.selected} see a voxel about {times:.2g} times as often"
+            f"OP       is counted over {checked.fused_frames} frames (at most {FUSED_FRAMES} are fused here); all"
+            f" {checked.selected} frames see a voxel about {times:.2g} times as often"
         )
     if checked.noise is not None and checked.of_scans:
         between, within, apart = map(_metres, (checked.noise.between, checked.noise.within, checked.noise.footprint))
         yield (
-            f"points   lie {between} from the nearest of another scan, {within} from that of their own; rays are"
-            f" {apart} apart"
+            f"noise    points lie {between} from the nearest point of another scan, {within} from the nearest point"
+            f" of their own scan; rays are {apart} apart"
         )
     elif checked.noise is not None:
         yield (
-            f"depth    errs by {_metres(checked.noise.between)} between frames, by {_metres(checked.noise.within)}"
-            f" within one; a pixel covers {_metres(checked.noise.footprint)}"
+            f"noise    depth differs by {_metres(checked.noise.between)} between frames, and by"
+            f" {_metres(checked.noise.within)} within a frame; a pixel covers {_metres(checked.noise.footprint)}"
         )
     suggestion = checked.suggestion
     if suggestion is None:
         return
     if suggestion.voxel_size is not None:
-        yield f"voxels   --voxel-size {suggestion.voxel_size:g}: {suggestion.voxel_size_reason}"
+        yield f"voxels   use --voxel-size {suggestion.voxel_size:g}: {suggestion.voxel_size_reason}"
         if verbose and not checked.of_scans:
-            yield f"pixels   --pixel-stride {suggestion.pixel_stride}: {suggestion.pixel_stride_reason}"
+            yield f"pixels   use --pixel-stride {suggestion.pixel_stride}: {suggestion.pixel_stride_reason}"
     stride = suggestion.frame_stride
-    yield f"frames   {f'--frames ::{stride}' if stride > 1 else 'all'}: {suggestion.frame_stride_reason}"
+    yield f"frames   use {f'--frames ::{stride}' if stride > 1 else 'all'}: {suggestion.frame_stride_reason}"
 
 
 def _conclusion(checked: SceneCheck) -> str:

@@ -65,7 +65,7 @@ class ScanSample:
     """
 
     reasons = (
-        "{:.0%} of the points have the nearest one of another scan in the same voxel",
+        "another scan puts {:.0%} of the points into the same voxel",
         "{:.0%} of a scan's points lie on the surfaces of the next one",
     )
 

@@ -168,19 +168,28 @@ def _kind(text: str | None) -> str | None:
     return KINDS[text]
 
 
+NAME_COLUMNS = 22
+"""Columns of the names that `list` prints."""
+
+
+def _entry(name: str, text: str, width: int) -> str:
+    """Return the line of an entry: its name, and its description, cut to fit the terminal."""
+    room = width - NAME_COLUMNS - 4
+    return f"  {name:<{NAME_COLUMNS}}  {text if len(text) <= room else f'{text[: room - 3].rstrip()}...'}"
+
+
 def list_(
     kind: Annotated[
         str | None, typer.Argument(metavar="KIND", help="Only backends, datasets, models, filters, taxonomies, ...")
     ] = None,
     check: Annotated[bool, typer.Option("--check", help="Also load each one, which takes seconds.")] = False,
 ) -> None:
-    """List backends, datasets, models, filters, taxonomies, studies and benchmarks, with 'ready' or what is missing.
+    """List backends, datasets, models, filters, taxonomies, studies and benchmarks, or one kind of them.
 
-    Your own settings, in ~/.config/semstab/config.yaml, follow.
+    Packages that an entry needs and that are missing are named. The user's settings, in
+    ~/.config/semstab/config.yaml, follow.
     """
     import yaml
-    from rich.markup import escape
-    from rich.table import Table
 
     from semstab import backends, datasets, models
     from semstab.config import read_yaml
@@ -190,32 +199,36 @@ def list_(
     from semstab.errors import MissingDependencyError
     from semstab.predict import filters
 
-    table = Table(show_edge=False)
-    for name in ("kind", "name", "", "description"):
-        table.add_column(name)
-    wanted = _kind(kind)
+    sections: dict[str, dict[str, str]] = {}
     for registry in (backends.REGISTRY, datasets.REGISTRY, models.REGISTRY, filters.REGISTRY):
-        for name, entry in sorted(registry.entries().items()) if wanted in (None, registry.kind) else ():
+        described = sections[registry.kind] = {}
+        for name, entry in sorted(registry.entries().items()):
             missing = registry.missing(name)
             if check and not missing:
                 try:
                     registry.load(name)
                 except MissingDependencyError as error:
                     missing = str(error)
-            ready = f"[yellow]{escape(missing)}" if missing else "[green]ready"
-            table.add_row(registry.kind, name, ready, escape(entry.summary))
-    for name in shipped_taxonomies() if wanted in (None, "taxonomy") else ():
-        space = LabelSpace.load(name)
-        table.add_row("taxonomy", name, "[green]ready", f"K = {len(space)}: {', '.join(space.classes)}")
-    for name in shipped_studies() if wanted in (None, "study") else ():
-        table.add_row("study", name, "[green]ready", load_study(name).description)
-    for name, file in shipped_benchmarks().items() if wanted in (None, "benchmark") else ():
-        table.add_row("benchmark", name, "[green]ready", read_yaml(file)["description"])
+            described[name] = f"not installed: {missing.rpartition('; ')[2]}" if missing else entry.summary
+    taxonomies = {name: LabelSpace.load(name) for name in shipped_taxonomies()}
+    sections["taxonomy"] = {
+        name: f"{len(space)} classes: {', '.join(space.classes)}" for name, space in taxonomies.items()
+    }
+    sections["study"] = {name: load_study(name).description for name in shipped_studies()}
+    sections["benchmark"] = {name: read_yaml(file)["description"] for name, file in shipped_benchmarks().items()}
+    wanted = _kind(kind)
+    plural = {one: several for several, one in KINDS.items()}
     console = Console()
-    console.print(table)
+    for one, described in sections.items():
+        if wanted in (None, one):
+            print_lines([f"{plural[one]} ({len(described)})"])
+            print_lines(_entry(name, text, console.width) for name, text in described.items())
+            print_lines([""] if wanted is None else [])
+    if wanted is not None:
+        return
     if (own := own_defaults()) is None:
-        console.print("you have no settings in ~/.config/semstab/config.yaml, or SEMSTAB_CONFIG", markup=False)
+        print_lines(["no settings in ~/.config/semstab/config.yaml or SEMSTAB_CONFIG"])
     else:
-        console.print(f"your settings, without --config: {own}", markup=False)
+        print_lines([f"settings used without --config: {own}"])
         content = yaml.safe_dump(read_yaml(own), sort_keys=False, allow_unicode=True)
         print_lines(f"  {line}" for line in content.splitlines())

@@ -101,7 +101,7 @@ def _wrapped(line: str, width: int, indent: int) -> list[str]:
 
 
 def _ends(result: GateResult) -> str:
-    return f"either end of an interval is missed in {100 * result.level:g} % of cases"
+    return f"each end of an interval holds with {100 * (1 - result.level):g} % confidence"
 
 
 def _scenes(result: GateResult) -> str:

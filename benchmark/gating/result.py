@@ -113,12 +113,13 @@ class Judgement:
         if self.counted:
             return "counted"
         if self.verdict == "passes":
-            return "shown"
+            return "the whole interval is within the limit"
         if self.verdict == "fails":
-            bounded = self.rule.bounds_a_loss and self.interval.low <= self.rule.limit
-            return "a loss is shown, but not that it is within the limit" if bounded else "the contrary is shown"
+            if self.rule.bounds_a_loss and self.interval.low <= self.rule.limit:
+                return "there is a loss, and it may exceed the limit"
+            return "the whole interval is beyond the limit"
         more = "locations" if self.interval.scope == THESE_FRAMES else "frames"
-        return self.interval.undecided or f"neither is shown; more {more} may decide"
+        return self.interval.undecided or f"the limit is in the interval; more {more} may decide"
 
     def digits(self, value: float) -> str:
         """Return a number of the rule's measure."""

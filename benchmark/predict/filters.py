@@ -30,16 +30,16 @@ REGISTRY = Registry(
     {
         "ema": Entry(
             "semstab.predict.filters:Ema",
-            "KEEP: average at the pixel; KEEP is the share of the previous belief",
+            "KEEP: running mean of a pixel; KEEP weighs its past",
         ),
         "ema-warped": Entry(
             "semstab.predict.filters:EmaWarped",
-            "KEEP: average at the surface point, by depth and pose",
+            "KEEP: running mean of a surface point, by its pose",
         ),
         "vote": Entry("semstab.predict.filters:Vote", "N: majority of the pixel's last N labels"),
         "guided": Entry(
             "semstab.predict.filters:Guided",
-            "PIXELS: guided filter: borders follow those of the image",
+            "PIXELS: guided filter; borders follow the image",
         ),
     },
 )

@@ -73,8 +73,8 @@ def warnings(result: Result) -> Iterator[str]:
     once = seen_once / max(1, sum(run.table.voxels for run in runs))
     if once >= MOSTLY_ONCE:
         yield (
-            f"{once:.0%} of the voxels were seen once and look consistent for that reason; larger voxels or more"
-            " overlap help: --voxel-size"
+            f"{once:.0%} of the voxels were seen in one frame only, and look stable for that reason; larger voxels"
+            " (--voxel-size) or more overlap help"
         )
     yield from dict.fromkeys(text for scene, advice in result.advice.items() if (text := _size(scene, advice, result)))
     stable = [record for record in result.select() if _is_untested(record)]
@@ -83,7 +83,10 @@ def warnings(result: Result) -> Iterator[str]:
         yield f"stable means that frames of {names} agree, not that they are right: no ground truth was compared"
     yield from _not_counting_frames(result)
     if mixed(runs):
-        yield "VSS, entropy and voxel alpha do not compare labels with soft scores: semstab-bench show RUN reduced"
+        yield (
+            "VSS, entropy and voxel alpha of labels and of soft scores cannot be compared; with scores reduced to"
+            " labels: semstab-bench show RUN reduced"
+        )
     for record in result.select():
         yield from (f"{_name(record.summary, result)}: {text}" for text in (*_suspicions(record), *_traffic(record)))
     yield from _one_class_covers(runs)
@@ -97,8 +100,8 @@ def _not_counting_frames(result: Result) -> Iterator[str]:
     names = [name for name, found in known if found.repeated.voxels and math.isnan(found.agreement.psa_op2.value)]
     if names:
         yield (
-            f"{', '.join(dict.fromkeys(names))}: evidence by this rule does not count frames, so that PSA, voxel alpha,"
-            " consistent locations and the null of SBD are not known; VSS, SBD, entropy, margin, labels and OP are"
+            f"{', '.join(dict.fromkeys(names))}: this rule does not count frames, so that PSA, voxel alpha, consistent"
+            " locations and the null of SBD are unknown"
         )
 
 
@@ -118,7 +121,7 @@ def _one_class_covers(runs: Sequence[UnitSummary]) -> Iterator[str]:
         if least >= NOTHING_ELSE:
             yield f"{covers}; what is left without it is too little to assess: take another model, or another scene"
         else:
-            yield f"{covers}; read them by class, or leave it out: {_excluding(name)}"
+            yield f"{covers}; read the numbers by class, or leave it out: {_excluding(name)}"
 
 
 NOTHING_ELSE = 0.99

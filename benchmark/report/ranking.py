@@ -45,8 +45,8 @@ def answers(result: Result) -> Iterator[str]:
         ranks = "; ".join(f"{rank}. {', '.join(names)}" for rank, names in ranked.ranks)
         yield f"most stable first: {ranks}"
         yield (
-            "ranks are by alpha of the observations that all models made; a rank is 1 plus the number of models shown"
-            f" to be more stable (Holm over {len(ranked.differences)} pairs)"
+            "rank: 1 plus the number of models with a significantly higher alpha (Holm over"
+            f" {len(ranked.differences)} pairs), where all models have a label"
         )
     for each in (each for each in ranked.differences if each.silent):
         better, worse = (each.model, each.other) if each.value > 0 else (each.other, each.model)
@@ -116,8 +116,8 @@ def contradictions(result: Result, ranked: Ranking) -> Iterator[str]:
     more = "; ".join(f"{first} above {second}" for first, second, _ in opposed[1:4])
     rest = f"; so it is for {more}{', ...' if len(opposed) > 4 else ''}" if more else ""
     yield (
-        f"the measures do not agree on this order: alpha is higher for {better}, but {listed}"
-        f" {'are' if others else 'is'} better for {worse}{rest}; look at the classes before you choose"
+        f"measures disagree: alpha is better for {better}, but {listed}"
+        f" {'are' if others else 'is'} better for {worse}{rest}; compare the classes before you choose"
     )
 
 

@@ -35,10 +35,10 @@ IN_CLASSES = (ALPHA, PSA, RECALL, IOU)
 """Measures that the table of classes shows side by side."""
 
 ANSWERS = (
-    f"Brackets hold intervals at {CONFIDENCE:.0%}, for this scene flown again if it has {LEAST_FRAMES} frames or"
-    " more, else for these frames, that is, for other locations in the same frames. p (Holm) is the p-value of no"
-    " difference: of alpha corrected for the runs that are compared, of what describes for all of it in the scene, or"
-    " over all scenes."
+    f"Brackets hold {CONFIDENCE:.0%} intervals, for this scene flown again if it has {LEAST_FRAMES} frames or more,"
+    " else for these frames, that is, for other locations in the same frames. p (Holm) is the p-value of no difference."
+    " For alpha it is corrected for the number of runs, for all other measures for their number in the scene or over all"
+    " scenes."
 )
 
 
@@ -61,7 +61,7 @@ def scopes(comparison: RunComparison) -> Iterator[tuple[str, Against]]:
 
 def heading(comparison: RunComparison, scope: str, against: Against) -> str:
     """Return the heading of a run's differences."""
-    return f"{scope}: {against.other} less {comparison.base}"
+    return f"{scope}: {against.other} minus {comparison.base}"
 
 
 def scope(row: Contrast) -> str:
@@ -83,10 +83,10 @@ def _differences(comparison: RunComparison) -> Table:
     )
     macro = " Over all scenes each scene with an interval counts once." if len(comparison.scenes) > 1 else ""
     caption = (
-        "Alpha is of the observations that all runs made, and other measures are of the voxels that all saw twice or"
-        " more; coverage is of each run's whole map, and flicker is of its images. Coverage is the number of voxels"
-        " seen twice or more, divided by that of the base. A difference is undecided if the frames are too few, or"
-        " if errors reach as far as the scene."
+        "Alpha counts the observations that all runs made. Flicker is measured in each run's images. All other"
+        " measures are means over the voxels that all runs saw twice or more. Coverage is the number of voxels that a"
+        " run saw twice or more, divided by the number of the base. A difference is undecided if the frames are too"
+        " few, or if errors reach as far as the scene."
         f" {ANSWERS}{macro}"
     )
     return Table("comparison", "Differences", caption, columns, groups, "scope")
@@ -286,7 +286,7 @@ MOST_CLASSES = 4
 """Most classes that a sentence names."""
 
 BASES: dict[Basis, str] = {
-    "observations": "paired; alpha is of the answers (a spot in a view) to which all runs gave a label",
+    "observations": "paired; alpha counts the views of a spot that all runs label",
     "voxels": "paired on the voxels that all runs saw twice or more",
     "cubes": "paired on cubes of space",
     "flights": "not paired",

@@ -16,8 +16,8 @@ MAJORITY = 0.5
 """A class with this share of the map or more is not listed for several models: all other classes disagree with it."""
 
 CONFUSED = "confused with"
-CLASS_HEAD = ("classes that disagree most", "alpha", CONFUSED, "of map", "disagreement")
-CLASS_COLUMNS, LEAST_CLASS = 32, 28
+CLASS_HEAD = ("disagreement by class", "alpha", CONFUSED, "of map", "of disagreement")
+CLASS_COLUMNS, LEAST_CLASS = 35, 27
 """The columns of a line of classes without its two names, and the least width of the first name."""
 
 CONTRIBUTES = 0.01
@@ -58,9 +58,9 @@ def class_lines(records: Sequence[Record], width: int, begin: str = "") -> Itera
         second = max(len(CONFUSED), min(room - first, max(len(row[2]) for row in rows)))
         for label, alpha_, other, of_map, of_all in (CLASS_HEAD, *rows):
             line = f"  {cut(label, first):<{first}}{alpha_:>5}   {cut(other, second):<{second}}"
-            yield f"{line}{of_map:>8}{of_all:>14}"
+            yield f"{line}{of_map:>8}{of_all:>17}"
     if left_out:
-        yield f"    {', '.join(left_out)}: half of the map or more, not listed"
+        yield f"    not listed: {', '.join(left_out)} (half of the map or more)"
 
 
 def class_means(records: Sequence[Record]) -> dict[str, tuple[float, float]]:

@@ -21,7 +21,7 @@ def head_lines(name: str, result: Result, runs: Sequence[UnitSummary], width: in
     spots = [run.statistics.spots for run in runs if run.statistics is not None]
     views = min((each.views for each in spots if each is not None and each.views < each.frames), default=None)
     seen = "" if views is None else f" of {views} distinct views"
-    chosen = " (chosen)" if any(advice.chosen for advice in result.advice.values()) else ""
+    chosen = " (auto)" if any(advice.chosen for advice in result.advice.values()) else ""
     numbers = {run.table.K for run in runs if run.taxonomy != OF_FEATURES.name}
     of = f"{' and '.join(map(str, sorted(numbers)))} classes" if numbers else "features"
     what = f"{counts} frames{seen}, {of}, {_metres(first.table.voxel_size)} voxels{chosen}"
@@ -39,7 +39,7 @@ def _geometry(result: Result) -> str:
     if not states:
         return ""
     sound = all(state.get("state") == "sound" for state in states)
-    return "geometry ok" if sound else "geometry unclear: semstab-bench check"
+    return "geometry ok" if sound else "geometry unclear: run semstab-bench check"
 
 
 def _scope(runs: Sequence[UnitSummary]) -> str:

@@ -6,17 +6,23 @@ import itertools
 import math
 import re
 import textwrap
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 
 from semstab.data.statistics import short
 from semstab.statistics.verdict import LIMITS
 
 WIDTH = 80
 
-LEVELS = f"  act on labels from alpha {short(LIMITS.stable)} on, with care from {short(LIMITS.usable)}"
-
-UNITS = "; SBD in bits"
-"""The unit of the numbers of a row that have one; shares are from 0 to 1 or in %."""
+ALPHA = (
+    f"alpha: agreement of two views beyond chance; {short(LIMITS.stable)} stable, {short(LIMITS.usable)} usable with"
+    " care"
+)
+COLUMNS = (
+    "agree: views with the same class; flicker: pixels that change class per frame",
+    "VSS: agreement of a voxel's frames, 1 is perfect; SBD: change of a voxel's belief per frame, in bits; OP: frames"
+    " that saw the voxel",
+)
+"""The meaning of the numbers on the screen, for readers who know mIoU."""
 
 TEXTS = 3
 """The number of columns of text, which are aligned left; numbers are aligned right."""
@@ -84,6 +90,13 @@ def number(value: float, digits: int) -> str:
     return "-" if math.isnan(value) else f"{value:z.{digits}f}"
 
 
+def legend() -> Iterator[str]:
+    """Yield the meaning of the columns of a table of models."""
+    yield from wrapped(ALPHA)
+    for text in COLUMNS:
+        yield from wrapped(text)
+
+
 def wrapped(text: str) -> list[str]:
     """Return a sentence as lines of at most 80 columns, indented by two, the lines after the first by four."""
-    return textwrap.wrap(text, WIDTH, initial_indent="  ", subsequent_indent="    ")
+    return textwrap.wrap(text, WIDTH, initial_indent="  ", subsequent_indent="    ", break_on_hyphens=False)

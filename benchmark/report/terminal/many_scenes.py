@@ -16,7 +16,7 @@ from semstab.report.means import ENOUGH, by_model, pooled
 from semstab.report.ranking import answers
 from semstab.report.terminal.disagreement import class_lines
 from semstab.report.terminal.head import head_lines
-from semstab.report.terminal.layout import LEVELS, UNITS, common_beginning, cut, laid_out, number, percent, wrapped
+from semstab.report.terminal.layout import common_beginning, cut, laid_out, legend, number, percent, wrapped
 
 LEAST_SCENES = 3
 """Scenes from which on an interval over scenes is printed: the spread of two says almost nothing."""
@@ -38,7 +38,7 @@ def many_scenes(result: Result, records: Sequence[Record], width: int) -> Iterat
         yield ""
     models, begin = by_model(records), common_beginning([*result.models])
     yield from _model_rows(models, begin, width)
-    yield f"{LEVELS}{UNITS}"
+    yield from legend()
     yield ""
     yield from _scene_lines(result.scenes, models, begin, width)
     if begin:
@@ -128,8 +128,8 @@ def _refuted(models: dict[str, list[Record]]) -> Iterator[str]:
             low, high = percent(min(wrong)), percent(max(wrong))
             share = low if low == high else f"{low} to {high}"
             yield from wrapped(
-                f"{name}: MISLEADING in {len(wrong)} of {len(records)} scenes, {share} of the consistent locations are"
-                " wrong"
+                f"{name}: MISLEADING in {len(wrong)} of {len(records)} scenes, {share} of the voxels whose frames agree"
+                " have a wrong class"
             )
 
 
@@ -138,7 +138,10 @@ def _silent(models: dict[str, list[Record]]) -> Iterator[str]:
     for name, records in models.items():
         known = [own.statistics.verdict for own in records if own.statistics is not None]
         if n := sum(bool(verdict.difference) for verdict in known):
-            yield from wrapped(f"{name}: another level in {n} scenes of what it labels alone: show RUN verdicts")
+            yield from wrapped(
+                f"{name}: another level in {n} scenes if pixels without a label count as disagreeing:"
+                " semstab-bench show RUN verdicts"
+            )
 
 
 def _outlying(models: dict[str, list[Record]]) -> Iterator[str]:
@@ -150,4 +153,4 @@ def _outlying(models: dict[str, list[Record]]) -> Iterator[str]:
         if frames:
             counts.append(f"{name} {sum(frames)} in {len(frames)} scene{'s' if len(frames) > 1 else ''}")
     if counts:
-        yield from wrapped(f"frames that stand out: {', '.join(counts)}: show RUN frames")
+        yield from wrapped(f"frames that stand out: {', '.join(counts)}: semstab-bench show RUN frames")

@@ -16,8 +16,11 @@ from semstab.report.narrative import nearly_all
 from semstab.report.terminal.disagreement import class_lines, outlying_lines
 from semstab.report.terminal.features import features_alone
 from semstab.report.terminal.head import head_lines
-from semstab.report.terminal.layout import LEVELS, WIDTH, percent, percents, wrapped
+from semstab.report.terminal.layout import ALPHA, WIDTH, percent, percents, wrapped
 from semstab.statistics.verdict import DANGEROUS, LIMITS, why_undecided
+
+MEANS = "VSS: agreement of a voxel's frames, 1 is perfect; SBD: change of a voxel's belief per frame"
+"""The meaning of the paper's means."""
 
 
 def one_model(result: Result, record: Record, width: int) -> Iterator[str]:
@@ -32,16 +35,19 @@ def one_model(result: Result, record: Record, width: int) -> Iterator[str]:
     recurrent, shares = run.table.recurrent, run.table.categories
     if shares:
         low, drifting, uncertain, stable = percents([shares[name] for name in CATEGORIES])
-        yield f"  map  {stable} stable  {uncertain} uncertain  {drifting} drifting  {low} seen less than 3 times"
+        yield f"  voxels  {stable} stable  {uncertain} uncertain  {drifting} drifting  {low} in less than 3 frames"
+    if recurrent.voxels >= ENOUGH:
+        means = (f"{m.word} {short(recurrent[m], digits=m.digits[0])} {m.unit}".rstrip() for m in measures())
+        yield from wrapped(f"in 3 frames or more: {', '.join(means)}")
+        yield from wrapped(MEANS)
+    else:
+        yield from wrapped(
+            f"VSS and SBD are not shown: 3 frames or more saw {recurrent.voxels:,} voxels, and {ENOUGH:,} are needed"
+        )
     yield from _flicker(record)
     yield ""
     yield from class_lines([record], width)
     yield from outlying_lines([record])
-    if recurrent.voxels >= ENOUGH:
-        means = (f"{m.word} {short(recurrent[m], digits=m.digits[0])} {m.unit}".rstrip() for m in measures())
-        yield f"  paper (OP>=3)  {'  '.join(means)}"
-    else:
-        yield f"  paper (OP>=3)  -, {recurrent.voxels:,} voxels are too few (at least {ENOUGH:,})"
     yield ""
 
 
@@ -62,7 +68,7 @@ def _verdict(run: UnitSummary) -> Iterator[str]:
         share, name = nearly_all(statistics.spots.largest_share), statistics.spots.largest_class
         yield f"  {share} of the observations are {name}: agreement does not assess such a map"
     else:
-        yield LEVELS
+        yield from wrapped(ALPHA)
     if difference := statistics.verdict.difference:
         yield from wrapped(f"{difference}: what has no label counts as disagreeing there")
     silent = 0.0 if statistics.spots is None else 1 - statistics.spots.labelled
@@ -86,7 +92,7 @@ def wrong_text(statistics: MapStatistics) -> str:
     """Return the share of the consistent locations that are wrong, and what follows from it; '' without truth."""
     if not (share := share_of_wrong(statistics)):
         return ""
-    told = f"{share} of the consistent locations are wrong"
+    told = f"{share} of the voxels whose frames agree have a wrong class"
     misleads = statistics.verdict.level == "misleading"
     return f"{told}, more than {percent(DANGEROUS)}: do not take agreement for truth" if misleads else told
 
@@ -101,7 +107,7 @@ def _flicker(record: Record) -> Iterator[str]:
     compensated = record.image_space.compensated_flicker_percent
     if not math.isnan(compensated):
         what, _, often = record.image_space.changing.partition(" ")
-        yield f"  flicker  {compensated:.1f} % of the {what} change class {often} (motion removed)"
+        yield f"  flicker {compensated:.1f} % of the {what} change class {often} (motion removed)"
 
 
 def _interval(estimate: Estimate, scale: float = 1.0) -> str:

@@ -13,17 +13,7 @@ from semstab.report.means import ENOUGH
 from semstab.report.ranking import answers
 from semstab.report.terminal.disagreement import class_lines, outlying_lines
 from semstab.report.terminal.head import head_lines
-from semstab.report.terminal.layout import (
-    LEVELS,
-    UNITS,
-    common_beginning,
-    cut,
-    laid_out,
-    number,
-    percent,
-    percents,
-    wrapped,
-)
+from semstab.report.terminal.layout import common_beginning, cut, laid_out, legend, number, percent, percents, wrapped
 from semstab.report.terminal.one_model import share_of_wrong
 from semstab.statistics.verdict import DANGEROUS
 
@@ -66,7 +56,7 @@ def names_text(record: Record) -> str:
     return f"{record.summary.table.K} names, as many as {spots.effective_classes:.1f} of equal size"
 
 
-OF_MAP = "of each map"
+OF_MAP = "voxels"
 MOST_MAPS = 2
 """The most maps whose shares are printed beneath the rows; tables and report have all."""
 
@@ -86,8 +76,8 @@ def several_models(result: Result, records: Sequence[Record], width: int) -> Ite
         yield f"  names of models begin with '{begin}'"
     if any(record.summary.table.recurrent.voxels < ENOUGH for record in records):
         titles = ", ".join(measure.title for measure in headlines())
-        yield f"  {titles} -: fewer than {ENOUGH:,} voxels were seen 3 times or more"
-    yield f"{LEVELS}{UNITS}"
+        yield from wrapped(f"-: fewer than {ENOUGH:,} voxels were seen in 3 frames or more, too few for {titles}")
+    yield from legend()
     if len(records) <= MOST_MAPS and any(record.summary.table.categories for record in records):
         yield from ("", *_map_shares(records, width, begin), "")
     yield from class_lines(records, width, begin)
@@ -122,14 +112,14 @@ def _wrong_lines(records: Sequence[Record]) -> Iterator[str]:
     if known := [f"{model} {share}" for model, share in shares.items() if share]:
         misleads = any(own.verdict.level == "misleading" for _, own in judged)
         more = f"; more than {percent(DANGEROUS)} is MISLEADING: do not take agreement for truth" if misleads else ""
-        yield from wrapped(f"of the consistent locations are wrong: {', '.join(known)}{more}")
+        yield from wrapped(f"wrong class although frames agree: {', '.join(known)} of such voxels{more}")
 
 
 def _map_shares(records: Sequence[Record], width: int, begin: str) -> Iterator[str]:
     """Yield a row for each map: how much of it is stable, uncertain, drifting, and seen too rarely to tell."""
     known = [record for record in records if record.summary.table.categories]
     rows = [percents([record.summary.table.categories[name] for name in reversed(CATEGORIES)]) for record in known]
-    heads = ("stable", "uncertain", "drifting", "seen less than 3 times")
+    heads = ("stable", "uncertain", "drifting", "in less than 3 frames")
     models = [record.unit.model.removeprefix(begin) for record in known]
     names = [cut(name, width - sum(map(len, heads)) - 2 * len(heads) - 2) for name in models]
     first = max(map(len, (OF_MAP, *names)))

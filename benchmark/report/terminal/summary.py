@@ -29,8 +29,11 @@ from semstab.report.terminal.videos import videos
 MOST_WARNINGS = 3
 STAGE_NAMES = {
     "read": "reading",
-    "check": "data check",
-    "reference": "check of the backend",
+    "check": "check of the data",
+    "sample": "sampling of spots",
+    "reference": "check of the fusion",
+    "sizing": "estimate of memory",
+    "network": "network",
     "write": "writing",
 }
 
@@ -102,17 +105,17 @@ def _check(pair: tuple[str, str], rows: Sequence[Agreement]) -> str:
     voxels, bad = sum(row.voxels[-1] for row in rows), [row for row in rows if not row.agrees]
     share = f", {one_in(rows)}" if one_in(rows) else ""
     if not voxels and not bad:
-        return f"{checked} was not checked against {reference}: no voxel was drawn{share}"
-    drawn = f" drawn at random{share}" if share else ""
+        return f"fusion by {checked} was not compared with {reference}: the random sample{share} has no voxel"
+    drawn = f" of a random sample ({one_in(rows)})" if share else ""
     if not bad and is_builtin(checked):
-        return f"checked {checked} against {reference} on {voxels:,} voxels{drawn}: equal"
+        return f"fusion by {checked} equals {reference} in {'' if share else 'all '}{voxels:,} voxels{drawn}"
     if not bad and not share:
-        return f"checked {checked} against {reference} on all {voxels:,} voxels: equal"
+        return f"fusion by {checked} equals {reference} in all {voxels:,} voxels"
     if not bad:
         most = f"{100 * largest_share(voxels):.2g}".removeprefix("0")
         return (
-            f"checked {checked} against {reference} on {voxels:,} voxels{drawn}: equal; at most {most} % of all voxels"
-            f" are wrong, with {CONFIDENCE:.0%}"
+            f"fusion by {checked} equals {reference} in {voxels:,} voxels{drawn}; with {CONFIDENCE:.0%} confidence at"
+            f" most {most} % of all voxels differ"
         )
     row = bad[0]
     only = f"; {sum(row.only_in):,} voxels in one only" if any(row.only_in) else ""
@@ -127,12 +130,14 @@ def _where(result: Result, out: Path | None, seconds: float | None) -> Iterator[
     if seconds is not None:
         stages = {STAGE_NAMES.get(k, k): v for k, v in result.manifest.get("seconds", {}).items() if k != "all"}
         longest = sorted(stages, key=lambda name: -stages[name])[:3]
-        parts = ", ".join(f"{name} {stages[name]:.0f}" for name in longest if stages[name] >= 1)
+        parts = ", ".join(f"{name} {stages[name]:.0f} s" for name in longest if stages[name] >= 1)
         in_process = result.manifest.get("units", {}).get("executor") == InProcess.name
-        what = f"longest stages{'' if in_process else ', all workers'}"  # of all workers they may exceed the run's time
-        yield f"  {seconds:.0f} s{f' ({what}: {parts})' if parts else ''}"
+        what = (
+            f"longest{'' if in_process else ', sums of all workers'}"  # of all workers they may exceed the run's time
+        )
+        yield f"  time    {seconds:.0f} s{f' ({what}: {parts})' if parts else ''}"
     if speeds := _speeds(result):
-        yield from wrapped(f"predicted: {speeds}")
+        yield from wrapped(f"speed of prediction: {speeds}")
     if out is None:
         return
     if (out / "report.html").exists():
