@@ -191,6 +191,7 @@ def test_a_run_with_the_groups_as_taxonomy_has_the_alpha_that_was_promised(home)
 
 
 def test_without_groups_there_is_no_taxonomy_to_write(home):
+    bench("export", "run", "--to", "groups.yaml", cwd=home)
     bench("wall", "--voxel-size", "0.1", "--taxonomy", "groups.yaml", "-o", "again", "--overwrite", cwd=home)
     line = error_of("export", "again", "--to", "more.yaml", cwd=home)
     assert "has no groups of classes to write" in line
