@@ -1,14 +1,15 @@
 """Write docs/leaderboard.md from the results in results/: `python scripts/leaderboard_page.py`.
 
-Its tables are those of `semstab-bench leaderboard results`; tests/test_leaderboard.py compares them.
+Its tables have the rows of `semstab-bench leaderboard results`; tests/test_leaderboard.py compares them.
 """
 
 from __future__ import annotations
 
+import dataclasses
 from pathlib import Path
 
 from semstab.core.files import write_text
-from semstab.leaderboard.board import boards, tables_of
+from semstab.leaderboard.board import Board, boards, headline
 from semstab.report.tables.table import to_markdown
 
 ROOT = Path(__file__).parents[1]
@@ -16,18 +17,21 @@ PAGE = ROOT / "docs/leaderboard.md"
 
 HEAD = """# Leaderboard
 
-Results of the [benchmarks](benchmarks.md) that can be run here. `semstab-bench leaderboard results --out site` makes
-a page of them; `python scripts/leaderboard_page.py` writes these tables.
+Which models are more stable on the [benchmarks](benchmarks.md)? Results that are in `results/`; each number follows
+from sums that are [checked](benchmarks.md#what-is-checked). A page that also has scenes, hardware and cards:
 
-- `city@1`: simulated models of known quality, tricks that buy stability without knowledge (a map painted in the world,
-  two classes, one class), and clusters of colour named by eye. A model may be stable and wrong: read alpha beside
-  accuracy.
-- `apc_shelf@1`: the labels and the scores that were published with the data.
-- `livingroom@1`: ten networks of two families, trained on PASCAL VOC ([how](real-networks.md)).
+```bash
+semstab-bench leaderboard results --out site
+```
 
-Each number but those "as stated" is computed from the sums of a result, which are checked against the definition
-([how](benchmarks.md#what-is-checked)). These models were timed on two cores that did other work, too: their
-milliseconds are no measure of speed.
+- **alpha** counts an answer that a model leaves out as one that disagrees. Numbers are means over scenes, with
+  intervals at 95 %.
+- **rank** is 1 plus the number of models that are shown to be more stable (paired by frames and cubes, Holm).
+  '1 to 7': models that share ranks are not told apart.
+- A model may be stable and wrong: read alpha beside accuracy.
+- What the ten networks of `livingroom@1` tell about measures: [real networks](real-networks.md).
+
+The results were made by:
 
 ```bash
 semstab-bench benchmark city@1 -m sim-steady -m sim-flicker -m sim-soft -m trick-two-class \\
@@ -40,12 +44,26 @@ semstab-bench benchmark livingroom@1 --data DATA/livingroom \\
 ```
 """
 
+MODELS = {
+    "apc_shelf@1": "The labels and the scores that were published with the data.",
+    "city@1": "Simulated models of known quality, tricks that buy stability without knowledge, and clusters of colour.",
+    "livingroom@1": "Ten networks of two families, trained on PASCAL VOC.",
+}
+"""Models of each benchmark."""
+
+
+def caption(board: Board) -> str:
+    """Return a description of the data, of the models, and why some are not ranked."""
+    benchmark = board.benchmark
+    said = [f"{benchmark.description}; definition {benchmark.digest}", *board.reasons]
+    return " ".join([*(f"{text[0].upper()}{text[1:]}." for text in said), MODELS.get(benchmark.id, "")]).strip()
+
 
 def page() -> str:
     """Return the text of the page."""
     parts = [HEAD]
     for board in boards(ROOT / "results"):
-        parts += map(to_markdown, tables_of(board))
+        parts.append(to_markdown(dataclasses.replace(headline(board), caption=caption(board))))
     return "\n".join(parts)
 
 

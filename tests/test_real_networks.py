@@ -248,8 +248,11 @@ def test_every_condition_has_its_networks_commands_and_digests(rows, stated) -> 
     assert real_networks.digest(ROOT / "scripts" / "nets.py") in stated["wrapper"].values()
 
 
-def test_the_page_has_the_table_of_the_results(rows) -> None:
-    assert "\n".join(real_networks.condition_table(rows)) in PAGE.read_text(encoding="utf-8")
+def test_the_rows_of_the_page_are_those_of_the_results(rows) -> None:
+    head, dashes, *conditions = real_networks.condition_table(rows)
+    (shown,) = re.findall(rf"{re.escape(head)}\n{re.escape(dashes)}\n((?:\|.*\n)+)", PAGE.read_text(encoding="utf-8"))
+    assert len(shown.splitlines()) >= 4
+    assert set(shown.splitlines()) <= set(conditions)
 
 
 @pytest.mark.parametrize("document", [PAGE, README])
@@ -290,11 +293,6 @@ def test_correlations_without_the_uninformative_networks_are_those_of_the_result
     assert f"Among the {count} others alpha has {' '.join(alpha)}, VSS has {' '.join(vss)}" in text
 
 
-def test_the_correlation_with_the_number_of_classes_is_that_of_the_results(stated) -> None:
-    _, rho, _ = correlation(stated, "vss", "effective_classes", "all")
-    assert f"With the effective number of classes, VSS has {rho}." in PAGE.read_text(encoding="utf-8")
-
-
 def test_levels_and_alphas_in_the_text_are_those_of_the_rows(rows) -> None:
     row = {(row.condition, row.network): row for row in rows}
     main = {network: each for (condition, network), each in row.items() if condition == real_networks.MAIN}
@@ -303,9 +301,8 @@ def test_levels_and_alphas_in_the_text_are_those_of_the_rows(rows) -> None:
     said = [f"{digits(each)} ({each.verdict}) in {each.frames}" for each in (few, many)]
     assert f"espnetv2-2.0 has {said[0]} frames and {said[1]}," in text
     assert f"dicenet-0.75, with {digits(main['dicenet-0.75'])}, calls" in text
-    assert f"dicenet-0.2: {main['dicenet-0.2'].verdict}." in text
-    for network in ("dicenet-1.0", "espnetv2-2.0"):
-        assert f"{network}: {main[network].verdict}, {digits(main[network])}." in text
+    assert "The verdict on these three is 'uninformative'" in text
+    assert {main[name].verdict for name in ("dicenet-0.2", "espnetv2-0.5", "dicenet-0.5")} == {"uninformative"}
 
 
 def digits(row):
