@@ -3,7 +3,7 @@
     python simulations/simulate.py alpha strides [--scenes 3] [--seed 0]
     python simulations/simulate.py alpha shares [--scenes 12] [--flights 16] [--seed 0]
 
-Flights of `pictures.py`, with errors of eight kinds. `strides` prints alpha and its level with every pixel, and with
+Flights of `orbit_views.py`, with errors of eight kinds. `strides` prints alpha and its level with every pixel, and with
 every second and third one of each axis. `shares` flies scenes again and again of which one class covers nearly all: an
 interval is right that holds what all flights over a scene give together, and a verdict that names its level. Both
 print a table in Markdown. What alpha should be is known exactly in other scenes: `exact.py`, `exact_coverage.py`.
@@ -16,7 +16,7 @@ from typing import Literal
 
 import numpy as np
 from levels import level_of, stated
-from pictures import KINDS, K, Views, field, frames, predicted, scene
+from orbit_views import KINDS, K, Views, field, frames, predicted, scene
 
 from semstab.statistics import Sampler
 from semstab.statistics.accumulate import sums_of_spots

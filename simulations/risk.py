@@ -6,7 +6,7 @@
     python simulations/simulate.py risk runs RUN ... --signs [--scores MODEL]
 
 Places are the voxels of a map that were seen three times or more and have a true class; the label of one is its
-dominant class. `made` takes flights of `pictures.py`, with errors of eight kinds at four rates, `city` the simulated
+dominant class. `made` takes flights of `orbit_views.py`, with errors of eight kinds at four rates, `city` the simulated
 models on scenes of the city, `runs` the maps of runs with ground truth (`semstab-bench --statistics`).
 
 How well disagreement, 1 - PSA, tells wrong places from right ones is the area under the ROC curve (AUROC): the
@@ -31,7 +31,7 @@ from typing import Literal
 import cases
 import numpy as np
 from alpha import RATES
-from pictures import KINDS, K, Views, frames, predicted, scene
+from orbit_views import KINDS, K, Views, frames, predicted, scene
 from signs import auroc
 from signs import table as table_of_signs
 
