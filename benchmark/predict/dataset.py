@@ -11,19 +11,20 @@ import math
 import threading
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import ClassVar
 
 import numpy as np
 from pydantic import BaseModel, Field, field_validator
 
 from semstab.config import DatasetConfig, FrameSelection, Settings
 from semstab.core.files import ScratchFolder
-from semstab.core.types import Float64, UInt8
+from semstab.core.types import UInt8
 from semstab.data.features import Features
 from semstab.data.frames import Frame
 from semstab.data.labels import LabelSpace
 from semstab.datasets import GROUND_TRUTH, Dataset, Filtering, Scene, open_dataset, resolved
-from semstab.datasets.geometry.lenses import Labels, Scores, require_same_view
+from semstab.datasets.geometry.lenses import require_same_view
+from semstab.datasets.relabelled import RelabelledScene
 from semstab.datasets.scene import select_frames
 from semstab.errors import ConfigError, DataError
 from semstab.models import Model, Prediction, create
@@ -179,7 +180,7 @@ class PredictedDataset(Dataset):
         return select_frames(scene, selection, **self.predictor(source).looks_at).indices
 
 
-class PredictedScene(Scene):
+class PredictedScene(RelabelledScene):
     """One scene of another dataset, with predicted labels.
 
     A sequential model is shown the dataset's `frames` of the scene in order, whichever of them is asked for.
@@ -191,20 +192,9 @@ class PredictedScene(Scene):
                 f"{inner.name}: holds scans, and models and filters work on images; write the labels of a model's"
                 " points into predictions/MODEL (docs/tutorials/scans.md)"
             )
-        self.name = inner.name
-        self.models = tuple(dataset.predictors)
-        self.ground_truth, self.replaced = inner.ground_truth, inner.models
-        self.up = inner.up
-        self.georeference = inner.georeference
-        self.placed = inner.placed
-        self.surface = inner.surface
-        self.depth_from = inner.depth_from
-        self.sources = inner.sources
-        self.folder = inner.folder
-        self.settings_file = inner.settings_file
-        self.made, self.posed = inner.made, inner.posed
-        self.skips_incomplete, self.images_elsewhere = inner.skips_incomplete, inner.images_elsewhere
-        self._inner = inner
+        super().__init__(inner)
+        self.models, self.replaced = tuple(dataset.predictors), inner.models
+        self.further, self.regions, self.unread, self.label_paths = (), (), None, ()  # of labels that are not read
         self._dataset = dataset
         self._producers: dict[str, Producer] = {}
         self._digests: dict[int, bytes] = {}
@@ -212,23 +202,6 @@ class PredictedScene(Scene):
             name for name, each in dataset.predictors.items()
             if each.model != STORED and not each.filters and dataset.model(name).gives_features
         )  # fmt: skip
-
-    def __len__(self) -> int:
-        """Return the number of frames."""
-        return len(self._inner)
-
-    @property
-    def timestamps(self) -> Float64 | None:
-        """Time stamps of the inner scene, if any."""
-        return self._inner.timestamps
-
-    def frame_name(self, index: int) -> str:
-        """Return the inner scene's."""
-        return self._inner.frame_name(index)
-
-    def tracked(self, index: int) -> bool:
-        """Return whether the frame has a pose."""
-        return self._inner.tracked(index)
 
     def missing(self, index: int, sources: Sequence[str] = (), *, color: bool = False) -> list[str]:
         """Return the missing files of the frame; it needs its colour where a model is among the sources."""
@@ -251,36 +224,6 @@ class PredictedScene(Scene):
         """Return the seconds that a model took to predict on a frame since they were last asked for; else NaN."""
         stored = model == GROUND_TRUTH or self._dataset.predictors[model].model == STORED
         return math.nan if stored else self._producer(model).seconds(index)
-
-    @property
-    def settings(self) -> Mapping[str, Any]:
-        """The conventions by which its files are read, by name of option."""
-        return self._inner.settings
-
-    @property
-    def depth_scale(self) -> float | None:
-        """Units of stored depth in a metre."""
-        return self._inner.depth_scale
-
-    def predicted(self, index: int, *, labels: Labels | None = None, scores: Scores | None = None) -> Frame:
-        """Return the frame with what was predicted on its image."""
-        return self._inner.predicted(index, labels=labels, scores=scores)
-
-    def view(self, index: int, shape: tuple[int, int]) -> Frame:
-        """Return depth and pose at the pixels of the colour image, of shape (H, W)."""
-        return self._inner.view(index, shape)
-
-    def geometry(self, index: int, *, color: bool = False) -> Frame:
-        """Return the frame but for its labels; nothing is predicted for it."""
-        return self._inner.geometry(index, color=color)
-
-    def color(self, index: int) -> UInt8 | None:
-        """Return the colour (H, W, 3) uint8 RGB, or None for a frame without colour."""
-        return self._inner.color(index)
-
-    def image_name(self, index: int) -> str:
-        """Return the name of the frame's files."""
-        return self._inner.image_name(index)
 
     def label_space(self, model: str) -> LabelSpace:
         """Return the classes that the model predicts.
