@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Iterator
 from functools import partial
 from pathlib import Path
-from typing import Literal
+from typing import ClassVar, Literal
 
 import numpy as np
 from pydantic import BaseModel, Field
@@ -51,6 +51,7 @@ class Kitti360Images(FileDataset[Kitti360ImagesOptions]):
     """
 
     Options: type[BaseModel] = Kitti360ImagesOptions
+    depth_is_sparse: ClassVar[bool] = True
     contents = f"image_00/data_rect/ below {RAW}/DRIVE/, and data_poses/, calibration/ and data_3d_raw/ beside {RAW}/"
 
     def is_scene(self, folder: Path) -> bool:

@@ -13,7 +13,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from types import MappingProxyType
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 from pydantic import BaseModel
@@ -278,10 +278,12 @@ class Dataset(ABC):
     """A set of scenes. Its class has `Options`, a pydantic model, and is made with an instance of it.
 
     Attributes:
+        depth_is_sparse: Whether its images have depth at the points of a LiDAR alone.
         run_folder: Folder of the run that reads it, for files that it writes meanwhile; None without a run.
     """
 
     Options: type[BaseModel]
+    depth_is_sparse: ClassVar[bool] = False
     run_folder: Path | None = None
 
     @property

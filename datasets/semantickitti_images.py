@@ -8,7 +8,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 from functools import partial
 from pathlib import Path
-from typing import Literal
+from typing import ClassVar, Literal
 
 import numpy as np
 from pydantic import BaseModel, Field
@@ -44,6 +44,7 @@ class SemanticKittiImages(FileDataset[SemanticKittiImagesOptions]):
     """{name} is the frame's number: 000012. A pixel has depth and a true class where a LiDAR point is seen."""
 
     Options: type[BaseModel] = SemanticKittiImagesOptions
+    depth_is_sparse: ClassVar[bool] = True
     contents = "image_2/, velodyne/, poses.txt and calib.txt"
 
     def is_scene(self, folder: Path) -> bool:

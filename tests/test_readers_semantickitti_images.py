@@ -191,6 +191,6 @@ def test_check_of_sparse_depth_is_quiet_and_says_whose_labels_agree(sequence, tm
             path.write_bytes(np.frombuffer(path.read_bytes(), f"V{row}")[::11].tobytes())
     result = bench("check", "--dataset", "semantickitti_images", "--data", sequence, cwd=tmp_path)
     assert "Warning" not in result.stderr
-    assert "labels   of no model but the truth: " in result.stdout
+    assert "labels   only ground truth: " in result.stdout
     assert display.OF_IMAGES[:20] in result.stdout
     assert "labels of gt" in result.stdout

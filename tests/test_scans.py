@@ -128,7 +128,7 @@ def test_the_folder_is_recognised_and_checked(folder, tmp_path):
     assert "read as semantickitti" in result.stdout + result.stderr
     assert "SOUND" in result.stdout
     assert "scans lie on each other" in " ".join(result.stdout.split())
-    assert "points   lie" in result.stdout
+    assert "noise    points lie" in result.stdout
 
 
 MISTAKES = {

@@ -25,7 +25,7 @@ from semstab.config import (
 from semstab.configure import load_config, predicted_config, shipped_benchmarks
 from semstab.core.prefetch import prefetch
 from semstab.data.labels import LabelSpace
-from semstab.datasets import GROUND_TRUTH, Scene, open_dataset
+from semstab.datasets import GROUND_TRUTH, REGISTRY, Dataset, Scene, open_dataset
 from semstab.errors import ConfigError, DataError
 from semstab.leaderboard.geometry import Spots, few_rows, geometry_file, load_geometry, spots_of
 from semstab.pixels.preparation import leave_out
@@ -44,10 +44,6 @@ IN_A_RUN = (
     "statistics",
 )  # fmt: skip
 """The settings of a run that a definition fixes, in addition to its dataset."""
-
-
-SPARSE = frozenset({"kitti360_images", "semantickitti_images"})
-"""Datasets whose images have depth at the points of a LiDAR alone."""
 
 
 class Benchmark(Settings):
@@ -151,7 +147,8 @@ class Benchmark(Settings):
     @property
     def is_sparse(self) -> bool:
         """Return whether its images have depth at the points of a LiDAR alone."""
-        return self.dataset.name in SPARSE
+        reader: type[Dataset] = REGISTRY.load(self.dataset.name)
+        return reader.depth_is_sparse
 
     def changed(self, config: Config) -> list[str]:
         """Return the settings of a run that are not those of the definition."""

@@ -37,8 +37,8 @@ IN_CLASSES = (ALPHA, PSA, RECALL, IOU)
 ANSWERS = (
     f"Brackets hold {CONFIDENCE:.0%} intervals, for this scene flown again if it has {LEAST_FRAMES} frames or more,"
     " else for these frames, that is, for other locations in the same frames. p (Holm) is the p-value of no difference."
-    " For alpha it is corrected for the number of runs, for all other measures for their number in the scene or over all"
-    " scenes."
+    " For alpha it is corrected for the number of runs, for all other measures for their number in the scene or over"
+    " all scenes."
 )
 
 
