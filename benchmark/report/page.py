@@ -190,8 +190,8 @@ def _numbers(
         value = short(together.recurrent[measure], digits=measure.digits[0]) if enough else "-"
         note = measure.unit
         yield measure.named, value, note if enough else few
-    right = [miou(record) for record in records]
-    yield MIOU.named, short(macro_mean(right), digits=MIOU.digits[0]), "of the fused labels"
+    overlap = macro_mean([miou(record) for record in records])
+    yield MIOU.named, "" if math.isnan(overlap) else short(overlap, digits=MIOU.digits[0]), "of the fused labels"
     wrong = [stats.headline.wrong_of_consistent_op3.value for stats in assessed]
     yield "consistent but wrong", mean(wrong, "{:.1f} %", 100), "of the consistent locations"
 
