@@ -59,34 +59,34 @@ def cautions(
     order = (stable, 1 - stable)
     more, less = (names[k] for k in order)
     yield _of_truth(more, less, by_measure, order)
-    classes = _means([[_effective_classes(each[k]) for each in scenes] for k in order])
+    classes = _means([[_effective_classes(scene[k]) for scene in scenes] for k in order])
     if classes[0] < MUCH_LESS * classes[1]:
         yield (
             f"{more} uses fewer classes than {less} ({classes[0]:.1f} against {classes[1]:.1f} effective classes):"
             " merged classes cannot be confused"
         )
-    edges = _means([[each[k].image_space.edge_recall for each in scenes] for k in order])
+    edges = _means([[scene[k].image_space.edge_recall for scene in scenes] for k in order])
     if edges[0] < MUCH_LESS * edges[1]:
         yield (
             f"labels of {more} follow {edges[0]:.0%} of the edges of depth, labels of {less} {edges[1]:.0%}: coarse or"
             " blurred labels flicker less"
         )
     for text in dict.fromkeys(
-        text for each in scenes for text in suspicions(each[stable].summary, each[stable].image_space)
+        text for scene in scenes for text in suspicions(scene[stable].summary, scene[stable].image_space)
     ):
         yield f"{more}: {text}"
 
 
 def _of_truth(more: str, less: str, by_measure: Mapping[str, Contrast], order: tuple[int, int]) -> str:
-    known = [by_measure[q.name] for q in (ACCURACY, MIOU) if q.name in by_measure]
-    if not known:
+    rows = [by_measure[q.name] for q in (ACCURACY, MIOU) if q.name in by_measure]
+    if not rows:
         return f"more stable means that frames of {more} agree, not that they are right: no ground truth was compared"
     titles = {q.name: f"{q.word} ({q.population})" for q in (ACCURACY, MIOU)}
-    both = [(row.base, row.other) for row in known]
-    values = [(pair[order[0]], pair[order[1]]) for pair in both]
+    pairs = [(row.base, row.other) for row in rows]
+    values = [(pair[order[0]], pair[order[1]]) for pair in pairs]
     numbers = ", ".join(
         f"{titles[row.measure]} {short(a, digits=3)} against {short(b, digits=3)}"
-        for row, (a, b) in zip(known, values, strict=True)
+        for row, (a, b) in zip(rows, values, strict=True)
     )
     if any(a < b for a, b in values):
         return f"{more} is more stable and less right than {less} ({numbers}): do not take agreement for truth"

@@ -91,8 +91,8 @@ def over_scenes(result: Sequence[Sequence[Contrast]]) -> tuple[Contrast, ...]:
     for row in (row for rows in result for row in rows):
         groups.setdefault((row.measure, row.of), []).append(row)
     means = []
-    for (measure, of), every in groups.items():
-        rows = [row for row in every if not math.isnan(row.difference.low)] or every
+    for (measure, of), group in groups.items():
+        rows = [row for row in group if not math.isnan(row.difference.low)] or group
         base, other = macro_mean([row.base for row in rows]), macro_mean([row.other for row in rows])
         means.append(Contrast(measure, of, base, other, mean_of([row.difference for row in rows]), math.nan, ""))
     return tuple(means)
@@ -122,18 +122,18 @@ def holm(p: Sequence[float]) -> list[float]:
     [0.03, 0.06, 0.06]
     """
     corrected = [float("nan")] * len(p)
-    tested = sorted((own, i) for i, own in enumerate(p) if not np.isnan(own))
+    tested = sorted((p_value, i) for i, p_value in enumerate(p) if not np.isnan(p_value))
     highest = 0.0
-    for rank, (own, i) in enumerate(tested):
-        highest = max(highest, min(1.0, own * (len(tested) - rank)))
+    for rank, (p_value, i) in enumerate(tested):
+        highest = max(highest, min(1.0, p_value * (len(tested) - rank)))
         corrected[i] = highest
     return corrected
 
 
 def _with_change(row: Contrast, p_holm: float, sign: float) -> Contrast:
-    shown = p_holm < SIGNIFICANCE and row.difference.decided
+    is_significant = p_holm < SIGNIFICANCE and row.difference.decided
     gain = -sign * row.difference.value
-    return dataclasses.replace(row, p_holm=p_holm, change=("better" if gain > 0 else "worse") if shown else "")
+    return dataclasses.replace(row, p_holm=p_holm, change=("better" if gain > 0 else "worse") if is_significant else "")
 
 
 # --- One scene --------------------------------------------------------------------------------------------------------
@@ -206,8 +206,8 @@ def flicker_difference(new: Flicker, base: Flicker, *, paired: bool = True, leve
     """Return the mean flicker of one run less another's, by frame where both have the same ones."""
     if paired and len(new.keys() & base.keys()) > 1:
         return _with_p_value(difference_over_frames(new, base, level))
-    each = [mean_over_frames(np.array([*flicker]), np.array([*flicker.values()]), level) for flicker in (new, base)]
-    return unpaired(each[0], each[1])
+    means = [mean_over_frames(np.array([*flicker]), np.array([*flicker.values()]), level) for flicker in (new, base)]
+    return unpaired(means[0], means[1])
 
 
 def _flicker(base: Flicker, other: Flicker, *, paired: bool) -> Contrast:
@@ -222,11 +222,11 @@ def _flicker(base: Flicker, other: Flicker, *, paired: bool) -> Contrast:
 def _of_voxels(measure: Measure, base: VoxelTable, other: VoxelTable, edge: float) -> Contrast:
     """Return the mean of a measure over its population in both maps, by its differences voxel by voxel."""
     before, after = measure.of(base), measure.of(other)
-    known = ~np.isnan(before) & ~np.isnan(after) & (base.op >= measure.op) & (other.op >= measure.op)
-    if not known.any():
+    defined = ~np.isnan(before) & ~np.isnan(after) & (base.op >= measure.op) & (other.op >= measure.op)
+    if not defined.any():
         return Contrast(measure.name, "", math.nan, math.nan, UNKNOWN, math.nan, "")
-    cubes, columns = Cubes.of(base, edge, where=known), np.stack([after - before, known], axis=1)
-    before, after = before[known], after[known]
+    cubes, columns = Cubes.of(base, edge, where=defined), np.stack([after - before, defined], axis=1)
+    before, after = before[defined], after[defined]
     change = cubes.estimate(columns, ratio_of, (-measure.largest, measure.largest), "plain")
     result = no_difference(change) if np.array_equal(before, after) else _with_p_value(change)
     return Contrast(measure.name, "", mean(before), mean(after), result, math.nan, "")
@@ -252,20 +252,22 @@ def _against_all(common: Common, names: Sequence[str], number: int) -> Iterator[
         if not _comparable(quantity, common):
             continue
         for k, name in enumerate(names):
-            seen = before["observations"].sum() / max(before["voxels"].sum(), 1e-9)
-            if before["evidence"][:, k].sum() >= LEAST_VOXELS * seen:  # evidence of LEAST_VOXELS voxels
+            mean_op = before["observations"].sum() / max(before["voxels"].sum(), 1e-9)
+            if before["evidence"][:, k].sum() >= LEAST_VOXELS * mean_op:  # evidence of LEAST_VOXELS voxels
                 yield from _row(quantity, before, after, common, k, name)
 
 
 def _of_locations(common: Common, names: Sequence[str], number: int) -> Iterator[Contrast]:
     labels = class_of_locations(common)
-    wanted = [each for each in BY_CLASS if each not in ONE_AGAINST_ALL and _comparable(each, common)]
+    comparable = [
+        quantity for quantity in BY_CLASS if quantity not in ONE_AGAINST_ALL and _comparable(quantity, common)
+    ]
     for k, name in enumerate(names):
         where = labels == k
         if np.count_nonzero(where) < LEAST_VOXELS:
             continue
         sums = common.among(where)
-        for quantity in wanted:
+        for quantity in comparable:
             yield from _row(quantity, sums[0], sums[number], common, of=name)
 
 
@@ -325,37 +327,37 @@ def differences_of(
     changes: dict[tuple[str, str], Changes] = {}
     for scene in shared_scenes(handles):
         progress(scene)
-        rows, own = _scene(scene, handles, scope)
+        rows, scene_changes = _scene(scene, handles, scope)
         scenes.append(rows)
-        changes |= {(scene, name): each for name, each in own.items()}
+        changes |= {(scene, name): change for name, change in scene_changes.items()}
     result = RunComparison(
         schema=SCHEMA,
         base=handles[0].name,
         runs=tuple(
             Compared(
-                each.name,
-                each.source,
-                each.model,
-                uninformative=all(each.scenes[row.scene].caveat.startswith("uninformative") for row in scenes),
+                handle.name,
+                handle.source,
+                handle.model,
+                uninformative=all(handle.scenes[row.scene].caveat.startswith("uninformative") for row in scenes),
             )
-            for each in handles
+            for handle in handles
         ),
         overall=(overall := _over_all(scenes)),
         scenes=tuple(scenes),
-        cautions=tuple(dict.fromkeys(text for own in overall for text in _cautions(handles, own, scenes))),
+        cautions=tuple(dict.fromkeys(text for against in overall for text in _cautions(handles, against, scenes))),
     )
-    ups = {scene: up for each in reversed(handles) for scene, entry in each.scenes.items() if (up := entry.up)}
+    ups = {scene: up for handle in reversed(handles) for scene, entry in handle.scenes.items() if (up := entry.up)}
     return ComparisonData(result, changes, ups)
 
 
 def _cautions(handles: Sequence[RunHandle], against: Against, scenes: Sequence[SceneComparison]) -> Iterator[str]:
-    base, other = handles[0], next(each for each in handles if each.name == against.other)
-    entries = [(base.scenes[each.scene], other.scenes[each.scene]) for each in scenes]
+    base, other = handles[0], next(handle for handle in handles if handle.name == against.other)
+    entries = [(base.scenes[scene.scene], other.scenes[scene.scene]) for scene in scenes]
     return cautions((base.name, other.name), entries, against.contrasts)
 
 
 def _scene(scene: str, runs: Sequence[RunHandle], scope: Scope) -> tuple[SceneComparison, dict[str, Changes]]:
-    entries, names = [each.scenes[scene] for each in runs], [each.name for each in runs]
+    entries, names = [run.scenes[scene] for run in runs], [run.name for run in runs]
     common = pair(entries, names, scope)
     numbers = range(1, len(entries))
     everything = corrected([contrasts(common, entries[0], entries[n], n) for n in numbers])
@@ -364,15 +366,15 @@ def _scene(scene: str, runs: Sequence[RunHandle], scope: Scope) -> tuple[SceneCo
     for n, of_all, of_classes in zip(numbers, everything, classes, strict=True):
         result = Against(names[n], of_all, of_classes)
         if common.regions is not None:
-            worse, named = worse_areas(common, n), entries[n].named
+            worse, name_frames = worse_areas(common, n), entries[n].named
             changes[names[n]] = worse.changes
             result = dataclasses.replace(
                 result,
                 compared=worse.changes.compared,
                 worse=worse.changes.worse,
                 better=worse.changes.better,
-                areas=tuple(dataclasses.replace(area, frames=named(area.frames)) for area in worse.areas),
-                top_frames=named(worse.top_frames),
+                areas=tuple(dataclasses.replace(area, frames=name_frames(area.frames)) for area in worse.areas),
+                top_frames=name_frames(worse.top_frames),
                 columns=Path(COLUMNS) / f"{slug(scene, names[0], names[n])}.parquet",
             )
         against.append(result)
@@ -399,7 +401,7 @@ def _over_all(scenes: Sequence[SceneComparison]) -> tuple[Against, ...]:
     everything = corrected([over_scenes([against.contrasts for against in run]) for run in runs])
     classes = corrected([over_scenes([against.by_class for against in run]) for run in runs])
     return tuple(
-        Against(run[0].other, of_all, of_classes, *(sum(getattr(each, name) for each in run) for name in _COUNTS))
+        Against(run[0].other, of_all, of_classes, *(sum(getattr(against, name) for against in run) for name in _COUNTS))
         for run, of_all, of_classes in zip(runs, everything, classes, strict=True)
     )
 

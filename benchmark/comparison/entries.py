@@ -113,7 +113,7 @@ class Entry(EntryNumbers):
             return tuple(frames)
         with self.record.series.open(encoding="utf-8", newline="") as lines:
             names = {row["frame"]: row.get("name") or "" for row in csv.DictReader(lines)}
-        return tuple(replace(each, name=names.get(str(each.frame), "")) for each in frames)
+        return tuple(replace(frame, name=names.get(str(frame.frame), "")) for frame in frames)
 
     @property
     def caveat(self) -> str:
@@ -171,12 +171,14 @@ def open_runs(named: Sequence[str | os.PathLike[str]]) -> tuple[RunHandle, ...]:
     Raises:
         ConfigError, DataError: As `open_run` does.
     """
-    runs = [open_run(each) for each in named]
+    runs = [open_run(source) for source in named]
     folders = ["" if run.source is None else run.source.resolve().name for run in runs]
     models = [run.model for run in runs]
-    both = [f"{folder}:{model}" for folder, model in zip(folders, models, strict=True)]
-    whole = [f"{run.source}:{run.model}" for run in runs]
-    names = next((naming for naming in (models, folders, both) if len({*naming}) == len({*whole})), whole)
+    folder_and_model = [f"{folder}:{model}" for folder, model in zip(folders, models, strict=True)]
+    full_names = [f"{run.source}:{run.model}" for run in runs]
+    names = next(
+        (naming for naming in (models, folders, folder_and_model) if len({*naming}) == len({*full_names})), full_names
+    )
     names = [run.model if run.source is None else name for name, run in zip(names, runs, strict=True)]
     in_memory = [name for name, run in zip(names, runs, strict=True) if run.source is None]
     if twice := next((name for name in in_memory if names.count(name) > 1), None):
@@ -217,15 +219,15 @@ def open_run(named: str | os.PathLike[str]) -> RunHandle:
         DataError: If it is damaged.
     """
     path, model_named = run_and_model(named)
-    wanted = model_named or ""
+    model = model_named or ""
     if not path.exists():
         raise ConfigError(f"{path}: there is no such folder; give the folder of a run, or FOLDER:MODEL")
     if path.is_file():
         small = load_summary(path)
-        _chosen(path, [small.model], wanted)
+        _chosen(path, [small.model], model)
         return small
     result = load_result(path)
-    return handle_of(result, _chosen(path, result.models, wanted), path if isinstance(named, str | Path) else None)
+    return handle_of(result, _chosen(path, result.models, model), path if isinstance(named, str | Path) else None)
 
 
 def handle_of(result: Result, model: str, source: Path | None = None) -> RunHandle:
@@ -256,17 +258,17 @@ def shared_scenes(runs: Sequence[RunHandle]) -> tuple[str, ...]:
     Raises:
         DataError: If there is none, where one was simulated with other seeds, or its classes differ.
     """
-    first, *others = runs
-    scenes = tuple(scene for scene in first.scenes if all(scene in other.scenes for other in others))
+    first, *rest = runs
+    scenes = tuple(scene for scene in first.scenes if all(scene in other.scenes for other in rest))
     if not scenes:
-        other = next((each for each in others if not first.scenes.keys() & each.scenes.keys()), others[-1])
+        other = next((run for run in rest if not first.scenes.keys() & run.scenes.keys()), rest[-1])
         listed = [", ".join([*run.scenes][:3]) + (", ..." if len(run.scenes) > 3 else "") for run in (first, other)]
         raise DataError(
             f"{first.where} and {other.where} have no scene in common ({listed[0] or 'none'}; {listed[1] or 'none'});"
             " run both on the same scenes"
         )
     for scene in scenes:
-        for other in others:
+        for other in rest:
             _require_same_scene(scene, first.scenes[scene], other.scenes[scene])
     return scenes
 
@@ -287,11 +289,11 @@ def _require_same_scene(scene: str, one: Entry, other: Entry) -> None:
         )
 
 
-def _chosen(path: Path, models: Sequence[str], wanted: str) -> str:
-    if wanted:
-        if wanted not in models:
-            raise ConfigError(f"{path}: no model '{wanted}'; {nearest(wanted, models)}")
-        return wanted
+def _chosen(path: Path, models: Sequence[str], model: str) -> str:
+    if model:
+        if model not in models:
+            raise ConfigError(f"{path}: no model '{model}'; {nearest(model, models)}")
+        return model
     predicted = [name for name in models if name != GROUND_TRUTH] or list(models)
     if not predicted:
         raise ConfigError(f"{path}: it holds no finished unit")
@@ -376,7 +378,7 @@ def save_summary(
     content = json.dumps({"kind": KIND, "schema": SCHEMA, **to_json(_Content(run.model, scenes, {**run.about}))})
     sums = [entry.sums for entry in run.scenes.values()]
     while len(data := _archive(content, sums, single=single)) > most:
-        coarser = [_coarser(each, keep_spots=keep_spots) for each in sums]
+        coarser = [_coarser(part, keep_spots=keep_spots) for part in sums]
         if all(np.array_equal(a.cell, b.cell) and a.step == b.step for a, b in zip(coarser, sums, strict=True)):
             raise DataError(f"{path}: a summary of {len(sums)} scenes takes {len(data)} bytes; use fewer scenes")
         sums = coarser
@@ -442,9 +444,9 @@ def _archive(content: str, sums: list[ClusterSums], *, single: bool) -> bytes:
     data = io.BytesIO()
     with zipfile.ZipFile(data, "w", zipfile.ZIP_DEFLATED) as archive, ScratchFolder() as folder:
         archive.writestr(zipfile.ZipInfo(CONTENT), content, zipfile.ZIP_DEFLATED)
-        for i, own in enumerate(sums):
+        for i, scene_sums in enumerate(sums):
             part = folder / "sums.parquet"
-            own.save(part, single=single)
+            scene_sums.save(part, single=single)
             archive.writestr(zipfile.ZipInfo(f"{i}.parquet"), part.read_bytes())
     return data.getvalue()
 

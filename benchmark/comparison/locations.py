@@ -61,7 +61,7 @@ class Changed:
         """Compare two maps, or parts of them, voxel by voxel."""
         rows = shared_rows(base, other)
         again = (base.op[rows[0]] >= 2) & (other.op[rows[1]] >= 2)
-        base, other = (table.rows(own[again]) for table, own in zip((base, other), rows, strict=True))
+        base, other = (table.rows(table_rows[again]) for table, table_rows in zip((base, other), rows, strict=True))
         between = [disagreement(table)[1] for table in (base, other)]
         true = right = None
         if truth is not None:
@@ -125,14 +125,14 @@ class Worse:
 def worse_areas(common: Common, number: int) -> Worse:
     """Return the areas of a run that got worse than the base; frames are known where observations were stored."""
     compared = worse = better = 0
-    left, shown = list[Changed](), list[Changed]()
+    relevant_parts, displayed_parts = list[Changed](), list[Changed]()
     for changed in _changed(common, number):
         compared += len(changed.change)
         worse += int(np.count_nonzero(changed.change <= -WORSE))
         better += int(np.count_nonzero(changed.change >= WORSE))
-        left.append(changed.rows(changed.matters))
-        shown.append(changed.rows(changed.matters | in_share(changed.table, common.shown)))
-    result, seen = Changed.joined(left), Changed.joined(shown)
+        relevant_parts.append(changed.rows(changed.matters))
+        displayed_parts.append(changed.rows(changed.matters | in_share(changed.table, common.shown)))
+    result, displayed = Changed.joined(relevant_parts), Changed.joined(displayed_parts)
     index = result.table.index
     area, improved_alike = _clusters(index, result.label, -result.change, WORSE)
     observations = _observations(common, number, index, result.table.voxel_size)
@@ -149,15 +149,15 @@ def worse_areas(common: Common, number: int) -> Worse:
         """Return the areas of some voxels (n,), which hold those that matter among them."""
         keys, theirs = voxel_keys(table.index, index)
         at = np.minimum(np.searchsorted(keys, theirs), max(len(keys) - 1, 0))
-        known = keys[at] == theirs if len(keys) else np.zeros(len(theirs), np.bool_)
-        wrong = None if wrong_area is None else _put(len(keys), at[known], wrong_area[known])
-        return _put(len(keys), at[known], area[known]), wrong
+        inside = keys[at] == theirs if len(keys) else np.zeros(len(theirs), np.bool_)
+        wrong = None if wrong_area is None else _put(len(keys), at[inside], wrong_area[inside])
+        return _put(len(keys), at[inside], area[inside]), wrong
 
     def parts() -> Iterator[dict[str, npt.NDArray[Any]]]:
         for changed in _changed(common, number):
             yield _columns(changed, *numbers(changed.table))
 
-    changes = Changes(seen, compared, worse, better, *numbers(seen.table), parts)
+    changes = Changes(displayed, compared, worse, better, *numbers(displayed.table), parts)
     top_frames = () if observations is None else _top_frames(observations.among(area > 0, result.label))
     return Worse(tuple(listed), top_frames, changes)
 
@@ -193,8 +193,8 @@ def _clusters(index: Int32, label: Int64, loss: Float64, least: float) -> tuple[
     The second array (m,) counts the areas that improved by as much.
     """
     area, mass = connected(index, label, loss, loss >= least)
-    _, others = connected(index, label, -loss, loss <= -least)
-    return area, np.array([np.count_nonzero(others >= observed - 1e-9) for observed in mass], dtype=np.int64)
+    _, improved_mass = connected(index, label, -loss, loss <= -least)
+    return area, np.array([np.count_nonzero(improved_mass >= observed - 1e-9) for observed in mass], dtype=np.int64)
 
 
 def connected(index: Int32, label: Int64, loss: Float64, where: Mask) -> tuple[Int64, Float64]:
@@ -211,11 +211,11 @@ def connected(index: Int32, label: Int64, loss: Float64, where: Mask) -> tuple[I
     mass: Float64 = np.bincount(of, weights=loss[rows]).astype(np.float64)
     count = np.bincount(of)
     order = np.lexsort((np.arange(len(mass)), -mass))
-    left = order[count[order] >= LEAST]
+    large_areas = order[count[order] >= LEAST]
     rank = np.zeros(len(mass), dtype=np.int64)
-    rank[left] = np.arange(1, len(left) + 1)
+    rank[large_areas] = np.arange(1, len(large_areas) + 1)
     number[rows] = rank[of]
-    return number, mass[left]
+    return number, mass[large_areas]
 
 
 def _touching(index: Int32, label: Int64) -> tuple[Int64, Int64]:
@@ -249,13 +249,13 @@ def _areas(
         where = number == k
         cells = (index[where] + 0.5) * voxel_size
         x, y, z = cells.mean(axis=0).tolist()
-        seen = None if observations is None else observations.among(where, label)
+        of_area = None if observations is None else observations.among(where, label)
         of = int(label[where][0])
         listed.append(
             Area(
-                k, what, names[of], "" if seen is None else seen.confused_with(of, names), len(cells),
+                k, what, names[of], "" if of_area is None else of_area.confused_with(of, names), len(cells),
                 float(loss[where].mean()), (x, y, z), float(np.linalg.norm(np.ptp(cells, axis=0) + voxel_size)),
-                int(improved_alike[k - 1]), () if seen is None else _top_frames(seen),
+                int(improved_alike[k - 1]), () if of_area is None else _top_frames(of_area),
             )
         )  # fmt: skip
     return listed
@@ -302,9 +302,9 @@ class Seen:
         return names[int(missing.argmax())] if missing.max(initial=0) > 0 else ""
 
 
-def _top_frames(seen: Seen) -> tuple[FrameShare, ...]:
-    frames, of = np.unique(seen.frame, return_inverse=True)
-    lost = np.maximum(np.bincount(of, weights=seen.lost, minlength=len(frames)), 0.0)
+def _top_frames(observations: Seen) -> tuple[FrameShare, ...]:
+    frames, of = np.unique(observations.frame, return_inverse=True)
+    lost = np.maximum(np.bincount(of, weights=observations.lost, minlength=len(frames)), 0.0)
     if not lost.sum() > 0:
         return ()
     order = np.argsort(-lost, kind="stable")
@@ -326,7 +326,7 @@ def _observations(common: Common, number: int, index: Int32, voxel_size: float) 
 def _rows_of(log: Events, index: Int32, voxel_size: float) -> tuple[Int64, Int64, Float64]:
     """Return for each observation the row of the voxel that holds its spot, or -1, its frame and its shares."""
     centre = (np.stack([log.ix, log.iy, log.iz], axis=1) + 0.5) * log.voxel_size
-    keys, wanted = voxel_keys(np.floor(centre / voxel_size).astype(np.int32), index)
-    at = np.minimum(np.searchsorted(wanted, keys), max(len(wanted) - 1, 0))
-    row = np.where(wanted[at] == keys, at, -1) if len(wanted) else np.full(len(keys), -1)
+    keys, table_keys = voxel_keys(np.floor(centre / voxel_size).astype(np.int32), index)
+    at = np.minimum(np.searchsorted(table_keys, keys), max(len(table_keys) - 1, 0))
+    row = np.where(table_keys[at] == keys, at, -1) if len(table_keys) else np.full(len(keys), -1)
     return row[log.voxel].astype(np.int64), log.frame.astype(np.int64), log.evidence[:]

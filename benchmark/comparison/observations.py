@@ -54,20 +54,20 @@ def common_observations(models: Sequence[SpotObservations]) -> CommonObservation
     models = same_spots(models)
     of, first = _numbered(models)
     labelled, silent, near, far = np.zeros((4, len(models), len(first)))
-    for k, (own, sample) in enumerate(zip(of, models, strict=True)):
-        labelled[k] = np.bincount(own[sample.label < sample.K], minlength=len(first))
-        silent[k] = np.bincount(own[sample.label == sample.K], minlength=len(first))
-        near[k], far[k] = (np.bincount(own, squares, len(first)) for squares in (sample.near, sample.far))
+    for k, (numbers, sample) in enumerate(zip(of, models, strict=True)):
+        labelled[k] = np.bincount(numbers[sample.label < sample.K], minlength=len(first))
+        silent[k] = np.bincount(numbers[sample.label == sample.K], minlength=len(first))
+        near[k], far[k] = (np.bincount(numbers, squares, len(first)) for squares in (sample.near, sample.far))
     elsewhere = (near == near[0]).all(axis=0) & (far != far[0]).any(axis=0)
     common: Mask = (labelled > 0).all(axis=0) & (silent == 0).all(axis=0) & ~elsewhere
     most = labelled.max(axis=0)
     asked = SpotObservations.stacked(models).only(first)
     shared, ignoring = [], []
-    for sample, own, seen in zip(models, of, labelled, strict=True):
-        shared.append(sample.only(common[own]))
-        ignoring.append(_filled(sample.labelled(), asked, most - seen))
+    for sample, numbers, counts in zip(models, of, labelled, strict=True):
+        shared.append(sample.only(common[numbers]))
+        ignoring.append(_filled(sample.labelled(), asked, most - counts))
     total = most.sum()
-    missing = tuple(float(1 - seen.sum() / total) if total else math.nan for seen in labelled)
+    missing = tuple(float(1 - counts.sum() / total) if total else math.nan for counts in labelled)
     return CommonObservations(tuple(shared), tuple(ignoring), missing)
 
 
@@ -92,8 +92,8 @@ def psa_bounds(log: Events) -> tuple[float, float]:
 
     Manski (1990, American Economic Review 80): pairs of observations of which one is missing agree never, or always.
     """
-    low, known = (mean_products(log, each) for each in (log.evidence[:, :-1], 1 - log.evidence[:, -1:]))
-    missing = 1 - known
+    low, labelled_share = (mean_products(log, shares) for shares in (log.evidence[:, :-1], 1 - log.evidence[:, -1:]))
+    missing = 1 - labelled_share
     high = low + np.where(missing > ONE_HOT, missing, 0.0)  # rounding leaves nothing out
     return (float(low.mean()), float(high.mean())) if len(low) else (math.nan, math.nan)
 
@@ -110,19 +110,21 @@ class SharedObservations:
 def compared_observations(samples: Mapping[str, SpotObservations]) -> SharedObservations:
     """Return the observations that all models made, and how their order depends on those that some left out."""
     names = list(samples)
-    both = common_observations([samples[name] for name in names])
-    shared, ignoring = (dict(zip(names, each, strict=True)) for each in (both.shared, both.ignoring))
-    logs = {name: own.observations() for name, own in shared.items()}
+    common = common_observations([samples[name] for name in names])
+    shared, ignoring = (dict(zip(names, answers, strict=True)) for answers in (common.shared, common.ignoring))
+    logs = {name: sample.observations() for name, sample in shared.items()}
     sums: dict[str, ClusterSums] = {}
     edge: float | None = None
-    for name, own in shared.items():
-        sums[name] = sums_of_spots(own, edge)
+    for name, sample in shared.items():
+        sums[name] = sums_of_spots(sample, edge)
         edge = sums[name].answers[0].edge
     ignored = []
-    for name, missing in zip(names, both.missing, strict=True):
-        log, whole = ignoring[name].observations(), sums_of_spots(samples[name])
-        pairs = LabelledPairs(pairs_labelled(log), chance_of(whole.answers[0]))
-        ignored.append(Ignored(name, missing, *psa_bounds(log), pairs.of_all(min(value_of(whole, ALPHA.key), 1.0))))
+    for name, missing in zip(names, common.missing, strict=True):
+        log, model_sums = ignoring[name].observations(), sums_of_spots(samples[name])
+        pairs = LabelledPairs(pairs_labelled(log), chance_of(model_sums.answers[0]))
+        ignored.append(
+            Ignored(name, missing, *psa_bounds(log), pairs.of_all(min(value_of(model_sums, ALPHA.key), 1.0)))
+        )
     first = next(iter(logs.values()))
     bounds = {row.model: (row.psa_low, row.psa_high) for row in ignored}
     by_psa = sorted(names, key=lambda name: -mean(psa(logs[name].table())))

@@ -133,9 +133,13 @@ def _paired(entries: Sequence[Entry], names: Sequence[str]) -> Common:
     if not any(row.common_share for row in covered):
         return _apart(entries, "the maps have no voxel in common: their locations or frames of reference differ")
     result = _with_observations(_by_voxels(entries, regions), names, records)
-    shown = share_of(min(row.voxels for row in covered))
-    notes = (*result.notes, *_notes(covered), *((SHOWN.format(n=round(1 / shown)),) if shown < 1 else ()))
-    return replace(result, notes=notes, regions=result.regions or regions, coverage=covered, shown=shown)
+    displayed_share = share_of(min(row.voxels for row in covered))
+    notes = (
+        *result.notes,
+        *_notes(covered),
+        *((SHOWN.format(n=round(1 / displayed_share)),) if displayed_share < 1 else ()),
+    )
+    return replace(result, notes=notes, regions=result.regions or regions, coverage=covered, shown=displayed_share)
 
 
 def _truth(records: Sequence[Record]) -> Tiles[VoxelTable] | None:
@@ -147,17 +151,17 @@ def _regions(
     names: Sequence[str], maps: Sequence[Tiles[VoxelTable]], truth: Tiles[VoxelTable] | None
 ) -> Iterator[Region]:
     """Yield the maps of runs tile by tile, or whole, with the ground truth, if it has their classes."""
-    for own in side_by_side([*maps, *([] if truth is None else [truth])]):
-        tables, true = own[: len(maps)], own[len(maps) :]
-        known = true[0] if true and true[0].classes == tables[0].classes else None
-        yield Region(dict(zip(names, tables, strict=True)), None, known)
+    for region in side_by_side([*maps, *([] if truth is None else [truth])]):
+        tables, true = region[: len(maps)], region[len(maps) :]
+        region_truth = true[0] if true and true[0].classes == tables[0].classes else None
+        yield Region(dict(zip(names, tables, strict=True)), None, region_truth)
 
 
 def joint_class(tables: Iterable[VoxelTable]) -> Int64:
     """Return the dominant class (n,) of the same voxels in several maps, each map with the same weight."""
-    first, *others = (table.summing_to_op() for table in tables)
+    first, *rest = (table.summing_to_op() for table in tables)
     beliefs = first.evidence[:] / first.op[:, None]
-    for other in others:
+    for other in rest:
         beliefs = beliefs + other.evidence[:] / other.op[:, None]
     label: Int64 = beliefs.round(9).argmax(axis=1)
     return label
@@ -259,8 +263,8 @@ def _sums(table: VoxelTable, label: Int64 | None) -> ClusterSums:
 
 def _same_frames(observations: Sequence[SpotObservations]) -> bool:
     """Return whether frames of one index were taken from one position, and flights share most frames."""
-    first, *others = (each.views for each in observations)
-    for other in others:
+    first, *rest = (sample.views for sample in observations)
+    for other in rest:
         _, one, same = np.intersect1d(first.frame, other.frame, return_indices=True)
         if 2 * len(one) < min(len(first), len(other)):
             return False
@@ -271,11 +275,11 @@ def _same_frames(observations: Sequence[SpotObservations]) -> bool:
 
 def _fewer_frames(observations: Sequence[SpotObservations]) -> tuple[str, ...]:
     """Return a note where a run left out frames that others have."""
-    if len({each.frames for each in observations}) == 1:
+    if len({sample.frames for sample in observations}) == 1:
         return ()
-    both = len(functools.reduce(np.intersect1d, [each.views.frame for each in observations]))
-    listed = " and ".join(str(each.frames) for each in observations)
-    return (f"the runs fused {listed} frames: alpha is of the {both} views that all have; flicker is left out",)
+    num_common = len(functools.reduce(np.intersect1d, [sample.views.frame for sample in observations]))
+    listed = " and ".join(str(sample.frames) for sample in observations)
+    return (f"the runs fused {listed} frames: alpha is of the {num_common} views that all have; flicker is left out",)
 
 
 # --- Reasons against pairing ------------------------------------------------------------------------------------------
@@ -283,8 +287,8 @@ def _fewer_frames(observations: Sequence[SpotObservations]) -> tuple[str, ...]:
 
 def _other_frame_of_reference(entries: Sequence[Entry]) -> str:
     """Return why coordinates do not show the same locations; empty where they do."""
-    first, *others = (entry.georeference for entry in entries)
-    for entry, views in zip(entries[1:], others, strict=True):
+    first, *rest = (entry.georeference for entry in entries)
+    for entry, views in zip(entries[1:], rest, strict=True):
         if (views is None) != (first is None):
             without = entry if views is None else entries[0]
             return f"{without.where} has no georeference, and the other has one"

@@ -107,9 +107,9 @@ def _ranking(scenes: tuple[Files, ...], names: tuple[str, ...]) -> Ranking:
     common = [_common(files) for files in scenes] if len(names) > 1 else []
     apart = tuple(name for name in names if common and name not in common[0][0])
     names = tuple(name for name in names if name not in apart)
-    known = [each for each in common if {*names} <= each[0].keys()]
-    of_all = {name: macro_mean([alpha[name] for _, alpha in known]) for name in names} if known else {}
-    return replace(ranked([sums for sums, _ in known], names, of_all=of_all), apart=apart)
+    complete = [scene for scene in common if {*names} <= scene[0].keys()]
+    of_all = {name: macro_mean([alpha[name] for _, alpha in complete]) for name in names} if complete else {}
+    return replace(ranked([sums for sums, _ in complete], names, of_all=of_all), apart=apart)
 
 
 def ranked(
@@ -132,15 +132,15 @@ def ranked(
         differs = change.decided and p < 1 - change.level and not change.low <= 0 <= change.high
         silent = bool(differs and of_all) and change.value * ((of_all or {})[b] - (of_all or {})[a]) < 0
         interval = change.value, change.low, change.high
-        shown = differs and not silent
+        is_significant = differs and not silent
         differences.append(
-            AlphaDifference(b, a, *interval, len(scenes), p, change.scope, change.undecided, shown, silent)
+            AlphaDifference(b, a, *interval, len(scenes), p, change.scope, change.undecided, is_significant, silent)
         )
     alpha = {name: _mean_alpha(name, scenes, places) for name in names} if scenes else {}
     better = dict.fromkeys(alpha, 0)
-    for each in differences:
-        if each.shown:
-            better[each.other if each.value > 0 else each.model] += 1
+    for difference in differences:
+        if difference.shown:
+            better[difference.other if difference.value > 0 else difference.model] += 1
     order = sorted(alpha, key=lambda name: (better[name], -alpha[name]))
     ranks = tuple((1 + n, tuple(tied)) for n, tied in itertools.groupby(order, key=better.__getitem__))
     return Ranking(ranks, tuple(differences))
@@ -152,7 +152,10 @@ def over_places(values: Sequence[Interval], places: Sequence[str]) -> Interval:
 
 
 def _by_place(values: Sequence[Value], places: Sequence[str]) -> list[list[Value]]:
-    return [[own for own, of in zip(values, places, strict=True) if of == place] for place in dict.fromkeys(places)]
+    return [
+        [place_value for place_value, of in zip(values, places, strict=True) if of == place]
+        for place in dict.fromkeys(places)
+    ]
 
 
 def _mean_alpha(name: str, scenes: Sequence[Mapping[str, ClusterSums]], places: Sequence[str]) -> float:
@@ -208,7 +211,7 @@ def _common(files: Files) -> tuple[Mapping[str, ClusterSums], Mapping[str, float
     sums is alpha of each model if what it leaves out counts as disagreeing.
     """
     loaded = {name: SpotObservations.load(file) for name, file, _ in files}
-    names = sharing_classes({name: each.classes for name, each in loaded.items()})
+    names = sharing_classes({name: sample.classes for name, sample in loaded.items()})
     vocabularies = over_one_model([*loaded])
     if {*names} & {*vocabularies}:
         vocabularies = tuple(name for name in loaded if name in (*names, *vocabularies))
@@ -216,5 +219,5 @@ def _common(files: Files) -> tuple[Mapping[str, ClusterSums], Mapping[str, float
         names, loaded = vocabularies, with_one_number_of_classes({name: loaded[name] for name in vocabularies})
     if not names:
         return {}, {}
-    both = compared_observations({name: loaded[name] for name in names})
-    return both.sums, {row.model: row.alpha for row in both.compared.ignored}
+    common = compared_observations({name: loaded[name] for name in names})
+    return common.sums, {row.model: row.alpha for row in common.compared.ignored}

@@ -85,8 +85,8 @@ def in_share(table: VoxelTable, share: float) -> Mask:
     """Return the mask (n,) of voxels in the sample that is this share of all, by a hash of their index."""
     if share >= 1:
         return np.ones(len(table), np.bool_)
-    drawn: Mask = streams(table, slice(None), 0) >> np.uint64(11) < np.uint64(share * 2**53)
-    return drawn
+    in_sample: Mask = streams(table, slice(None), 0) >> np.uint64(11) < np.uint64(share * 2**53)
+    return in_sample
 
 
 def common_voxels(regions: Regions) -> Region:
@@ -95,20 +95,20 @@ def common_voxels(regions: Regions) -> Region:
     share, parts = share_of(count), list[Region]()
     for region in regions():
         tables, logs, rows = {}, {}, repeated_rows(region.tables)
-        drawn = in_share(next(iter(region.tables.values())).rows(rows[0]), share)
-        for (name, table), own in zip(region.tables.items(), rows, strict=True):
-            tables[name] = table.rows(own[drawn])
+        in_sample = in_share(next(iter(region.tables.values())).rows(rows[0]), share)
+        for (name, table), table_rows in zip(region.tables.items(), rows, strict=True):
+            tables[name] = table.rows(table_rows[in_sample])
             if region.events is not None:
-                logs[name] = region.events[name].rows(own[drawn])
+                logs[name] = region.events[name].rows(table_rows[in_sample])
         first, truth = next(iter(tables.values())), region.truth
         true = None if truth is None else truth.rows(shared_rows(truth, first)[0])
         parts.append(Region(tables, logs or None, true))
-    tables = {name: VoxelTable.joined([each.tables[name] for each in parts]) for name in parts[0].tables}
-    events = [each.events for each in parts if each.events is not None]
-    truths = [each.truth for each in parts if each.truth is not None]
+    tables = {name: VoxelTable.joined([part.tables[name] for part in parts]) for name in parts[0].tables}
+    events = [part.events for part in parts if part.events is not None]
+    truths = [part.truth for part in parts if part.truth is not None]
     return Region(
         tables,
-        {name: Events.joined([each[name] for each in events]) for name in tables} if events else None,
+        {name: Events.joined([log[name] for log in events]) for name in tables} if events else None,
         VoxelTable.joined(truths) if truths else None,
         share,
     )

@@ -36,7 +36,9 @@ def to_arrays(value: Any, name: str = "") -> Arrays:
     if not isinstance(value, Mapping):
         return {name: np.asarray(value)}
     below = f"{name}/" if name else ""
-    return {path: each for field, own in value.items() for path, each in to_arrays(own, below + field).items()}
+    return {
+        path: values for field, content in value.items() for path, values in to_arrays(content, below + field).items()
+    }
 
 
 def from_arrays(cls: type[T], arrays: Mapping[str, npt.NDArray[Any]], name: str = "") -> T:
@@ -53,7 +55,7 @@ def from_arrays(cls: type[T], arrays: Mapping[str, npt.NDArray[Any]], name: str 
 def _read(kind: Any, arrays: Mapping[str, npt.NDArray[Any]], path: str) -> Any:
     inside = {key.removeprefix(f"{path}/"): key for key in arrays if key.startswith(f"{path}/")}
     if get_origin(kind) in (Union, types.UnionType):
-        kind = next(own for own in get_args(kind) if own is not types.NoneType)
+        kind = next(member for member in get_args(kind) if member is not types.NoneType)
         if path not in arrays and not inside:
             return None
     if dataclasses.is_dataclass(kind):
@@ -61,7 +63,7 @@ def _read(kind: Any, arrays: Mapping[str, npt.NDArray[Any]], path: str) -> Any:
     origin = get_origin(kind)
     origin = get_origin(getattr(origin, "__value__", None)) or origin  # NDArray is a `type` alias from NumPy 2.5 on
     if origin is not None and origin is not np.ndarray and issubclass(origin, Mapping):
-        return {key: arrays[own] for key, own in inside.items()}
+        return {key: arrays[full_key] for key, full_key in inside.items()}
     if origin is tuple:
         return tuple(arrays[path].tolist())
     return arrays[path] if origin is np.ndarray else kind(arrays[path][()])
@@ -114,10 +116,10 @@ class RecentArrays:
     def get(self, number: int, make: Callable[[], A]) -> A:
         """Return the array of a number, read-only; make the array if it is not stored."""
         with self._lock:
-            known = self._arrays.pop(number, None)
-            if known is not None:
-                self._arrays[number] = known
-                return cast(A, known)
+            cached = self._arrays.pop(number, None)
+            if cached is not None:
+                self._arrays[number] = cached
+                return cast(A, cached)
         made = make()
         made.flags.writeable = False
         with self._lock:

@@ -61,9 +61,9 @@ class Code:
         module = guarded(text, lambda: _of_file(Path(source)) if in_file else importlib.import_module(source))
         target = getattr(module, name, None)
         if target is None:
-            own = [key for key, value in vars(module).items() if callable(value) and not key.startswith("_")]
-            near = difflib.get_close_matches(name, own, n=1)
-            hint = f"did you mean '{near[0]}'?" if near else f"it has {', '.join(own) or 'nothing to call'}"
+            callables = [key for key, value in vars(module).items() if callable(value) and not key.startswith("_")]
+            near = difflib.get_close_matches(name, callables, n=1)
+            hint = f"did you mean '{near[0]}'?" if near else f"it has {', '.join(callables) or 'nothing to call'}"
             raise ConfigError(f"{source}: has no '{name}'; {hint}")
         if not callable(target):
             raise ConfigError(f"{text}: is a {type(target).__name__}; name a class, or a function of an image")
@@ -235,12 +235,12 @@ def _import_first_from(folder: Path) -> None:
     """
     if _searched[:1] == [folder] or (folder not in (*_searched, *_allowed) and str(folder) in sys.path):
         return
-    others = [other for other in (*_searched, *_allowed) if other != folder]
-    named = {path.stem for other in others if other.is_dir() for path in other.iterdir()}
-    for name in {path.stem for path in folder.iterdir()} & named & set(sys.modules):
+    other_folders = [other for other in (*_searched, *_allowed) if other != folder]
+    module_names = {path.stem for other in other_folders if other.is_dir() for path in other.iterdir()}
+    for name in {path.stem for path in folder.iterdir()} & module_names & set(sys.modules):
         module = sys.modules[name]
         places = list(getattr(module, "__path__", [module.__file__ or ""]))
-        if any(Path(place).parent in others for place in places):
+        if any(Path(place).parent in other_folders for place in places):
             for part in [part for part in sys.modules if part.partition(".")[0] == name]:
                 del sys.modules[part]
     sys.path[:] = [name for name in sys.path if Path(name) not in (*_searched, *_allowed)]

@@ -74,18 +74,18 @@ class _Cache(FunctionCache):
                 super().save_overload(signature, data)  # type: ignore[no-untyped-call]
 
 
-def _stamp(function: Any, seen: frozenset[Any]) -> tuple[Any, ...]:
+def _stamp(function: Any, visited: frozenset[Any]) -> tuple[Any, ...]:
     """Return time and size of the file of a function, and of what it names: compiled functions, numbers, arrays."""
     file = Path(function.__code__.co_filename)
     stamp: list[Any] = [(file.name, file.stat().st_mtime, file.stat().st_size) if file.exists() else file.name]
     names, codes = set[str](), [function.__code__]
     for code in codes:  # with those of functions inside it, which are added as they come
         names.update(code.co_names)
-        codes += [each for each in code.co_consts if isinstance(each, types.CodeType)]
+        codes += [constant for constant in code.co_consts if isinstance(constant, types.CodeType)]
     for name in sorted(names):
         value = function.__globals__.get(name)
-        if isinstance(value, Dispatcher) and value.py_func not in seen:
-            stamp.append(_stamp(value.py_func, seen | {function}))
+        if isinstance(value, Dispatcher) and value.py_func not in visited:
+            stamp.append(_stamp(value.py_func, visited | {function}))
         elif isinstance(value, bool | int | float | str | tuple | np.ndarray | np.generic):
             stamp.append((name, value.tobytes() if isinstance(value, np.ndarray) else repr(value)))
     return tuple(stamp)

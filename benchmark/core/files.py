@@ -146,19 +146,19 @@ class ScratchFolder:
     def __init__(self) -> None:
         _remove_abandoned_scratch(Path(tempfile.gettempdir()))
         while True:
-            own = Path(tempfile.mkdtemp(prefix=SCRATCH))
+            folder = Path(tempfile.mkdtemp(prefix=SCRATCH))
             try:
-                handle = os.open(own, os.O_RDONLY)
+                handle = os.open(folder, os.O_RDONLY)
             except FileNotFoundError:  # another process took it for one that is abandoned
                 continue
             with suppress(OSError):  # a file system without locks
                 fcntl.flock(handle, fcntl.LOCK_SH)
-            if own.exists():  # else it was removed before it was locked
+            if folder.exists():  # else it was removed before it was locked
                 break
             os.close(handle)
-        self.path = own / "files"  # a run locks it
+        self.path = folder / "files"  # a run locks it
         self.path.mkdir()
-        self.remove = weakref.finalize(self, _remove_scratch, own, handle)
+        self.remove = weakref.finalize(self, _remove_scratch, folder, handle)
 
     def __enter__(self) -> Path:
         return self.path
@@ -167,8 +167,8 @@ class ScratchFolder:
         self.remove()
 
 
-def _remove_scratch(own: Path, handle: int) -> None:
-    shutil.rmtree(own, ignore_errors=True)
+def _remove_scratch(folder: Path, handle: int) -> None:
+    shutil.rmtree(folder, ignore_errors=True)
     os.close(handle)
 
 
@@ -272,8 +272,8 @@ def write_stack(
 
 def cache_folder() -> Path:
     """Return the folder of caches: SEMSTAB_CACHE, or semstab below XDG_CACHE_HOME, which is ~/.cache."""
-    if own := os.environ.get("SEMSTAB_CACHE"):
-        return Path(own)
+    if path := os.environ.get("SEMSTAB_CACHE"):
+        return Path(path)
     return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "semstab"
 
 
@@ -389,8 +389,8 @@ def read_arrays(path: Path) -> Arrays | None:
     except Exception:  # noqa: BLE001  numpy raises a dozen kinds of them on a damaged .npz file
         return None
     digest = arrays.pop(DIGEST, None)
-    whole = all(isinstance(array, np.ndarray) for array in arrays.values())  # a file that is not an array gives bytes
-    return arrays if whole and digest is not None and np.array_equal(digest, _digest(arrays)) else None
+    valid = all(isinstance(array, np.ndarray) for array in arrays.values())  # a file that is not an array gives bytes
+    return arrays if valid and digest is not None and np.array_equal(digest, _digest(arrays)) else None
 
 
 def _digest(arrays: Arrays) -> UInt8:

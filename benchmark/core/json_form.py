@@ -78,8 +78,8 @@ _WRITERS: Mapping[Any, Callable[[Any], Any]] = {
 def _fields(fields: list[tuple[str, str | None]], value: Any) -> dict[str, Any]:
     content: dict[str, Any] = {}
     for name, suffix in fields:
-        own = to_json(getattr(value, name))
-        content |= {name: own} if suffix is None else {key + suffix: item for key, item in own.items()}
+        field_json = to_json(getattr(value, name))
+        content |= {name: field_json} if suffix is None else {key + suffix: item for key, item in field_json.items()}
     return content
 
 
@@ -133,7 +133,7 @@ def _adapted(schema: Any) -> Any:
     if not isinstance(schema, dict):
         return schema
     kind, cls = schema.get("type"), cast(Any, schema.get("cls"))
-    own = {key: _adapted(value) for key, value in schema.items()} | ({"strict": True} if kind in EXACT else {})
+    adapted = {key: _adapted(value) for key, value in schema.items()} | ({"strict": True} if kind in EXACT else {})
     inlined = {
         f.name: f.metadata["inline"]
         for f in (dataclasses.fields(cls) if kind == "dataclass" else ())
@@ -154,8 +154,12 @@ def _adapted(schema: Any) -> Any:
     if kind == "float":
         return core_schema.no_info_plain_validator_function(number)
     if kind == "dataclass" and hasattr(cls, "of_json_content"):
-        return core_schema.no_info_plain_validator_function(cls.of_json_content, ref=own.get("ref"))
-    return core_schema.no_info_before_validator_function(spread, own, ref=own.pop("ref", None)) if inlined else own
+        return core_schema.no_info_plain_validator_function(cls.of_json_content, ref=adapted.get("ref"))
+    return (
+        core_schema.no_info_before_validator_function(spread, adapted, ref=adapted.pop("ref", None))
+        if inlined
+        else adapted
+    )
 
 
 def _line(problem: ErrorDetails) -> str:

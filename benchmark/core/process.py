@@ -86,7 +86,7 @@ def group_bytes(proc: Path, cgroups: Path) -> int | None:
             '0::/user'.
         cgroups: A folder like /sys/fs/cgroup: version 2, or version 1 with a folder `memory`.
     """
-    left, lines = list[int](), list[str]()
+    available, lines = list[int](), list[str]()
     with contextlib.suppress(OSError):
         lines = (proc / "cgroup").read_text().splitlines()
     for line in lines:
@@ -94,13 +94,13 @@ def group_bytes(proc: Path, cgroups: Path) -> int | None:
         if controllers and "memory" not in controllers.split(","):
             continue
         root, (limit, used, cache) = (cgroups / "memory", V1_FILES) if controllers else (cgroups, V2_FILES)
-        own = root / path.lstrip("/")  # in a container, the path may be that of the host: then only the root is there
-        for folder in (each for each in (own, *own.parents) if each.is_relative_to(root)):
+        group = root / path.lstrip("/")  # in a container, the path may be that of the host: then only the root is there
+        for folder in (candidate for candidate in (group, *group.parents) if candidate.is_relative_to(root)):
             with contextlib.suppress(OSError, ValueError):  # 'max' is no limit
                 most, taken = (int((folder / name).read_text()) for name in (limit, used))
                 stat = dict(entry.split() for entry in (folder / "memory.stat").read_text().splitlines())
-                left.append(most - taken + sum(int(stat.get(name, 0)) for name in cache))
-    return min(left, default=None)
+                available.append(most - taken + sum(int(stat.get(name, 0)) for name in cache))
+    return min(available, default=None)
 
 
 TRIM_THRESHOLD, MMAP_THRESHOLD, ARENA_MAX = -1, -3, -8

@@ -159,12 +159,12 @@ class Against:
         """The first difference, and the measures in which a difference is shown."""
         first = self.contrasts[0] if self.contrasts else None
         changes = [
-            f"{change} in {', '.join(named)}"
+            f"{change} in {', '.join(measure_names)}"
             for change in ("worse", "better")
-            if (named := [row.measure for row in self.contrasts if row.change == change])
+            if (measure_names := [row.measure for row in self.contrasts if row.change == change])
         ]
-        known = "" if first is None else f": {first.measure} {first.difference.text('+')}, p {first.p_holm:.2g}"
-        return f"{self.other}{known}; {'; '.join(changes) or 'no difference is shown'}"
+        first_text = "" if first is None else f": {first.measure} {first.difference.text('+')}, p {first.p_holm:.2g}"
+        return f"{self.other}{first_text}; {'; '.join(changes) or 'no difference is shown'}"
 
 
 @dataclass(frozen=True)
@@ -190,7 +190,7 @@ class SceneComparison:
 
     def __repr__(self) -> str:
         lines = [f"<SceneComparison of {self.scene}: {self.voxels:,} voxels that all saw twice, {self.frames} frames>"]
-        return "\n".join([*lines, *(f"  {own.stated}" for own in self.against)])
+        return "\n".join([*lines, *(f"  {against.stated}" for against in self.against)])
 
 
 @dataclass(frozen=True)
@@ -226,6 +226,6 @@ class RunComparison:
     def __repr__(self) -> str:
         scenes = ", ".join(scene.scene for scene in self.scenes)
         lines = [f"<RunComparison with {self.base} on {scenes}>"]
-        lines += [f"  {own.stated}" for own in self.overall]
+        lines += [f"  {against.stated}" for against in self.overall]
         lines += [f"  caution: {text}" for text in self.cautions]
         return "\n".join(lines)

@@ -90,7 +90,7 @@ def _table(path: Path, space: LabelSpace) -> Float64:
     rows = [row for row in csv.reader(io.StringIO(text)) if row]
     names = {name_key(name): k for k, name in enumerate(rows[0][1:] if rows else ())}
     of_row = {name_key(row[0]): row for row in rows[1:]}
-    found = np.zeros((len(space), len(space)))
+    distances = np.zeros((len(space), len(space)))
     for i, name in enumerate(space.classes):
         if (row := of_row.get(name_key(name))) is None or name_key(name) not in names:
             raise DataError(f"{path}: the class '{name}' of {space.name} has no row or no column")
@@ -98,10 +98,10 @@ def _table(path: Path, space: LabelSpace) -> Float64:
             if (column := names.get(name_key(other))) is None:
                 raise DataError(f"{path}: the class '{other}' of {space.name} has no column")
             try:
-                found[i, j] = float(row[1 + column])
+                distances[i, j] = float(row[1 + column])
             except (ValueError, IndexError) as error:
                 raise DataError(f"{path}: the distance of '{name}' and '{other}' is no number") from error
-    return found
+    return distances
 
 
 def _required(distances: Float64, path: Path, space: LabelSpace) -> Float64:

@@ -114,10 +114,10 @@ class Events:
         edges = np.array([chunk.start for chunk in self.evidence.chunks()])
         cuts = np.unique(np.append(np.searchsorted(self.starts, edges), len(self.ix))).tolist()
         for first, last in zip(cuts, cuts[1:] or cuts, strict=False):
-            own, of = slice(self.bounds[first], self.bounds[last]), slice(first, last)
+            rows, of = slice(self.bounds[first], self.bounds[last]), slice(first, last)
             columns: dict[str, Any] = {name: getattr(self, name)[of] for name in INDEX}
-            columns |= {name: getattr(self, name)[own] for name in ("frame", "pixels")}
-            yield replace(self, **columns, voxel=self.voxel[own] - first, evidence=self.evidence.take(own))
+            columns |= {name: getattr(self, name)[rows] for name in ("frame", "pixels")}
+            yield replace(self, **columns, voxel=self.voxel[rows] - first, evidence=self.evidence.take(rows))
 
     def beliefs(self) -> Float64:
         """Return (m, K) the belief p^(t) after each observation.
@@ -150,16 +150,16 @@ class Events:
         number = np.repeat(np.arange(len(voxels), dtype=np.int32), count)
         rows = np.repeat(first - np.cumsum(count) + count, count)
         rows += np.arange(len(rows))
-        own: dict[str, Any] = {name: getattr(self, name)[voxels] for name in INDEX}
-        own |= {name: getattr(self, name)[rows] for name in ("frame", "pixels")}
-        return replace(self, **own, voxel=number, evidence=self.evidence.take(rows))
+        columns: dict[str, Any] = {name: getattr(self, name)[voxels] for name in INDEX}
+        columns |= {name: getattr(self, name)[rows] for name in ("frame", "pixels")}
+        return replace(self, **columns, voxel=number, evidence=self.evidence.take(rows))
 
     def save(self, path: str | Path, tile: parquet.Tile | None = None) -> None:
         """Write Parquet, atomically: one row an observation, with its voxel's index."""
 
         def columns(chunk: slice) -> dict[str, npt.NDArray[Any]]:
-            own = {name: getattr(self, name)[chunk] for name in OF_EVENTS}
-            return own | {name: getattr(self, name)[self.voxel[chunk]] for name in INDEX}
+            values = {name: getattr(self, name)[chunk] for name in OF_EVENTS}
+            return values | {name: getattr(self, name)[self.voxel[chunk]] for name in INDEX}
 
         parts = map(columns, self.evidence.chunks())
         parquet.write(path, parts, type(self).__name__, self.voxel_size, self.classes, tile)

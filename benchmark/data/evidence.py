@@ -138,19 +138,19 @@ class Evidence(NDArrayOperatorsMixin):
 
     def take(self, rows: Any) -> Evidence:
         """Return the rows (r,) of these numbers, or for which a mask (n,) holds."""
-        known = None if self.known is None else self.known.take(rows)
+        concentration = None if self.known is None else self.known.take(rows)
         if isinstance(rows, slice) and rows.step in (None, 1):
             first, last, _ = rows.indices(len(self))
             starts = self.starts[first : max(first, last) + 1]
             entries = slice(starts[0], starts[-1])
-            return Evidence(starts - starts[0], self.label[entries], self.weight[entries], self.K, known=known)
+            return Evidence(starts - starts[0], self.label[entries], self.weight[entries], self.K, known=concentration)
         from semstab.data.kernels import copy_rows
 
         first, end = (bound[rows] for bound in self.bounds)
         starts = _starts(end - first)
         label, weight = np.empty(starts[-1], np.uint16), np.empty(starts[-1])
         copy_rows(first, end, starts[:-1], self.label, self.weight, label, weight)
-        return Evidence(starts, label, weight, self.K, known=known)
+        return Evidence(starts, label, weight, self.K, known=concentration)
 
     def only(self, labels: UInt16) -> Evidence:
         """Return the evidence of these ascending classes (k,), which have all the entries: they become 0 to k - 1."""
@@ -176,9 +176,9 @@ class Evidence(NDArrayOperatorsMixin):
         They are where the entries are, and the row of each of them.
         """
         rows = len(self)
-        for some in stretches(rows, max(1, STRETCH_ENTRIES * rows // max(len(self.weight), 1))):
-            starts = self.starts[some.start : some.stop + 1]
-            yield slice(starts[0], starts[-1]), np.repeat(np.arange(some.start, some.stop), np.diff(starts))
+        for stretch in stretches(rows, max(1, STRETCH_ENTRIES * rows // max(len(self.weight), 1))):
+            starts = self.starts[stretch.start : stretch.stop + 1]
+            yield slice(starts[0], starts[-1]), np.repeat(np.arange(stretch.start, stretch.stop), np.diff(starts))
 
     def sums_by_class(self, group: npt.NDArray[np.signedinteger[Any]], groups: int, *values: ByEntry) -> list[Float64]:
         """Return the sums (groups, K) of values of entries by the group (n,) of their row; it is -1 if none counts."""

@@ -92,11 +92,11 @@ class Features:
         (h, w), (H, W) = self.vectors.shape[:2], shape
         column = np.floor((np.arange(W) - self.first[0]) / self.step[0] + 0.5).astype(np.int64)
         row = np.floor((np.arange(H) - self.first[1]) / self.step[1] + 0.5).astype(np.int64)
-        shown: npt.NDArray[Any] = values[row.clip(0, h - 1)[:, None], column.clip(0, w - 1)[None, :]]
+        pixels: npt.NDArray[Any] = values[row.clip(0, h - 1)[:, None], column.clip(0, w - 1)[None, :]]
         beyond = ((row < 0) | (row >= h))[:, None] | ((column < 0) | (column >= w))[None, :]
         if beyond.any():
-            shown[beyond] = outside
-        return shown
+            pixels[beyond] = outside
+        return pixels
 
 
 @dataclass(frozen=True, eq=False)

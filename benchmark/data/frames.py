@@ -309,8 +309,8 @@ class Frame:
         points = np.ascontiguousarray(points[None] if points.ndim == 2 else points, dtype=np.float32)
         if len(points) == 1:
             for name in IMAGES:
-                if (given := getattr(self, name)) is not None and np.ndim(given) == 1 + (name in OF_VECTORS):
-                    object.__setattr__(self, name, np.asarray(given)[None])
+                if (value := getattr(self, name)) is not None and np.ndim(value) == 1 + (name in OF_VECTORS):
+                    object.__setattr__(self, name, np.asarray(value)[None])
         if self.depth is None:
             x, y, z = np.moveaxis(points.astype(np.float64), -1, 0)
             object.__setattr__(self, "depth", np.sqrt(x * x + y * y + z * z).astype(np.float32))
@@ -355,12 +355,12 @@ class Frame:
             )
         return T
 
-    def _checked_features(self, given: Any) -> Features:
+    def _checked_features(self, features: Any) -> Features:
         """Return features whose grid has a place in the image."""
         try:
-            if isinstance(given, Features):
-                return given
-            vectors = np.asarray(given)
+            if isinstance(features, Features):
+                return features
+            vectors = np.asarray(features)
             return Features.over(vectors[None] if self.is_scan and vectors.ndim == 2 else vectors, self.shape)
         except DataError as error:
             raise DataError(f"{self.where('features')}: {error}") from error
@@ -418,12 +418,12 @@ class Frame:
             raise DataError(f"{self.where(name)}: {name} are {size} but depth is {W}x{H}; bring them to one size")
 
 
-def _intrinsics(given: Any, where: str) -> Intrinsics:
+def _intrinsics(intrinsics: Any, where: str) -> Intrinsics:
     """Return intrinsics, or a camera matrix as such."""
-    if isinstance(given, Intrinsics):
-        return given
+    if isinstance(intrinsics, Intrinsics):
+        return intrinsics
     try:
-        return Intrinsics.from_matrix(given)
+        return Intrinsics.from_matrix(intrinsics)
     except (TypeError, ValueError) as error:
         reason = error if isinstance(error, DataError) else "not a 3x3 matrix"
         raise DataError(f"{where}: {reason}; give Intrinsics(fx, fy, cx, cy) or a camera matrix") from error

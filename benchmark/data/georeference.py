@@ -94,16 +94,16 @@ def wkt(crs: str, where: str) -> str:
     except ImportError as error:
         raise MissingDependencyError(f"{where}: a georeference needs pyproj; {INSTALL}") from error
     try:
-        known = CRS.from_user_input(crs)
+        system = CRS.from_user_input(crs)
     except (CRSError, RecursionError) as error:  # a text of braces is read as JSON
         hint = "write it as EPSG:32615, a PROJ string or WKT"
         raise ConfigError(
             f"{where}: {crs[:80]!r} is no reference system ({summarize_error(error)[:80]}); {hint}"
         ) from error
-    units = {axis.unit_name for axis in known.axis_info[:2]}
-    if not known.is_projected or units != {"metre"}:
+    units = {axis.unit_name for axis in system.axis_info[:2]}
+    if not system.is_projected or units != {"metre"}:
         raise ConfigError(
-            f"{where}: {known.name} has axes in {', '.join(sorted(units))}; project it, to UTM for example"
+            f"{where}: {system.name} has axes in {', '.join(sorted(units))}; project it, to UTM for example"
         )
-    number = known.to_epsg()
-    return str((known if number is None else CRS.from_epsg(number)).to_wkt())
+    number = system.to_epsg()
+    return str((system if number is None else CRS.from_epsg(number)).to_wkt())

@@ -116,7 +116,9 @@ def by_group(
     sums, defined = np.zeros((2, wide, groups))
     of = group.astype(np.int32, copy=False)
     for first in range(0, wide, TOGETHER):
-        own = [np.ascontiguousarray(column, dtype=np.float64) for column in values[first : first + TOGETHER]]
+        columns = [np.ascontiguousarray(column, dtype=np.float64) for column in values[first : first + TOGETHER]]
         chunk = slice(first, first + TOGETHER)
-        add_by_group(of, *own, *(TOGETHER - len(own)) * own[:1], max(BLOCK, groups), sums[chunk], defined[chunk])
+        add_by_group(
+            of, *columns, *(TOGETHER - len(columns)) * columns[:1], max(BLOCK, groups), sums[chunk], defined[chunk]
+        )
     return tuple(np.ascontiguousarray(part[: len(values)].T) for part in (sums, defined))  # type: ignore[return-value]

@@ -21,24 +21,24 @@ def mark_valid(depth: Any, labels: Any, ignore: int, out: Any) -> None:
 @serial
 def count_changed(valid: Any, labels: Any, other_valid: Any, other_labels: Any) -> tuple[int, int]:
     """Return the number of pixels that are valid in both frames, and of those among them whose labels differ."""
-    both = changed = 0
+    num_valid = changed = 0
     for i in range(valid.size):
         common = valid[i] & other_valid[i]
-        both += common
+        num_valid += common
         changed += common & (labels[i] != other_labels[i])
-    return both, changed
+    return num_valid, changed
 
 
 @serial
 def count_changed_at(at: Any, valid: Any, labels: Any, other_valid: Any, other_labels: Any) -> tuple[int, int]:
     """Count the valid pixels that see a valid pixel of the other view, `at`, and those whose label differs there."""
-    seen = changed = 0
+    num_covisible = changed = 0
     for i in range(len(at)):
         j = max(at[i], 0)
-        both = valid[i] & other_valid[j] & (at[i] >= 0)
-        seen += both
-        changed += both & (labels[i] != other_labels[j])
-    return seen, changed
+        is_covisible = valid[i] & other_valid[j] & (at[i] >= 0)
+        num_covisible += is_covisible
+        changed += is_covisible & (labels[i] != other_labels[j])
+    return num_covisible, changed
 
 
 @serial
@@ -114,9 +114,9 @@ def add_by_group(group: Any, one: Any, two: Any, three: Any, four: Any, block: i
             if g < 0:
                 continue
             for c, value in enumerate((one[i], two[i], three[i], four[i])):
-                known = value == value  # noqa: PLR0124 - NaN is not
-                part[g, c] += value if known else 0.0
-                count[g, c] += 1.0 if known else 0.0
+                is_defined = value == value  # noqa: PLR0124 - NaN is not
+                part[g, c] += value if is_defined else 0.0
+                count[g, c] += 1.0 if is_defined else 0.0
         for g in range(sums.shape[1]):
             for c in range(4):
                 sums[c, g] += part[g, c]

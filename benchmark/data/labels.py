@@ -71,8 +71,8 @@ def palette(K: int) -> tuple[Color, ...]:
     fit &= np.linalg.norm(grid[:, None] - between(GLOW, 4 * len(GLOW)), axis=2).min(axis=1) >= CLEAR
     candidates, appearance = candidates[fit], appearance[fit]
     if len(chosen) < K:
-        own = _appearance_of(np.array(chosen))
-        nearest = np.min([_distance(appearance, one) for one in own], axis=0)
+        appearances = _appearance_of(np.array(chosen))
+        nearest = np.min([_distance(appearance, one) for one in appearances], axis=0)
     while len(chosen) < K:
         best = int(nearest.argmax())
         chosen.append((int(candidates[best, 0]), int(candidates[best, 1]), int(candidates[best, 2])))
@@ -101,8 +101,8 @@ def _oklab(linear: Float64) -> Float64:
 def _distance(appearance: Float64, one: Float64) -> Float64:
     """Return (n,) how far colours look from one: to all eyes, and half as much to those without green cones."""
     difference = appearance - one
-    seen = np.linalg.norm(difference[:, :3], axis=1) + 0.5 * np.linalg.norm(difference[:, 3:], axis=1)
-    distance: Float64 = seen
+    separation = np.linalg.norm(difference[:, :3], axis=1) + 0.5 * np.linalg.norm(difference[:, 3:], axis=1)
+    distance: Float64 = separation
     return distance
 
 
@@ -191,9 +191,9 @@ class LabelSpace:
         """Read the content of a taxonomy file: name, classes (names, or name, id, color, members), ignored."""
         if not isinstance(content, dict) or not isinstance(content.get("classes"), list):
             raise ConfigError(f"{where}: a taxonomy needs a list 'classes'")
-        known = ("name", "classes", "ignored")
-        if unknown := [key for key in content if key not in known]:
-            raise ConfigError(f"{where}: unknown key {reprlib.repr(unknown[0])}; known: {', '.join(known)}")
+        allowed_keys = ("name", "classes", "ignored")
+        if unknown := [key for key in content if key not in allowed_keys]:
+            raise ConfigError(f"{where}: unknown key {reprlib.repr(unknown[0])}; known: {', '.join(allowed_keys)}")
         entries = [entry if isinstance(entry, dict) else {"name": entry} for entry in content["classes"]]
         for entry in entries:
             known_keys = {"name", "id", "color", "members", "group"}
@@ -244,13 +244,13 @@ class LabelSpace:
         Raises:
             ConfigError: If classes are mapped nowhere and are not listed as ignored, naming them.
         """
-        known = target.row_of
-        if lost := [name for name in self.classes if name_key(name) not in known]:
+        row_of = target.row_of
+        if lost := [name for name in self.classes if name_key(name) not in row_of]:
             raise ConfigError(
                 f"taxonomy {target.name}: no class takes '{', '.join(lost)}' of {self.name};"
                 " add the name to a class's members, or to ignored"
             )
-        rows = (known[name_key(name)] for name in self.classes)
+        rows = (row_of[name_key(name)] for name in self.classes)
         return LabelMapping(self, target, tuple(None if row == LEFT_OUT else row for row in rows))
 
 
@@ -270,10 +270,10 @@ class LabelMapping:
 
     def named(self, names: Iterable[str]) -> tuple[int, ...]:
         """Return positions of the source classes that have one of these names, or become a class that has."""
-        wanted = {name_key(name) for name in names}
-        rows = {row for row, name in enumerate(self.target.classes) if name_key(name) in wanted}
+        keys = {name_key(name) for name in names}
+        rows = {row for row, name in enumerate(self.target.classes) if name_key(name) in keys}
         pairs = zip(self.source.classes, self.rows, strict=True)
-        return tuple(k for k, (name, row) in enumerate(pairs) if name_key(name) in wanted or row in rows)
+        return tuple(k for k, (name, row) in enumerate(pairs) if name_key(name) in keys or row in rows)
 
     def labels(self, labels: UInt8 | UInt16, where: str) -> UInt8 | UInt16:
         """Map a label map of any shape; the ignore id stays one.
@@ -406,7 +406,7 @@ def _taxonomy_text(name: str) -> tuple[str, str]:
 def sharing_classes(classes: Mapping[str, tuple[str, ...]]) -> tuple[str, ...]:
     """Return the models that can be compared: those with the classes that most of them have, if two or more have."""
     ((most, count),) = Counter(classes.values()).most_common(1) or [((), 0)]
-    return tuple(model for model, own in classes.items() if own == most) if count > 1 else ()
+    return tuple(model for model, names in classes.items() if names == most) if count > 1 else ()
 
 
 MOVING = frozenset({

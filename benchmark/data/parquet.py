@@ -72,8 +72,8 @@ def write(
     tables = (pa.table({name: _to_arrow(values) for name, values in columns.items()}) for columns in parts)
     with atomic_path(path) as temporary, ExitStack() as open_files:
         writer = None
-        while some := [*itertools.islice(tables, IN_GROUP)]:
-            content = pa.concat_tables(some).replace_schema_metadata({"semstab": json.dumps(about)})
+        while batch := [*itertools.islice(tables, IN_GROUP)]:
+            content = pa.concat_tables(batch).replace_schema_metadata({"semstab": json.dumps(about)})
             writer = writer or open_files.enter_context(pq.ParquetWriter(temporary, content.schema, compression="zstd"))
             writer.write_table(content)
 
@@ -198,7 +198,7 @@ def unpacked_bytes(path: Path) -> int:
 def _unpacked_bytes(group: pq.RowGroupMetaData) -> int:
     """Return the bytes that a group of rows takes in memory: eight a value, or as its pages say, if that is more."""
     chunks = [group.column(k) for k in range(group.num_columns)]
-    return sum(max(8 * group.num_rows, 8 * each.num_values, each.total_uncompressed_size) for each in chunks)
+    return sum(max(8 * group.num_rows, 8 * chunk.num_values, chunk.total_uncompressed_size) for chunk in chunks)
 
 
 @contextmanager

@@ -493,8 +493,8 @@ class Result:
 
     def _columns(self) -> dict[str, Any]:
         flicker = {record.unit: record.image_space.compensated_flicker_percent for record in reversed(self.records)}
-        named: dict[str, str | int | float] = {"benchmark": self.benchmark} if self.benchmark else {}
-        rows = [run.row() | {"compensated_flicker_percent": flicker[run.unit]} | named for run in self.runs]
+        benchmark_column: dict[str, str | int | float] = {"benchmark": self.benchmark} if self.benchmark else {}
+        rows = [run.row() | {"compensated_flicker_percent": flicker[run.unit]} | benchmark_column for run in self.runs]
         return {name: np.array([row[name] for row in rows]) for name in (rows[0] if rows else ())}
 
     def _repr_html_(self) -> str:
@@ -504,12 +504,12 @@ class Result:
         for run in self.runs:
             table, unit = run.table, run.unit
             means = (voxels.number(table.recurrent[measure], measure.digits[0]) for measure in measures())
-            seen = voxels.number(table.mean_op, 2), *means, voxels.number(100 * table.recurrent.share, 2)
+            numbers = voxels.number(table.mean_op, 2), *means, voxels.number(100 * table.recurrent.share, 2)
             verdict = alpha = ""
             if run.statistics is not None:
                 verdict, alpha = str(run.statistics.verdict), run.statistics.headline.alpha.text()
                 colors[verdict] = KIND_COLORS[KINDS.get(run.statistics.verdict.decisive, "bad")]
-            rows.append([unit.scene, unit.model, unit.backend, verdict, alpha, table.voxels, *seen])
+            rows.append([unit.scene, unit.model, unit.backend, verdict, alpha, table.voxels, *numbers])
         titles = [measure.named for measure in measures()]
         headers = [
             "scene",
@@ -525,8 +525,8 @@ class Result:
         base = [record for record in self.select() if record.unit.backend == self.backend]
         there = [record for record in base if record.voxels_file is not None and record.voxels_file.is_file()][:MAPS]
         maps = [
-            as_figure(own.table().image(self.up.get(own.unit.scene)), f"{own.unit.scene}, {own.unit.model}")
-            for own in there
+            as_figure(record.table().image(self.up.get(record.unit.scene)), f"{record.unit.scene}, {record.unit.model}")
+            for record in there
         ]
         legend = f"<div>{voxels.CAPTION}</div>" if maps else ""
         return voxels.as_html(self.name, headers, rows, colors) + "".join(maps) + legend

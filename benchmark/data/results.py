@@ -185,8 +185,8 @@ class TableSummary:
             return MeasureMeans(dict.fromkeys(means.value, math.nan), dict.fromkeys(means.voxels, 0))
 
         strata, well_seen, classes = (
-            tuple(replace(own, means=unknown(own.means)) for own in each)
-            for each in (self.strata, self.well_seen, self.classes)
+            tuple(replace(row, means=unknown(row.means)) for row in rows)
+            for rows in (self.strata, self.well_seen, self.classes)
         )
         recurrent = replace(self.recurrent, means=unknown(self.recurrent.means))
         return replace(
@@ -225,8 +225,8 @@ class UnitSummary:
     @property
     def stated(self) -> str:
         """Its scene and model, the verdict and alpha: 'scene0, m: stable (p .98), alpha .93 (.92 to .95)'."""
-        known = "" if self.statistics is None else f": {self.statistics.stated}"
-        return f"{self.unit.scene}, {self.unit.model}{known}"
+        statistics_text = "" if self.statistics is None else f": {self.statistics.stated}"
+        return f"{self.unit.scene}, {self.unit.model}{statistics_text}"
 
     def row(self) -> dict[str, str | int | float]:
         """Return a row: its names, the verdict and the number that it rests on, the size of its map, means of measures.

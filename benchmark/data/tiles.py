@@ -72,23 +72,23 @@ class Tiles(Generic[T]):
         tiles, of = np.unique(index // self.size, axis=0, return_inverse=True)
         order = np.argsort(of.ravel(), kind="stable")
         rows = np.split(order, np.cumsum(np.bincount(of.ravel(), minlength=len(tiles)))[:-1])
-        for (x, y), own in zip(tiles.tolist(), rows, strict=True):
+        for (x, y), tile_rows in zip(tiles.tolist(), rows, strict=True):
             if (x, y) in self._load:
-                yield (x, y), own
+                yield (x, y), tile_rows
 
     def region(self, tile: TileIndex, size: int) -> T:
         """Return the voxels of a wider tile of that size, a multiple of the own one."""
         if self.size is None:
             table = self[0, 0]
             return table.rows(np.flatnonzero((table.ix // size == tile[0]) & (table.iy // size == tile[1])))
-        inside = [own for own in self if self._in_wider(own, size) == tile]
+        inside = [index for index in self if self._in_wider(index, size) == tile]
         first = self[next(iter(self))] if not inside else self[inside[0]]
-        return type(first).joined([self[own] for own in inside]) if inside else first.rows(np.zeros(0, np.int64))
+        return type(first).joined([self[index] for index in inside]) if inside else first.rows(np.zeros(0, np.int64))
 
     def wider(self, size: int) -> set[TileIndex]:
         """Return the wider tiles of that size that hold a voxel."""
         if self.size is not None:
-            return {self._in_wider(own, size) for own in self}
+            return {self._in_wider(tile, size) for tile in self}
         table = self[0, 0]
         pairs = np.unique(np.stack([table.ix // size, table.iy // size], axis=1), axis=0)
         return {(x, y) for x, y in pairs.tolist()}
@@ -103,10 +103,10 @@ def side_by_side(maps: Sequence[Tiles[Any]]) -> Iterator[tuple[Any, ...]]:
 
     Maps in single files are yielded at once.
     """
-    sizes = [own.size for own in maps if own.size is not None]
+    sizes = [tiled_map.size for tiled_map in maps if tiled_map.size is not None]
     if not sizes:
-        yield tuple(own[0, 0] for own in maps)
+        yield tuple(tiled_map[0, 0] for tiled_map in maps)
         return
     size = max(sizes)
-    for tile in sorted({tile for own in maps for tile in own.wider(size)}):
-        yield tuple(own.region(tile, size) for own in maps)
+    for tile in sorted({tile for tiled_map in maps for tile in tiled_map.wider(size)}):
+        yield tuple(tiled_map.region(tile, size) for tiled_map in maps)

@@ -133,23 +133,23 @@ def freeze(table: Any, types: Types, like: npt.NDArray[Any]) -> None:
         DataError: If one is not.
     """
     for name, dtype in types.items():
-        given = getattr(table, name)
-        if len(given) != len(like):
-            raise DataError(f"{type(table).__name__}: column '{name}' has {len(given)} rows, expected {len(like)}")
-        object.__setattr__(table, name, _evidence(table, given) if name == "evidence" else _frozen(given, dtype))
+        values = getattr(table, name)
+        if len(values) != len(like):
+            raise DataError(f"{type(table).__name__}: column '{name}' has {len(values)} rows, expected {len(like)}")
+        object.__setattr__(table, name, _evidence(table, values) if name == "evidence" else _frozen(values, dtype))
 
 
-def _frozen(given: npt.ArrayLike, dtype: type[np.generic]) -> npt.NDArray[Any]:
-    column: npt.NDArray[Any] = np.ascontiguousarray(given, dtype=dtype).view()
+def _frozen(values: npt.ArrayLike, dtype: type[np.generic]) -> npt.NDArray[Any]:
+    column: npt.NDArray[Any] = np.ascontiguousarray(values, dtype=dtype).view()
     column.setflags(write=False)
     return column
 
 
-def _evidence(table: Any, given: npt.NDArray[Any] | Evidence) -> Evidence:
-    shape = np.shape(given)
+def _evidence(table: Any, evidence: npt.NDArray[Any] | Evidence) -> Evidence:
+    shape = np.shape(evidence)
     if len(shape) != 2:
         raise DataError(f"{type(table).__name__}: evidence of shape {shape}, expected one row of K classes each")
-    return Evidence.of(given)
+    return Evidence.of(evidence)
 
 
 @dataclass(frozen=True, eq=False)
@@ -313,9 +313,9 @@ class VoxelTable:
 
         def columns(chunk: slice) -> dict[str, npt.NDArray[Any]]:
             part = self.rows(chunk)
-            own = {name: np.asarray(getattr(part, name)) for name in self._types}
+            table_columns = {name: np.asarray(getattr(part, name)) for name in self._types}
             made = {name: of(part) for name, of in (computed or {}).items()}
-            return own | made | {name: values[chunk] for name, values in (extra or {}).items()}
+            return table_columns | made | {name: values[chunk] for name, values in (extra or {}).items()}
 
         parts = map(columns, self.evidence.chunks())
         parquet.write(path, parts, type(self).__name__, self.voxel_size, self.classes, tile)
@@ -345,9 +345,9 @@ class VoxelTable:
             DataError: If one is not there.
         """
         files, sorting = parquet.files_of(path), tuple(INDEX)
-        wanted = [*dict.fromkeys((*names, *(sorting if len(files) > 1 else ())))]
-        parts = [parquet.columns(file, wanted) for file in files]
-        columns = {name: np.concatenate([part[name] for part in parts]) for name in wanted}
+        all_names = [*dict.fromkeys((*names, *(sorting if len(files) > 1 else ())))]
+        parts = [parquet.columns(file, all_names) for file in files]
+        columns = {name: np.concatenate([part[name] for part in parts]) for name in all_names}
         order = in_order(columns) if len(files) > 1 else slice(None)
         return {name: columns[name][order] for name in names}
 

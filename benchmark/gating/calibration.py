@@ -50,8 +50,8 @@ def _with_truth(record: Record, truth_file: Path) -> tuple[VoxelTable, Truth]:
     share, parts = share_of(record.summary.table.voxels), []
     files = [file for file in (record.voxels_file, truth_file) if file is not None]
     for table, truth in side_by_side([Tiles.open(file, VoxelTable) for file in files]):
-        drawn = table.rows(in_share(table, share))
-        parts.append((drawn, join_truth(drawn, truth).label))
+        sample = table.rows(in_share(table, share))
+        parts.append((sample, join_truth(sample, truth).label))
     order = np.lexsort(np.concatenate([table.index for table, _ in parts]).T[::-1])
     label = np.concatenate([labels for _, labels in parts])[order]
     return VoxelTable.joined([table for table, _ in parts]), Truth(label >= 0, label)

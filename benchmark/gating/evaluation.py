@@ -70,8 +70,8 @@ def _has(rule: Rule, entry: Entry) -> bool:
         return False
     if rule.measure.quantity is not SBD_EXCESS:
         return True
-    known, locations = _order_known(entry.sums)
-    return known > 0 and known >= ORDER_KNOWN * locations
+    num_with_null, locations = _order_known(entry.sums)
+    return num_with_null > 0 and num_with_null >= ORDER_KNOWN * locations
 
 
 def _order_known(sums: ClusterSums) -> tuple[float, int]:
@@ -81,9 +81,9 @@ def _order_known(sums: ClusterSums) -> tuple[float, int]:
 
 def _few_known(rule: Rule, entry: Entry) -> str:
     """Return at how few locations SBD in random order is known, which are no random sample; empty for other rules."""
-    known, locations = _order_known(entry.sums) if rule.measure.quantity is SBD_EXCESS else (0.0, 0)
-    few = f", which is known at {known:,.0f} of {locations:,} locations, fewer than {ORDER_KNOWN:.0%}"
-    return few if known > 0 else ""
+    num_with_null, locations = _order_known(entry.sums) if rule.measure.quantity is SBD_EXCESS else (0.0, 0)
+    few = f", which is known at {num_with_null:,.0f} of {locations:,} locations, fewer than {ORDER_KNOWN:.0%}"
+    return few if num_with_null > 0 else ""
 
 
 Pair = tuple[Entry, Entry | None]
@@ -122,11 +122,11 @@ class GateRuns:
 
     def pairs(self, rule: Rule) -> list[Pair]:
         """Return the runs on each scene that a rule is about; for a rule on a value only the new one."""
-        named = [rule.scene] if rule.scene else self.scenes
+        scenes = [rule.scene] if rule.scene else self.scenes
         if self.on_common(rule):
-            return [self.common[0][scene] for scene in named]
+            return [self.common[0][scene] for scene in scenes]
         base = self.base.scenes if self.base is not None and rule.change else {}
-        return [(self.new.scenes[scene], base.get(scene)) for scene in named]
+        return [(self.new.scenes[scene], base.get(scene)) for scene in scenes]
 
 
 def with_values(rules: Sequence[Rule], runs: GateRuns) -> tuple[tuple[Rule, ...], dict[str, list[str]]]:
@@ -172,9 +172,9 @@ def require_values(rule: Rule, pairs: Sequence[Pair]) -> None:
             if entry is not None and _of_all_alpha(rule) and _is_nearly_one_class(entry.sums):
                 continue  # undecided, whatever alpha is
             if entry is not None and rule.measure.quantity is not COVERAGE and math.isnan(value_of(rule, entry)):
-                named = f"{rule.measure.name} of {rule.class_name}" if rule.class_name else rule.measure.name
+                measure_text = f"{rule.measure.name} of {rule.class_name}" if rule.class_name else rule.measure.name
                 raise ConfigError(
-                    f"rule '{rule.text}': {entry.where} has no {named}: {NOTHING}; {rule.measure.if_missing}"
+                    f"rule '{rule.text}': {entry.where} has no {measure_text}: {NOTHING}; {rule.measure.if_missing}"
                 )
         mixed = old is not None and (new.summary.reduced is None) != (old.summary.reduced is None)
         if mixed and (rule.measure.quantity in OF_EVIDENCE or isinstance(rule.measure.quantity, Measure)):
@@ -230,11 +230,11 @@ def bounded(
     scope: Scope = THIS_SCENE,
 ) -> Interval:
     """Return the value, drop or rise that a rule bounds, from sums; each end is missed with probability `level`."""
-    key, both = rule.measure.quantity.key, 1 - 2 * level
+    key, confidence = rule.measure.quantity.key, 1 - 2 * level
     if base is None or rule.change is None:
-        return estimate(new, key, k, THESE_FRAMES if functional(key, k).of_space_alone else scope, both)
+        return estimate(new, key, k, THESE_FRAMES if functional(key, k).of_space_alone else scope, confidence)
     same_frames = True if scope == THESE_FRAMES else None
-    result = sums_difference(key, new, base, k, scope=scope, same_frames=same_frames, level=both)
+    result = sums_difference(key, new, base, k, scope=scope, same_frames=same_frames, level=confidence)
     return result if rule.change == "rise" else negative(result)
 
 

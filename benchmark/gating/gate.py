@@ -73,8 +73,8 @@ def gate_config(
     Raises:
         ConfigError: If a setting is wrong; it names the file and the setting.
     """
-    given = {"level": level, "undecided": undecided, "scope": scope}
-    options = {name: value for name, value in given.items() if value is not None}
+    settings = {"level": level, "undecided": undecided, "scope": scope}
+    options = {name: value for name, value in settings.items() if value is not None}
     config = GateConfig() if file is None else validated(GateConfig, read_yaml(file), f"{file}: ")
     config = validated(GateConfig, {**config.model_dump(), **options, "rules": (*config.rules, *rules)}, "gate: ")
     if not config.rules:
@@ -107,12 +107,12 @@ def gate(new: str | os.PathLike[str], against: str | os.PathLike[str] | None, co
     base = None if against is None else open_run(against)
     scenes = tuple(run.scenes) if base is None else shared_scenes([base, run])
     runs, judgements, notes = GateRuns(run, base, scenes), list[Judgement](), _notes(run, base, scenes)
-    for given in parsed:
-        rules, notes_of_rules = _rules(given, runs)
+    for parsed_rule in parsed:
+        rules, notes_of_rules = _rules(parsed_rule, runs)
         notes += notes_of_rules
         for rule in rules:
             pairs = runs.pairs(rule)
-            if given.class_name == ALL and is_lost(rule, pairs):
+            if parsed_rule.class_name == ALL and is_lost(rule, pairs):
                 judgements.append(_of_lost_class(rule, pairs))
                 continue
             require_values(rule, pairs)
@@ -126,16 +126,16 @@ def gate(new: str | os.PathLike[str], against: str | os.PathLike[str] | None, co
     )
 
 
-def _rules(given: Rule, runs: GateRuns) -> tuple[tuple[Rule, ...], list[str]]:
-    """Return the rules that a given one stands for, all of which the runs have data for, and notes on others."""
-    rules = given.of_each(runs.new.scenes[runs.scenes[0]].classes)
+def _rules(parsed_rule: Rule, runs: GateRuns) -> tuple[tuple[Rule, ...], list[str]]:
+    """Return the rules that a parsed rule stands for, all of which the runs have data for, and notes on others."""
+    rules = parsed_rule.of_each(runs.new.scenes[runs.scenes[0]].classes)
     for rule in rules:
         require_data(rule, runs.new, runs.base, runs.scenes)
-    if given.class_name != ALL:
+    if parsed_rule.class_name != ALL:
         return rules, []
     rules, absent = with_values(rules, runs)
     return rules, [
-        f"{given.text}: left out, as seen nowhere twice in {where}: {', '.join(names)}"
+        f"{parsed_rule.text}: left out, as seen nowhere twice in {where}: {', '.join(names)}"
         for where, names in absent.items()
     ]
 
@@ -149,27 +149,27 @@ def _of_lost_class(rule: Rule, pairs: Sequence[Pair]) -> Judgement:
 def _notes(run: RunHandle, base: RunHandle | None, scenes: Sequence[str]) -> list[str]:
     """Return notes on maps that say little, and on scenes that only one of the runs has."""
     warned = [
-        f"{scene}: {each.name} is {why}"
+        f"{scene}: {handle.name} is {why}"
         for scene in scenes
-        for each in (run, base)
-        if each is not None and (why := each.scenes[scene].caveat)
+        for handle in (run, base)
+        if handle is not None and (why := handle.scenes[scene].caveat)
     ]
-    left = [scene for scene in run.scenes if scene not in scenes]
+    unpaired = [scene for scene in run.scenes if scene not in scenes]
     missing = [scene for scene in (base.scenes if base else ()) if scene not in scenes]
-    text = [f"only the run has these scenes, which are left out: {', '.join(left)}"] if left else []
+    text = [f"only the run has these scenes, which are left out: {', '.join(unpaired)}"] if unpaired else []
     text += [f"only the baseline has these scenes, which are left out: {', '.join(missing)}"] if missing else []
     return warned + text
 
 
-def _without_frames(judgements: Sequence[Judgement], wanted: Scope) -> list[str]:
+def _without_frames(judgements: Sequence[Judgement], scope: Scope) -> list[str]:
     """Return a note on rules whose intervals are for these frames, because the run has no sums by frame."""
     names = [
-        each.rule.text
-        for each in judgements
-        if each.interval.scope == THESE_FRAMES != wanted
-        and not each.counted
-        and each.rule.measure.quantity not in (FLICKER, COVERAGE)
-        and not functional(each.rule.measure.quantity.key).of_space_alone
+        judgement.rule.text
+        for judgement in judgements
+        if judgement.interval.scope == THESE_FRAMES != scope
+        and not judgement.counted
+        and judgement.rule.measure.quantity not in (FLICKER, COVERAGE)
+        and not functional(judgement.rule.measure.quantity.key).of_space_alone
     ]
     why = "as the run kept no sums of its map by frame or has few; --statistics, or more frames"
     return [f"judged for these frames, {why}: {', '.join(names)}"] if names else []

@@ -59,7 +59,7 @@ def _summary_of(result: GateResult, verdict: Verdict) -> str:
 
 def _named(result: GateResult, verdict: Verdict, last: str = " and ") -> str:
     """Return the rules of a verdict, the first ones by their text."""
-    rules = [f"'{each.rule.text}'" for each in result.judgements if each.verdict == verdict]
+    rules = [f"'{judgement.rule.text}'" for judgement in result.judgements if judgement.verdict == verdict]
     if len(rules) > MOST_NAMED:
         return f"{', '.join(rules[:MOST_NAMED])}{last}{len(rules) - MOST_NAMED} more"
     return last.join(filter(None, [", ".join(rules[:-1]), rules[-1]]))
@@ -73,16 +73,20 @@ def lines(result: GateResult, width: int = 80) -> Iterator[str]:
     for note in result.notes:
         yield from _wrapped(f"  {note}", width, 2)
     yield ""
-    longest = max((len(each.rule.text) for each in result.judgements), default=0)
-    for each in result.judgements:
-        yield from _wrapped(f"  {each.verdict.upper():<9}  {each.rule.text:<{longest}}  {each.values}", width, 13)
+    longest = max((len(judgement.rule.text) for judgement in result.judgements), default=0)
+    for judgement in result.judgements:
+        yield from _wrapped(
+            f"  {judgement.verdict.upper():<9}  {judgement.rule.text:<{longest}}  {judgement.values}", width, 13
+        )
     yield ""
     reasons: dict[str, list[str]] = {}
-    for each in result.judgements:
-        reasons.setdefault(f"{each.verdict}: {each.reason} ({each.about})", []).append(each.rule.text)
+    for judgement in result.judgements:
+        reasons.setdefault(f"{judgement.verdict}: {judgement.reason} ({judgement.about})", []).append(
+            judgement.rule.text
+        )
     for why, rules in reasons.items():
-        named = f": {', '.join(rules)}" if len(reasons) > 1 else ""
-        yield from _wrapped(f"  {why}{named}", width, 4)
+        rules_text = f": {', '.join(rules)}" if len(reasons) > 1 else ""
+        yield from _wrapped(f"  {why}{rules_text}", width, 4)
     if result.count("undecided"):
         yield "  more     --plan: how many frames each rule needs; --out gate.md"
 
@@ -90,10 +94,16 @@ def lines(result: GateResult, width: int = 80) -> Iterator[str]:
 def plan(result: GateResult) -> Iterator[str]:
     """Yield lines for the terminal: how many frames each rule needs, by the spread of these runs."""
     yield f"frames that decide a rule with a probability of {POWER:.0%}, by the spread of these runs"
-    for each in result.judgements:
-        needed, now = each.frames_needed(result.level), each.interval.frames
-        text = f"{needed:,} ({now} now)" if needed else "counted" if each.counted else "no number of frames decides it"
-        yield f"  {each.rule.text}: {text}"
+    for judgement in result.judgements:
+        needed, now = judgement.frames_needed(result.level), judgement.interval.frames
+        text = (
+            f"{needed:,} ({now} now)"
+            if needed
+            else "counted"
+            if judgement.counted
+            else "no number of frames decides it"
+        )
+        yield f"  {judgement.rule.text}: {text}"
 
 
 def _wrapped(line: str, width: int, indent: int) -> list[str]:
@@ -116,9 +126,9 @@ def markdown(result: GateResult) -> str:
     """Return a summary for a pull request."""
     against = f" against {_code(result.against)}" if result.against else ""
     rows = [
-        f"| {SIGNS[each.verdict]} {each.verdict} | {_code(each.rule.text)} | {each.values} | {_cell(each.reason)}"
-        f" ({each.about}) |"
-        for each in result.judgements
+        f"| {SIGNS[judgement.verdict]} {judgement.verdict} | {_code(judgement.rule.text)} | {judgement.values} | "
+        f"{_cell(judgement.reason)} ({judgement.about}) |"
+        for judgement in result.judgements
     ]
     text = [
         f"### {SIGNS[result.outcome]} semstab: the gate {OUTCOMES[result.outcome]}",
@@ -152,12 +162,12 @@ def as_json(result: GateResult) -> str:
     """Return the result as JSON."""
     rows = [
         {
-            "rule": each.rule.text, "verdict": each.verdict, "measure": each.rule.measure.quantity.name,
-            "class": each.rule.class_name, "scene": each.rule.scene, "change": each.rule.change,
-            "limit": each.rule.limit, "new": each.new, "base": each.base, "found": each.interval, "reason": each.reason,
-            "about": each.about,
+            "rule": judgement.rule.text, "verdict": judgement.verdict, "measure": judgement.rule.measure.quantity.name,
+            "class": judgement.rule.class_name, "scene": judgement.rule.scene, "change": judgement.rule.change,
+            "limit": judgement.rule.limit, "new": judgement.new, "base": judgement.base,
+            "found": judgement.interval, "reason": judgement.reason, "about": judgement.about,
         }
-        for each in result.judgements
+        for judgement in result.judgements
     ]  # fmt: skip
     content = {
         "schema": SCHEMA, "gate": result.outcome, "exit_code": result.exit_code, "new": result.new,
@@ -182,13 +192,17 @@ def junit(result: GateResult) -> str:
     properties = ElementTree.SubElement(suite, "properties")
     for name, content in (("gate", result.outcome), ("exit_code", str(result.exit_code))):
         ElementTree.SubElement(properties, "property", name=name, value=content)
-    for each in result.judgements:
-        case = ElementTree.SubElement(suite, "testcase", classname="semstab.gate", name=_xml(each.rule.text), time="0")
-        if each.verdict == "fails" or (each.verdict == "undecided" and undecided_fails):
-            ElementTree.SubElement(case, "failure", message=_xml(f"{each.values}: {each.reason}"))
-        elif each.verdict == "undecided":
-            ElementTree.SubElement(case, "skipped", message=_xml(f"undecided: {each.reason}"))
-        ElementTree.SubElement(case, "system-out").text = _xml(f"{each.values}; {each.reason} ({each.about})")
+    for judgement in result.judgements:
+        case = ElementTree.SubElement(
+            suite, "testcase", classname="semstab.gate", name=_xml(judgement.rule.text), time="0"
+        )
+        if judgement.verdict == "fails" or (judgement.verdict == "undecided" and undecided_fails):
+            ElementTree.SubElement(case, "failure", message=_xml(f"{judgement.values}: {judgement.reason}"))
+        elif judgement.verdict == "undecided":
+            ElementTree.SubElement(case, "skipped", message=_xml(f"undecided: {judgement.reason}"))
+        ElementTree.SubElement(case, "system-out").text = _xml(
+            f"{judgement.values}; {judgement.reason} ({judgement.about})"
+        )
     ElementTree.indent(suite)
     return '<?xml version="1.0" encoding="UTF-8"?>\n' + ElementTree.tostring(suite, encoding="unicode") + "\n"
 

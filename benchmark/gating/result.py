@@ -38,8 +38,8 @@ def verdict(rule: Rule, interval: Interval) -> Verdict:
         return "undecided"
     if interval.low == interval.high == rule.limit:
         return "passes" if rule.or_equal else "fails"
-    shown, limit = (interval, rule.limit) if rule.below else (negative(interval), -rule.limit)
-    low, high = shown.low, shown.high
+    oriented, limit = (interval, rule.limit) if rule.below else (negative(interval), -rule.limit)
+    low, high = oriented.low, oriented.high
     if high < limit:
         return "passes"
     return "fails" if low > (min(limit, 0.0) if rule.bounds_a_loss else limit) else "undecided"
@@ -166,11 +166,11 @@ class GateResult:
     def __repr__(self) -> str:
         against = f" against {self.against}" if self.against else ""
         lines = [f"<GateResult: {self.outcome}; {self.new}{against} on {', '.join(self.scenes)}>"]
-        return "\n".join([*lines, *(f"  {each.stated}" for each in self.judgements)])
+        return "\n".join([*lines, *(f"  {judgement.stated}" for judgement in self.judgements)])
 
     def count(self, verdict: Verdict) -> int:
         """Return how many rules have this verdict."""
-        return sum(each.verdict == verdict for each in self.judgements)
+        return sum(judgement.verdict == verdict for judgement in self.judgements)
 
     @property
     def failed(self) -> bool:

@@ -80,7 +80,7 @@ MEASURES = (
 
 def gate_measures() -> tuple[GateMeasure, ...]:
     """Return all measures in the order of lists."""
-    return (*MEASURES, *(GateMeasure(each, _plain(each.key), if_missing="run it again") for each in summed()))
+    return (*MEASURES, *(GateMeasure(measure, _plain(measure.key), if_missing="run it again") for measure in summed()))
 
 
 def _plain(name: str) -> str:
@@ -93,11 +93,17 @@ def measure_named(name: str, where: str) -> GateMeasure:
     Raises:
         ConfigError: If there is no such measure; the message starts with `where`.
     """
-    known = gate_measures()
-    named = {_plain(word): each for each in reversed(known) for word in (each.name, each.quantity.title, *each.also)}
-    if _plain(name) not in named:
-        raise ConfigError(f"{where}: no measure '{name}'; {nearest(_plain(name), [each.name for each in known])}")
-    return named[_plain(name)]
+    measures = gate_measures()
+    measure_by_word = {
+        _plain(word): measure
+        for measure in reversed(measures)
+        for word in (measure.name, measure.quantity.title, *measure.also)
+    }
+    if _plain(name) not in measure_by_word:
+        raise ConfigError(
+            f"{where}: no measure '{name}'; {nearest(_plain(name), [measure.name for measure in measures])}"
+        )
+    return measure_by_word[_plain(name)]
 
 
 # The rules of a gate, as text: 'alpha drop < 0.02', 'class human: recall > 0.6'.
@@ -183,7 +189,11 @@ def parse(text: str) -> Rule:
 def _change_meant(name: str) -> tuple[str, str] | None:
     """Return the last word after a measure's name, which is no change, and the change that is meant; None else."""
     measure, _, word = name.rpartition(" ")
-    names = {_plain(each) for known in gate_measures() for each in (known.name, known.quantity.title, *known.also)}
+    names = {
+        _plain(alias)
+        for gate_measure in gate_measures()
+        for alias in (gate_measure.name, gate_measure.quantity.title, *gate_measure.also)
+    }
     near = difflib.get_close_matches(word.lower(), get_args(Change), n=1)
     return (word, near[0]) if near and _plain(measure) in names and _plain(name) not in names else None
 

@@ -54,7 +54,7 @@ def shared_rows(*tables: VoxelTable) -> list[Int64]:
         return [np.arange(len(tables[0]))] * len(tables)
     keys = voxel_keys(*(table.index for table in tables))
     common = reduce(_intersection, keys)
-    return [np.searchsorted(own, common).astype(np.int64) for own in keys]
+    return [np.searchsorted(table_keys, common).astype(np.int64) for table_keys in keys]
 
 
 def _intersection(a: Int64, b: Int64) -> Int64:
@@ -74,9 +74,9 @@ def same_voxels(first: VoxelTable, *others: VoxelTable) -> bool:
 def observations(log: Events, rows: Int64) -> Events:
     """Return these rows of a log, ascending, with the voxels that they are of."""
     voxels, of = np.unique(log.voxel[rows], return_inverse=True)
-    own: dict[str, Any] = {name: getattr(log, name)[voxels] for name in ("ix", "iy", "iz")}
-    own |= {"frame": log.frame[rows], "evidence": log.evidence.take(rows), "pixels": log.pixels[rows]}
-    return dataclasses.replace(log, **own, voxel=of)
+    columns: dict[str, Any] = {name: getattr(log, name)[voxels] for name in ("ix", "iy", "iz")}
+    columns |= {"frame": log.frame[rows], "evidence": log.evidence.take(rows), "pixels": log.pixels[rows]}
+    return dataclasses.replace(log, **columns, voxel=of)
 
 
 def rows_of(table: VoxelTable, where: Mask) -> VoxelTable:
@@ -86,8 +86,8 @@ def rows_of(table: VoxelTable, where: Mask) -> VoxelTable:
 
 def require_same_grid(*tables: VoxelTable | Events) -> None:
     """Raise DataError where tables differ in K or voxel size."""
-    first, *others = tables
-    for other in others:
+    first, *rest = tables
+    for other in rest:
         if (first.K, first.voxel_size) != (other.K, other.voxel_size):
             raise DataError(
                 f"maps of {first.K} classes in voxels of {first.voxel_size:g} m and of {other.K} in"

@@ -23,10 +23,10 @@ def iou(right: npt.NDArray[Any], true: npt.NDArray[Any], predicted: npt.NDArray[
 
 def mean_iou(right: npt.NDArray[Any], true: npt.NDArray[Any], predicted: npt.NDArray[Any]) -> Float64:
     """Return mean IoU (...,) over the classes, the last axis, that are true or predicted anywhere; NaN without any."""
-    each = iou(right, true, predicted)
-    defined = ~np.isnan(each)
+    class_iou = iou(right, true, predicted)
+    defined = ~np.isnan(class_iou)
     with np.errstate(invalid="ignore"):
-        mean: Float64 = np.where(defined, each, 0).sum(axis=-1) / defined.sum(axis=-1)
+        mean: Float64 = np.where(defined, class_iou, 0).sum(axis=-1) / defined.sum(axis=-1)
     return mean
 
 

@@ -34,8 +34,8 @@ def flicker_percent(previous: Frame, current: Frame) -> float:
     from semstab.data.kernels import count_changed
 
     images = (previous.valid, previous.predicted, current.valid, current.predicted)
-    both, changed = count_changed(*(flat(image) for image in images))
-    return 100.0 * changed / both if both else math.nan
+    num_valid, changed = count_changed(*(flat(image) for image in images))
+    return 100.0 * changed / num_valid if num_valid else math.nan
 
 
 def flicker_in_place(previous: Frame | None, current: Frame) -> float:
@@ -82,10 +82,10 @@ def compensated_flicker(
 
     seen = correspond(current, previous, depth_tolerance=depth_tolerance) if seen is None else seen
     images = (seen.pixel, current.valid, current.predicted, previous.valid, previous.predicted)
-    both, changed = count_changed_at(*(flat(image) for image in images))
+    num_covisible, changed = count_changed_at(*(flat(image) for image in images))
     return CompensatedFlicker(
-        100.0 * changed / both if both else math.nan,
-        both / valid if (valid := int(np.count_nonzero(current.valid))) else math.nan,
+        100.0 * changed / num_covisible if num_covisible else math.nan,
+        num_covisible / valid if (valid := int(np.count_nonzero(current.valid))) else math.nan,
     )
 
 
@@ -93,15 +93,17 @@ def _between_scans(previous: Frame, current: Frame, voxel_size: float) -> Compen
     valid = int(np.count_nonzero(current.valid))
     before = dominant_before(previous, current, voxel_size)
     met = before >= 0
-    both = int(np.count_nonzero(met))
+    num_covisible = int(np.count_nonzero(met))
     changed = int(np.count_nonzero(before[met] != current.predicted[current.valid][met]))
-    return CompensatedFlicker(100.0 * changed / both if both else math.nan, both / valid if valid else math.nan)
+    return CompensatedFlicker(
+        100.0 * changed / num_covisible if num_covisible else math.nan, num_covisible / valid if valid else math.nan
+    )
 
 
 def covisible(previous: Frame, current: Frame, seen: Correspondence) -> Mask:
     """Return the valid pixels (H, W) of the current frame that the previous one shows at a valid pixel."""
-    both: Mask = current.valid & seen.bring(previous.valid, fill=False)
-    return both
+    is_covisible: Mask = current.valid & seen.bring(previous.valid, fill=False)
+    return is_covisible
 
 
 def changed_pixels(previous: Frame, current: Frame, seen: Correspondence | None = None) -> Mask:
@@ -364,11 +366,11 @@ def compensated_regions(
     `counted` has the pixels of the previous and of the current frame that count, all by default; the share is of the
     current ones.
     """
-    seen = correspond(current, previous)
+    correspondence = correspond(current, previous)
     before, now = counted or (np.ones(previous.shape, bool), np.ones(current.shape, bool))
-    both, pixels = now & seen.bring(before, fill=False), np.count_nonzero(now)
-    change = matched_region_flicker(seen.bring(previous.predicted), current.predicted, both)
-    return change, np.count_nonzero(both) / pixels if pixels else math.nan
+    is_covisible, pixels = now & correspondence.bring(before, fill=False), np.count_nonzero(now)
+    change = matched_region_flicker(correspondence.bring(previous.predicted), current.predicted, is_covisible)
+    return change, np.count_nonzero(is_covisible) / pixels if pixels else math.nan
 
 
 def region_flicker(previous: Frame, current: Frame) -> tuple[float, float, float]:

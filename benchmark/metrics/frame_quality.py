@@ -41,14 +41,14 @@ class FrameQualityMeter:
     def add(self, frame: Frame, model: Frame, truth: Frame | None) -> None:
         """Add the next frame."""
         if truth is not None:
-            known = frame.valid & truth.valid
-            pairs = truth.predicted[known].astype(np.int64) * self._K + frame.predicted[known]
+            valid = frame.valid & truth.valid
+            pairs = truth.predicted[valid].astype(np.int64) * self._K + frame.predicted[valid]
             confusion = np.bincount(pairs, minlength=self._K**2).reshape(self._K, self._K)
             self._confusion += confusion
             self._accuracy.append(_share(np.trace(confusion), confusion.sum()))
-        said = model.predicted != model.ignore_id
+        is_labelled = model.predicted != model.ignore_id
         self._count(labelled=frame.valid, sayable=model.valid)
-        self._count(said=said, changed=said & (frame.predicted != model.predicted))
+        self._count(said=is_labelled, changed=is_labelled & (frame.predicted != model.predicted))
         if self._before is not None and self._before[0].shape == frame.shape:
             self._compare(*self._before, frame, model, truth)
         self._before = frame, model, truth
@@ -81,8 +81,8 @@ class FrameQualityMeter:
         where = correspond(now, frame, depth_tolerance=math.inf)
         labelled = _not_hidden(now, frame, where) & where.bring(frame.predicted != frame.ignore_id, fill=False)
         before = where.bring(frame.predicted)
-        seen = labelled & now.valid
-        self._count(seen=seen, flickering=seen & (before != now.predicted))
+        visible = labelled & now.valid
+        self._count(seen=visible, flickering=visible & (before != now.predicted))
         met = labelled & model_now.valid
         foreseen = met & (before == model_now.predicted)
         self._next_frame.append(_share(foreseen.sum(), met.sum()))
@@ -105,9 +105,9 @@ def _not_hidden(now: Frame, before: Frame, where: Correspondence) -> Mask:
 
     Where depth is sparse, its labels are known at places of which its depth is not.
     """
-    known = where.bring((before.depth > 0) & (before.depth < np.inf), fill=False)
-    seen: Mask = where.visible & (correspond(now, before).visible | ~known)
-    return seen
+    has_depth = where.bring((before.depth > 0) & (before.depth < np.inf), fill=False)
+    is_visible: Mask = where.visible & (correspond(now, before).visible | ~has_depth)
+    return is_visible
 
 
 class Lag:
@@ -129,9 +129,9 @@ class Lag:
         if self._age is None:
             self._age = np.full(truth.shape, NONE, dtype=np.int16)
         true = truth_now.predicted
-        known = truth_now.valid & where.bring(truth.valid, fill=False)
-        changed = known & ~_near(truth, where, true)
-        same = known & (where.bring(truth.predicted) == true)
+        valid = truth_now.valid & where.bring(truth.valid, fill=False)
+        changed = valid & ~_near(truth, where, true)
+        same = valid & (where.bring(truth.predicted) == true)
         age = np.where(same, where.bring(self._age, fill=NONE), NONE)
         age = np.where(age >= 0, age + 1, NONE)
         age[changed & model.valid & (model.predicted == true)] = 0

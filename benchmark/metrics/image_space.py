@@ -75,10 +75,10 @@ class ImageSpaceMeter:
         if frame.is_scan:
             self.rows.append((flicker, share, *[math.nan] * (len(COLUMNS) - 2)))
             return flicker
-        by_itself = [each.add(sample.predicted, sample.valid) for each in self._by_itself]
+        by_itself = [meter.add(sample.predicted, sample.valid) for meter in self._by_itself]
         by_truth = [
-            each.skip() if true is None else each.add(sample.predicted, sample.valid & true.valid, true.predicted)
-            for each in self._by_truth
+            meter.skip() if true is None else meter.add(sample.predicted, sample.valid & true.valid, true.predicted)
+            for meter in self._by_truth
         ]
         self.rows.append((flicker, share, *by_truth, *by_itself, self.recall(sample)))
         return flicker
@@ -98,9 +98,9 @@ class ImageSpaceMeter:
 
 def mean_over_scenes(rows: Iterable[ImageSpace]) -> ImageSpace:
     """Return the macro mean of each number over scenes: each scene with the number counts once."""
-    known = list(rows)
+    scene_rows = list(rows)
     names = [field.name for field in dataclasses.fields(ImageSpace)]
-    return ImageSpace(**{name: macro_mean([getattr(row, name) for row in known]) for name in names})
+    return ImageSpace(**{name: macro_mean([getattr(row, name) for row in scene_rows]) for name in names})
 
 
 @dataclass(frozen=True, eq=False)
@@ -136,18 +136,18 @@ def picture_of(frame: Frame, sample: Frame, alone: Mask) -> LonePicture:
 
 def picture_arrays(pictures: Sequence[LonePicture]) -> dict[str, npt.NDArray[Any]]:
     """Return pictures as arrays (n, ...) by name, those with the size of the first; colour where all have it."""
-    same = [own for own in pictures if own.labels.shape == pictures[0].labels.shape]
+    same = [picture for picture in pictures if picture.labels.shape == pictures[0].labels.shape]
     if not same:
         return {}
-    arrays = {"lone_frames": np.array([own.frame for own in same])}
-    arrays |= {"lone_labels": np.stack([own.labels for own in same])}
-    arrays |= {"lone_alone": np.stack([own.alone for own in same])}
-    images = [own.color for own in same if own.color is not None]
+    arrays = {"lone_frames": np.array([picture.frame for picture in same])}
+    arrays |= {"lone_labels": np.stack([picture.labels for picture in same])}
+    arrays |= {"lone_alone": np.stack([picture.alone for picture in same])}
+    images = [picture.color for picture in same if picture.color is not None]
     alike = len(images) == len(same) and len({image.shape for image in images}) == 1
     return arrays | ({"lone_color": np.stack(images)} if alike else {})
 
 
 def thumbnail(shape: tuple[int, ...]) -> tuple[slice, slice]:
     """Return every n-th pixel of both axes, so that at most THUMBNAIL are left of the longer one."""
-    every = slice(None, None, -(-max(shape[:2]) // THUMBNAIL))
-    return every, every
+    stride = slice(None, None, -(-max(shape[:2]) // THUMBNAIL))
+    return stride, stride

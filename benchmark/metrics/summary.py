@@ -102,8 +102,8 @@ class TableSums:
                 start, label, weight = rows.evidence.entries
                 pair = np.repeat(dominant(rows), np.diff(start)) * K + label
                 confusion += np.bincount(pair, weights=weight, minlength=K * K).reshape(K, K)
-        for own, bounds in ((sums[0], edges), (sums[2], [RECURRENT - 1]), (sums[3], steps)):
-            np.add.at(own.T, np.searchsorted(bounds, [*finest, np.iinfo(np.int32).max]), by_op.T)
+        for group_sums, bounds in ((sums[0], edges), (sums[2], [RECURRENT - 1]), (sums[3], steps)):
+            np.add.at(group_sums.T, np.searchsorted(bounds, [*finest, np.iinfo(np.int32).max]), by_op.T)
         total = [table.pixels.sum(), observations, by_op[0].sum()]
         return cls(np.array(total, dtype=np.float64), sums[0], sums[1], sums[2], sums[3], category, confusion)
 
@@ -117,7 +117,7 @@ class TableSums:
         return cls(**{field.name: arrays[f"table {field.name}"] for field in dataclasses.fields(cls)})
 
     def __add__(self, other: TableSums) -> TableSums:
-        return TableSums(*(own + more for own, more in zip(vars(self).values(), vars(other).values(), strict=True)))
+        return TableSums(*(value + more for value, more in zip(vars(self).values(), vars(other).values(), strict=True)))
 
     def summary(self, voxel_size: float, classes: Sequence[str], edges: Sequence[int] = STRATA) -> TableSummary:
         """Return the summary; the edges are those of the sums."""
@@ -150,8 +150,8 @@ class TableSums:
         )
 
     def _confused(self, names: Sequence[str]) -> Iterator[tuple[str, str]]:
-        others = self.confusion * (1 - np.eye(len(self.confusion)))
-        for name, row in zip(names, others, strict=False):
+        off_diagonal = self.confusion * (1 - np.eye(len(self.confusion)))
+        for name, row in zip(names, off_diagonal, strict=False):
             if row.max() > 0:
                 yield name, names[int(row.argmax())]
 
@@ -171,8 +171,8 @@ def _by_group(values: Sequence[Float64], op: Int32, group: Int64, groups: int) -
     sums, defined = by_group(group, [*values, *enough], groups)
     often = dict(zip(levels, defined.T[len(values) :], strict=True))
     rows = [often[1]]
-    for measure, total, known in zip(measures(), sums.T, defined.T, strict=False):
-        rows += [total, known, often[measure.lowest_op]]
+    for measure, total, count in zip(measures(), sums.T, defined.T, strict=False):
+        rows += [total, count, often[measure.lowest_op]]
     return np.stack(rows)
 
 
@@ -203,12 +203,12 @@ def split_last(tables: Sequence[TableSummary]) -> list[Means]:
     for row in (row for table in tables for row in table.well_seen):
         steps.setdefault(row.name, []).append(row)
     ordered = [pool(steps[name], voxels) for name in sorted(steps, key=_lowest)]
-    seen = sum(row.voxels for row in ordered)
-    if seen <= CROWDED * voxels or len(ordered) < 2:
+    total = sum(row.voxels for row in ordered)
+    if total <= CROWDED * voxels or len(ordered) < 2:
         return []
     parts: list[list[Means]] = [[]]
     for row in ordered:
-        if sum(own.voxels for own in parts[-1]) + row.voxels / 2 > seen / PARTS and parts[-1] and len(parts) < PARTS:
+        if sum(part.voxels for part in parts[-1]) + row.voxels / 2 > total / PARTS and parts[-1] and len(parts) < PARTS:
             parts.append([])
         parts[-1].append(row)
     if len(parts) < 2:
@@ -235,7 +235,9 @@ def pool(groups: Sequence[Means], voxels: int) -> Means:
     n = sum(group.voxels for group in groups)
     rows, first = [(group.means, group.voxels) for group in groups], groups[0].means
     weights = {key: [means.voxels.get(key, of_all) for means, of_all in rows] for key in first.value}
-    value = {key: _weighted([means.value[key] for means, _ in rows], own) for key, own in weights.items()}
+    value = {
+        key: _weighted([means.value[key] for means, _ in rows], voxel_counts) for key, voxel_counts in weights.items()
+    }
     pooled = MeasureMeans(value, {key: sum(weights[key]) for key in first.voxels})
     return Means(groups[0].name, n / voxels if voxels else math.nan, n, pooled)
 

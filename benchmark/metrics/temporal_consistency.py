@@ -72,11 +72,11 @@ class TemporalConsistency:
         if labels.shape != warped.shape or (counted is not None and counted.shape != labels.shape):
             raise DataError(f"labels {labels.shape}, warped labels {warped.shape}: give images of one size")
         K = self.num_classes
-        known = (labels >= 0) & (labels < K)
-        known = known if counted is None else known & counted
-        own, other = labels[known].astype(np.int64), warped[known].astype(np.int64)
+        valid = (labels >= 0) & (labels < K)
+        valid = valid if counted is None else valid & counted
+        label, other = labels[valid].astype(np.int64), warped[valid].astype(np.int64)
         other = np.where((other >= 0) & (other < K), other, K)
-        pair = np.bincount(own * (K + 1) + other, minlength=K * (K + 1)).reshape(K, K + 1)
+        pair = np.bincount(label * (K + 1) + other, minlength=K * (K + 1)).reshape(K, K + 1)
         sums = np.stack([np.diag(pair), pair[:, :K].sum(axis=1), pair[:, :K].sum(axis=0), pair[:, K]])
         self._sums += sums
         value = float(mean_iou(*sums[:3]))
@@ -119,11 +119,11 @@ SUMS = 4
 
 def pooled_tc(sums: npt.NDArray[np.int64], form: Literal["vspw", "etc"]) -> float:
     """Return TC in a form that pools pixels, from `TemporalConsistency.sums`; NaN if no pixel counts."""
-    same, own, warped, lost = sums
+    same, num_labelled, warped, lost = sums
     if form == "vspw":
-        there = own > 0
-        return float(mean_iou(same[there], own[there], warped[there]))
-    return float(np.nan_to_num(iou(same, own + lost, warped)).mean()) if sums.any() else math.nan
+        there = num_labelled > 0
+        return float(mean_iou(same[there], num_labelled[there], warped[there]))
+    return float(np.nan_to_num(iou(same, num_labelled + lost, warped)).mean()) if sums.any() else math.nan
 
 
 def warp_labels(labels: Labels, flow: npt.NDArray[np.floating[Any]], sampling: Sampling = "nearest") -> Labels:
@@ -194,7 +194,7 @@ def image_flow(image: UInt8, following: UInt8) -> Float32:
     """
     import cv2
 
-    grey = [cv2.cvtColor(each, cv2.COLOR_RGB2GRAY) for each in (image, following)]
+    grey = [cv2.cvtColor(rgb, cv2.COLOR_RGB2GRAY) for rgb in (image, following)]
     search = cv2.DISOpticalFlow.create(cv2.DISOPTICAL_FLOW_PRESET_MEDIUM)
     flow: Any = search.calc(grey[0], grey[1], np.zeros((*grey[0].shape, 2), np.float32))
     return np.asarray(flow, dtype=np.float32)
@@ -227,9 +227,9 @@ def flow_by_depth(frame: Frame, following: Frame, *, depth_tolerance: float = DE
     Also the pixels (H, W) whose point the next frame shows, not occluded (`semstab.pixels.warp.correspond`); elsewhere
     the motion is NaN. It ends in the middle of a pixel of the next frame.
     """
-    seen = correspond(frame, following, depth_tolerance=depth_tolerance)
-    row, column = np.divmod(seen.pixel, following.shape[1])
+    correspondence = correspond(frame, following, depth_tolerance=depth_tolerance)
+    row, column = np.divmod(correspondence.pixel, following.shape[1])
     H, W = frame.shape
     flow = np.stack([column - np.arange(W), row - np.arange(H)[:, None]], axis=2).astype(np.float64)
-    flow[~seen.visible] = np.nan
-    return flow, seen.visible
+    flow[~correspondence.visible] = np.nan
+    return flow, correspondence.visible

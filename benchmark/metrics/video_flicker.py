@@ -93,11 +93,11 @@ class VideoFlickerMeter(ImageSpaceMeter):
         if before.shape != sample.shape:
             self._earlier = None
             return CompensatedFlicker(math.nan, math.nan)
-        seen, to_next = self._flows.between(frame, previous, sample.shape)
+        correspondence, to_next = self._flows.between(frame, previous, sample.shape)
         if self._earlier is not None:
             self.lone.append(lone_pixels(before, [self._earlier, (sample, to_next)]))
-        self._earlier = before, seen
-        return compensated_flicker(before, sample, seen=seen)
+        self._earlier = before, correspondence
+        return compensated_flicker(before, sample, seen=correspondence)
 
     def recall(self, sample: Frame) -> float:
         """Return NaN: there are no edges of depth."""
@@ -107,16 +107,19 @@ class VideoFlickerMeter(ImageSpaceMeter):
 def lone_pixels(frame: Frame, neighbours: Sequence[tuple[Frame, Correspondence]]) -> LonePixels:
     """Return how much of a frame differs from two neighbours that agree, given with the pixels that show the same."""
     (first, in_first), (second, in_second) = neighbours
-    both = covisible(first, frame, in_first) & covisible(second, frame, in_second)
+    is_covisible = covisible(first, frame, in_first) & covisible(second, frame, in_second)
     one, other = in_first.bring(first.predicted), in_second.bring(second.predicted)
-    pixels = int(np.count_nonzero(both))
-    alone = np.count_nonzero(both & (one == other) & (one != frame.predicted))
+    pixels = int(np.count_nonzero(is_covisible))
+    alone = np.count_nonzero(is_covisible & (one == other) & (one != frame.predicted))
     return LonePixels(frame.index, pixels, alone / pixels if pixels else math.nan)
 
 
 def video_picture(frame: Frame, others: Sequence[Frame]) -> LonePicture:
     """Hold a frame against others, with the motion between their images removed."""
     sample, flows = frame.within(SIDE), Flows()
-    seen = [flows.between(frame, other, sample.shape)[0] for other in others]
-    changed = [changed_pixels(other.within(SIDE), sample, own) for other, own in zip(others, seen, strict=True)]
+    correspondences = [flows.between(frame, other, sample.shape)[0] for other in others]
+    changed = [
+        changed_pixels(other.within(SIDE), sample, correspondence)
+        for other, correspondence in zip(others, correspondences, strict=True)
+    ]
     return picture_of(frame, sample, np.logical_and.reduce(changed))

@@ -44,8 +44,8 @@ class VideoMeter:
             DataError: If optical flow is asked for, and the frame has no image.
         """
         labels, labelled = frame.predicted, frame.predicted != frame.ignore_id
-        for own in self._by_itself:
-            own.add(labels, labelled)
+        for meter in self._by_itself:
+            meter.add(labels, labelled)
         for published, own_by_truth in zip(self._published, self._by_truth, strict=True):
             if truth is None:
                 published.skip()
@@ -59,18 +59,18 @@ class VideoMeter:
 
     def result(self) -> VideoMeasures:
         """Return the measures of the frames so far."""
-        published = [ClipMean(each.published, each.published_clips) for each in self._published]
-        by_truth = [ClipMean(each.value, each.clips) for each in self._by_truth]
-        by_itself = [ClipMean(each.value, each.clips) for each in self._by_itself]
+        published = [ClipMean(meter.published, meter.published_clips) for meter in self._published]
+        by_truth = [ClipMean(meter.value, meter.clips) for meter in self._by_truth]
+        by_itself = [ClipMean(meter.value, meter.clips) for meter in self._by_itself]
         clips = dict(zip(CLIP_FIELDS, (*published, *by_truth, *by_itself), strict=True))
         return VideoMeasures(self._flow, **clips, tc=_overlap(self._tc), tc_seen=_overlap(self._tc_seen))
 
     def _compare(self, frame: Frame, following: Frame) -> None:
-        flow, seen = _by_depth(frame, following) if self._flow == "depth" else _by_images(frame, following)
+        flow, is_visible = _by_depth(frame, following) if self._flow == "depth" else _by_images(frame, following)
         inside = warp_labels(np.zeros(frame.shape, np.uint8), flow) == 0
         warped = warp_labels(following.predicted, flow)
         self._tc.add(frame.predicted, warped, inside)
-        self._tc_seen.add(frame.predicted, warped, inside & seen)
+        self._tc_seen.add(frame.predicted, warped, inside & is_visible)
 
 
 Motion = tuple[npt.NDArray[np.floating], Mask]
@@ -79,8 +79,8 @@ Motion = tuple[npt.NDArray[np.floating], Mask]
 
 def _by_depth(frame: Frame, following: Frame) -> Motion:
     """Return the motion of all pixels with depth; `flow_by_depth` leaves out what the next frame hides."""
-    _, seen = flow_by_depth(frame, following)
-    return flow_by_depth(frame, following, depth_tolerance=np.inf)[0], seen
+    _, is_visible = flow_by_depth(frame, following)
+    return flow_by_depth(frame, following, depth_tolerance=np.inf)[0], is_visible
 
 
 def _by_images(frame: Frame, following: Frame) -> Motion:

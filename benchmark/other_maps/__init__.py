@@ -55,13 +55,13 @@ class MapComparison:
     @property
     def agreements(self) -> tuple[MapAgreement, ...]:
         """The numbers of each map."""
-        return tuple(each.agreement for each in self.maps)
+        return tuple(voxelwise.agreement for voxelwise in self.maps)
 
     def __repr__(self) -> str:
         lines = [f"<MapComparison with {self.run.name} on {self.scene}>"]
         lines += [
-            f"  {own.name}: {own.same:.1%} of {own.compared:,} labels agree; it holds {own.covers:.1%} of the voxels"
-            for own in self.agreements
+            f"  {row.name}: {row.same:.1%} of {row.compared:,} labels agree; it holds {row.covers:.1%} of the voxels"
+            for row in self.agreements
         ]
         return "\n".join(lines)
 
@@ -127,8 +127,10 @@ def compare_maps(
         labels = labels_of(
             cloud, target, None if classes is None else str(classes), None if colours is None else Path(colours)
         )
-        own = _compared(cloud, labels.row, ours, placement, first.georeference, name)
-        compared.append(replace(own, agreement=replace(own.agreement, notes=(*_frame_notes(cloud), *labels.notes))))
+        voxelwise = _compared(cloud, labels.row, ours, placement, first.georeference, name)
+        compared.append(
+            replace(voxelwise, agreement=replace(voxelwise.agreement, notes=(*_frame_notes(cloud), *labels.notes)))
+        )
     comparison = MapComparison(ours, first, tuple(compared), record.unit.scene)
     if out is not None:
         from semstab.other_maps.written import write
@@ -138,10 +140,10 @@ def compare_maps(
     return comparison
 
 
-def _names(others: Sequence[str | Path]) -> list[str]:
+def _names(paths: Sequence[str | Path]) -> list[str]:
     """Return a short name for each file: without its folder, if no two are called so."""
-    names = [Path(other).name for other in others]
-    return names if len(set(names)) == len(names) else [str(other) for other in others]
+    names = [Path(other).name for other in paths]
+    return names if len(set(names)) == len(names) else [str(other) for other in paths]
 
 
 def _system(cloud: Cloud, frame: str | None, georeference: Georeference | None) -> System:
@@ -167,14 +169,14 @@ def _system(cloud: Cloud, frame: str | None, georeference: Georeference | None) 
 
 
 def _short(crs: str) -> str:
-    named = re.search(r'"([^"]*)"', crs)
-    return named[1] if named else crs[:60]
+    match = re.search(r'"([^"]*)"', crs)
+    return match[1] if match else crs[:60]
 
 
 def _epsg(crs: str) -> int | None:
     """Return the EPSG number of a reference system in WKT or by its name; None if it has none."""
-    if named := re.search(r"\(EPSG:(\d+)\)$", crs):
-        return int(named[1])
+    if match := re.search(r"\(EPSG:(\d+)\)$", crs):
+        return int(match[1])
     try:
         from pyproj import CRS
         from pyproj.exceptions import CRSError
@@ -204,8 +206,8 @@ def _compared(
         raise _outside(cloud, placed, run, better.line() if better else "")
     theirs = fused(placed, row, size, len(run.classes))
     numbers = len(points), float(np.mean(~inside)), float(np.mean(row == NONE))
-    found = agreement(run, theirs, name, *numbers, placement)
-    return replace(found, agreement=replace(found.agreement, better=better.line() if better else ""))
+    voxelwise = agreement(run, theirs, name, *numbers, placement)
+    return replace(voxelwise, agreement=replace(voxelwise.agreement, better=better.line() if better else ""))
 
 
 def _outside(cloud: Cloud, placed: Float64, run: RunMap, better: str) -> DataError:

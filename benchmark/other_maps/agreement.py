@@ -228,49 +228,53 @@ def agreement(
     at, ours = run.grid.rows(theirs.index), run.grid.label
     label, held = _theirs_in_run(run, theirs, at), np.zeros(len(ours), np.bool_)
     held[at[at != NONE]] = True
-    both, same, K = (ours != NONE) & (label != NONE), ours == label, len(run.classes)
+    labelled, same, K = (ours != NONE) & (label != NONE), ours == label, len(run.classes)
     true = np.full(len(ours), NONE, np.int64) if run.true is None else run.true
-    known = both & (true != NONE)
-    area, places = _places(run, label, both & ~same, true)
-    accuracy = share(ours == true, known), share(label == true, known)
-    found = MapAgreement(
+    has_truth = labelled & (true != NONE)
+    area, places = _places(run, label, labelled & ~same, true)
+    accuracy = share(ours == true, has_truth), share(label == true, has_truth)
+    result = MapAgreement(
         name, points, outside, unlabelled, len(theirs), share(held, np.ones_like(held)), float(np.mean(at != NONE)),
-        int(np.count_nonzero(both)), share(same, both), int(np.count_nonzero(known)), accuracy,
-        (_miou(ours, true, known, K), _miou(label, true, known, K)),
-        tuple(_by_class(run, label, both, true)), tuple(_by_op(run, label, held, both, true)), places,
+        int(np.count_nonzero(labelled)), share(same, labelled), int(np.count_nonzero(has_truth)), accuracy,
+        (_miou(ours, true, has_truth, K), _miou(label, true, has_truth, K)),
+        tuple(_by_class(run, label, labelled, true)), tuple(_by_op(run, label, held, labelled, true)), places,
     )  # fmt: skip
-    return Voxelwise(found, theirs, at, area, placement)
+    return Voxelwise(result, theirs, at, area, placement)
 
 
-def _miou(label: Int64, true: Int64, known: Mask, K: int) -> float:
-    right = known & (label == true)
-    counts = [np.bincount(of[where], minlength=K) for of, where in ((true, right), (true, known), (label, known))]
-    return float(mean_iou(*counts)) if known.any() else math.nan
+def _miou(label: Int64, true: Int64, has_truth: Mask, K: int) -> float:
+    right = has_truth & (label == true)
+    counts = [
+        np.bincount(of[where], minlength=K) for of, where in ((true, right), (true, has_truth), (label, has_truth))
+    ]
+    return float(mean_iou(*counts)) if has_truth.any() else math.nan
 
 
-def _by_class(run: RunMap, label: Int64, both: Mask, true: Int64) -> list[ClassAgreement]:
+def _by_class(run: RunMap, label: Int64, labelled: Mask, true: Int64) -> list[ClassAgreement]:
     ours, K = run.grid.label, len(run.classes)
-    confusion = np.bincount(ours[both] * K + label[both], minlength=K * K).reshape(K, K)
+    confusion = np.bincount(ours[labelled] * K + label[labelled], minlength=K * K).reshape(K, K)
     rows = []
     for k, name in enumerate(run.classes):
-        n, others = int(confusion[k].sum()), np.where(np.arange(K) == k, 0, confusion[k])
-        of_class = both & (true == k)
+        n, confused = int(confusion[k].sum()), np.where(np.arange(K) == k, 0, confusion[k])
+        of_class = labelled & (true == k)
         if n or of_class.any():
-            instead = run.classes[int(others.argmax())] if others.any() else ""
+            instead = run.classes[int(confused.argmax())] if confused.any() else ""
             recall = share(ours == k, of_class), share(label == k, of_class)
             rows.append(ClassAgreement(name, n, int(confusion[k, k]) / n if n else math.nan, instead, recall))
     return rows
 
 
-def _by_op(run: RunMap, label: Int64, held: Mask, both: Mask, true: Int64) -> list[StratumAgreement]:
+def _by_op(run: RunMap, label: Int64, held: Mask, labelled: Mask, true: Int64) -> list[StratumAgreement]:
     ours, group, rows = run.grid.label, groups_of(run.op, EDGES), []
     for k, (name, _, _) in enumerate(strata(EDGES)):
-        own = group == k
-        if own.any():
-            known = own & both & (true != NONE)
-            accuracy = share(ours == true, known), share(label == true, known)
-            same = share(ours == label, own & both)
-            rows.append(StratumAgreement(name, int(np.count_nonzero(own)), share(held, own), same, accuracy))
+        in_stratum = group == k
+        if in_stratum.any():
+            has_truth = in_stratum & labelled & (true != NONE)
+            accuracy = share(ours == true, has_truth), share(label == true, has_truth)
+            same = share(ours == label, in_stratum & labelled)
+            rows.append(
+                StratumAgreement(name, int(np.count_nonzero(in_stratum)), share(held, in_stratum), same, accuracy)
+            )
     return rows
 
 
@@ -283,15 +287,15 @@ def _places(run: RunMap, label: Int64, differs: Mask, true: Int64) -> tuple[Int6
     places = []
     for k in range(len(count)):
         rows = order[edges[k] : edges[k + 1]]
-        own = centers(run.grid.index[rows], size)
-        x, y, z = own.mean(axis=0).tolist()
-        extent = float(np.linalg.norm(np.ptp(own, axis=0) + size))
+        points = centers(run.grid.index[rows], size)
+        x, y, z = points.mean(axis=0).tolist()
+        extent = float(np.linalg.norm(np.ptp(points, axis=0) + size))
         first = rows[0]
-        named = run.classes[ours[first]], run.classes[label[first]], _most(true[rows], run.classes)
-        places.append(Place(k + 1, *named, len(rows), (x, y, z), extent))
+        class_names = run.classes[ours[first]], run.classes[label[first]], _most(true[rows], run.classes)
+        places.append(Place(k + 1, *class_names, len(rows), (x, y, z), extent))
     return area, tuple(places)
 
 
 def _most(true: Int64, classes: Sequence[str]) -> str:
-    known = true[true != NONE]
-    return classes[int(np.bincount(known).argmax())] if len(known) else ""
+    labels = true[true != NONE]
+    return classes[int(np.bincount(labels).argmax())] if len(labels) else ""

@@ -44,14 +44,14 @@ class Target:
     @classmethod
     def of(cls, classes: tuple[str, ...], colors: UInt8, taxonomy: str) -> Target:
         """Return the classes of a run; a taxonomy that ships has ids and members of each class."""
-        own = {name_key(name): row for row, name in enumerate(classes)}
+        row_of = {name_key(name): row for row, name in enumerate(classes)}
         try:
             space = LabelSpace.load(taxonomy)
         except ConfigError:
             space = None
         if space is None or space.classes != classes:
-            return cls(classes, tuple(range(len(classes))), colors, taxonomy, own)
-        return cls(classes, space.ids, colors, taxonomy, space.row_of | own)
+            return cls(classes, tuple(range(len(classes))), colors, taxonomy, row_of)
+        return cls(classes, space.ids, colors, taxonomy, space.row_of | row_of)
 
 
 @dataclass(frozen=True, eq=False)
@@ -111,22 +111,22 @@ def _unknown(distinct: npt.NDArray[Any], of: Int64, row: Int64) -> tuple[str, ..
 def _by_id(cloud: Cloud, ids: npt.NDArray[Any], target: Target, classes: str | None) -> Labels:
     """Name ids by the file of classes, else by what the cloud states, else by ASPRS codes, else as the run's own."""
     notes: tuple[str, ...] = ()
-    named: Mapping[int, str]
+    name_of_id: Mapping[int, str]
     if classes is not None:
-        named = names_by_id(classes)
+        name_of_id = names_by_id(classes)
     elif cloud.stated.names:
-        named = cloud.stated.names
+        name_of_id = cloud.stated.names
     elif cloud.what == "classification" and cloud.path.suffix.lower() in LAS_CLOUD:
-        named = _of_asprs(target)
-        if not named:
+        name_of_id = _of_asprs(target)
+        if not name_of_id:
             raise ConfigError(f"{cloud.path}: no ASPRS codes ship for {target.taxonomy}; name codes with --classes")
         notes = ("ASPRS codes by the table of the taxonomy (--classes names others)",)
     else:
-        named = dict(zip(target.ids, target.classes, strict=True))
-        first = ", ".join(f"{k} {name}" for k, name in [*named.items()][:3])
+        name_of_id = dict(zip(target.ids, target.classes, strict=True))
+        first = ", ".join(f"{k} {name}" for k, name in [*name_of_id.items()][:3])
         notes = (f"its ids have no names, so they are the run's: {first} ... (--classes names others)",)
     distinct, of = np.unique(ids, return_inverse=True)
-    texts = np.array([named.get(int(k), "" if k < 0 else f"id {k}") for k in distinct], dtype=np.str_)
+    texts = np.array([name_of_id.get(int(k), "" if k < 0 else f"id {k}") for k in distinct], dtype=np.str_)
     labels = _by_name(texts[of], target)
     return Labels(labels.row, (*notes, *labels.notes))
 
@@ -161,10 +161,10 @@ def _by_colour(cloud: Cloud, target: Target, colours: Path | None) -> Labels:
     from scipy.spatial import cKDTree
 
     palette = dict(zip(target.classes, target.colors.tolist(), strict=True)) if colours is None else palette_of(colours)
-    names, known = [*palette], np.array([*palette.values()], dtype=np.float64)
+    names, palette_rgb = [*palette], np.array([*palette.values()], dtype=np.float64)
     distinct, of = np.unique(cloud.colors @ (np.array([2**16, 2**8, 1])), return_inverse=True)
     rgb = np.stack([distinct >> 16, (distinct >> 8) & 255, distinct & 255], axis=1).astype(np.float64)
-    apart, nearest_class = cKDTree(known).query(rgb)
+    apart, nearest_class = cKDTree(palette_rgb).query(rgb)
     near = apart <= SAME_COLOUR
     rows = np.array([target.row_of.get(name_key(name), NONE) for name in names], np.int64)
     row = np.where(near, np.maximum(rows, NONE)[nearest_class], NONE)[of]

@@ -91,8 +91,8 @@ def read_cloud(path: Path, field_name: str | None = None) -> Cloud:
         raise ConfigError(f"{path}: there is no such file")
     try:
         columns, stated, faces = reader(path)
-        named = {_plain(name): values for name, values in columns.items()}
-        return _cloud(path, named, stated, faces, field_name)
+        plain_columns = {_plain(name): values for name, values in columns.items()}
+        return _cloud(path, plain_columns, stated, faces, field_name)
     except (SemstabError, ImportError):
         raise
     except Exception as error:  # readers of other libraries raise anything at a damaged file
@@ -108,14 +108,14 @@ def _cloud(
     path: Path, columns: Columns, stated: Stated, faces: npt.NDArray[Any] | None, field_name: str | None
 ) -> Cloud:
     points, colors = _points(path, columns, stated), _colors(columns)
-    wanted = None if field_name is None else _plain(field_name)
-    if wanted in ("color", COLOUR):
+    plain_name = None if field_name is None else _plain(field_name)
+    if plain_name in ("color", COLOUR):
         if colors is None:
             raise ConfigError(f"{path}: its points have no colour; leave out --field")
         return Cloud(path, points, None, colors, COLOUR, stated, faces)
-    if wanted is not None and wanted not in columns:
+    if plain_name is not None and plain_name not in columns:
         raise ConfigError(f"{path}: no field '{field_name}'; it has {', '.join(sorted(columns))}")
-    what = wanted or next((name for name in FIELDS if name in columns), None)
+    what = plain_name or next((name for name in FIELDS if name in columns), None)
     if what is None and colors is None:
         raise DataError(
             f"{path}: no field holds a class ({', '.join(FIELDS[:4])} ...), and points have no colour;"
@@ -142,10 +142,10 @@ def _labels(path: Path, what: str, values: npt.NDArray[Any]) -> npt.NDArray[Any]
     if values.dtype.kind in "OUS":
         return values.astype(str)
     if values.dtype.kind == "f":
-        known = np.where(np.isfinite(values), values, -1)
-        if (known != np.round(known)).any():
+        ids = np.where(np.isfinite(values), values, -1)
+        if (ids != np.round(ids)).any():
             raise DataError(f"{path}: field '{what}' holds numbers that are not whole, so no classes; name another one")
-        return known.astype(np.int64)
+        return ids.astype(np.int64)
     return values.astype(np.int64)
 
 
@@ -153,13 +153,13 @@ def _points(path: Path, columns: Columns, stated: Stated) -> Float64:
     """Return coordinates (n, 3), of centres where the file holds indices of voxels."""
     if all(axis in columns for axis in "xyz"):
         return np.stack([columns[axis].astype(np.float64).reshape(-1) for axis in "xyz"], axis=1)
-    given = next((columns[name] for name in POSITIONS if name in columns), None)
-    if given is not None:
-        return _triples(path, given).astype(np.float64)
+    position = next((columns[name] for name in POSITIONS if name in columns), None)
+    if position is not None:
+        return _triples(path, position).astype(np.float64)
     if all(axis in columns for axis in ("ix", "iy", "iz")):
         index = np.stack([columns[axis].reshape(-1) for axis in ("ix", "iy", "iz")], axis=1)
-    elif (found := next((columns[name] for name in INDICES if name in columns), None)) is not None:
-        index = _triples(path, found)
+    elif (indices := next((columns[name] for name in INDICES if name in columns), None)) is not None:
+        index = _triples(path, indices)
     else:
         raise DataError(f"{path}: no coordinates: x, y, z, or points (n, 3); it has {', '.join(sorted(columns))}")
     if not stated.voxel_size > 0:
@@ -168,10 +168,12 @@ def _points(path: Path, columns: Columns, stated: Stated) -> Float64:
     return centres
 
 
-def _triples(path: Path, given: npt.NDArray[Any]) -> npt.NDArray[Any]:
-    if given.ndim != 2 or given.shape[1] != 3 or given.dtype.kind not in "iuf":
-        raise DataError(f"{path}: coordinates of shape {given.shape} and type {given.dtype}, expected numbers (n, 3)")
-    return given
+def _triples(path: Path, triples: npt.NDArray[Any]) -> npt.NDArray[Any]:
+    if triples.ndim != 2 or triples.shape[1] != 3 or triples.dtype.kind not in "iuf":
+        raise DataError(
+            f"{path}: coordinates of shape {triples.shape} and type {triples.dtype}, expected numbers (n, 3)"
+        )
+    return triples
 
 
 def _colors(columns: Columns) -> UInt8 | None:
@@ -181,10 +183,10 @@ def _colors(columns: Columns) -> UInt8 | None:
             rgb = np.stack([columns[name].reshape(-1) for name in names], axis=1)
             break
     else:
-        found = next((columns[name] for name in ("colors", "colours", "rgb") if name in columns), None)
-        if found is None or found.ndim != 2 or found.shape[1] < 3:
+        colors = next((columns[name] for name in ("colors", "colours", "rgb") if name in columns), None)
+        if colors is None or colors.ndim != 2 or colors.shape[1] < 3:
             return None
-        rgb = found[:, :3]
+        rgb = colors[:, :3]
     largest = rgb.max(initial=0)
     if rgb.dtype.kind == "f" and largest <= 1:
         return np.round(255 * rgb).astype(np.uint8)
@@ -213,8 +215,8 @@ def _read_ply(path: Path) -> Content:
     names = vertices.dtype.names if isinstance(vertices, np.ndarray) else vertices.keys()
     columns = {name: np.asarray(vertices[name]) for name in names}
     faces = kwargs.get("faces")
-    classes = {int(found[1]): found[2] for line in comments if (found := NAMED.fullmatch(line))}
-    ours = next((found for line in comments if (found := OURS.fullmatch(line))), None)
+    classes = {int(match[1]): match[2] for line in comments if (match := NAMED.fullmatch(line))}
+    ours = next((match for line in comments if (match := OURS.fullmatch(line))), None)
     stated = Stated(classes) if ours is None else _of_ours(classes, float(ours[1]), ours[2])
     return columns, stated, faces if faces is not None and len(faces) else None
 
@@ -267,8 +269,8 @@ def _read_parquet(path: Path) -> Content:
 
     schema = pq.read_schema(path)
     about = parse_json((schema.metadata or {}).get(b"semstab", b"{}"))
-    known = {"x", "y", "z", "ix", "iy", "iz", "red", "green", "blue", "r", "g", "b", *FIELDS}
-    table = pq.read_table(path, columns=[name for name in schema.names if _plain(name) in known])
+    column_names = {"x", "y", "z", "ix", "iy", "iz", "red", "green", "blue", "r", "g", "b", *FIELDS}
+    table = pq.read_table(path, columns=[name for name in schema.names if _plain(name) in column_names])
     columns = {}
     for name, column in zip(table.column_names, table.columns, strict=True):
         if pa.types.is_dictionary(column.type):

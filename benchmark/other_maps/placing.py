@@ -53,8 +53,8 @@ class Placement:
         """
         if unit not in UNITS:
             raise ConfigError(f"--unit {unit}: not known; {nearest(unit, [*UNITS])}")
-        named = tuple((axes or "x,y,z").replace(" ", "").split(","))
-        if sorted(name.lstrip("-") for name in named) != [*AXES] or any(name[:2] == "--" for name in named):
+        file_axes = tuple((axes or "x,y,z").replace(" ", "").split(","))
+        if sorted(name.lstrip("-") for name in file_axes) != [*AXES] or any(name[:2] == "--" for name in file_axes):
             raise ConfigError(f"--axes {axes}: write the axes of the file that become x, y and z, as x,-z,y")
         try:
             metres = [float(number) for number in (shift or "0,0,0").split(",")]
@@ -62,7 +62,7 @@ class Placement:
             metres = []
         if len(metres) != 3 or not np.isfinite(metres).all():
             raise ConfigError(f"--shift {shift}: write three numbers in metres, as 0.05,0.05,0.05")
-        a, b, c = named
+        a, b, c = file_axes
         x, y, z = metres
         return cls(unit, (a, b, c), (x, y, z), system)
 
@@ -161,8 +161,8 @@ def fused(points: Float64, row: Int64, size: float, K: int) -> Grid:
     index, of = np.unique(index_of(points, size), axis=0, return_inverse=True)
     if (np.abs(index) >= FARTHEST).any():
         raise DataError(f"points lie more than {FARTHEST * size:.3g} m from the origin; check their unit (--unit)")
-    known = row != NONE
-    pairs, votes = np.unique(of.reshape(-1)[known] * K + row[known], return_counts=True)
+    labelled = row != NONE
+    pairs, votes = np.unique(of.reshape(-1)[labelled] * K + row[labelled], return_counts=True)
     voxel, label = pairs // K, pairs % K
     order = np.lexsort((label, -votes, voxel))
     first = np.append(True, np.diff(voxel[order]) != 0) if len(order) else np.zeros(0, np.bool_)
@@ -189,12 +189,12 @@ def on_surface(points: Float64, row: Int64, faces: npt.NDArray[np.integer[Any]],
     steps = np.clip(np.ceil(longest / step), 1, MOST_STEPS).astype(np.int64)
     placed, rows = [points], [row]
     for n in np.unique(steps[steps > 1]).tolist():
-        own = faces[steps == n]
+        split_faces = faces[steps == n]
         i, j = np.divmod(np.arange((n + 1) ** 2), n + 1)
         weights = np.stack([i, j, n - i - j], axis=1)[i + j <= n] / n
         weights = weights[weights.max(axis=1) < 1]
-        placed.append(np.einsum("wc,fcd->fwd", weights, points[own]).reshape(-1, 3))
-        rows.append(row[own][:, weights.argmax(axis=1)].reshape(-1))
+        placed.append(np.einsum("wc,fcd->fwd", weights, points[split_faces]).reshape(-1, 3))
+        rows.append(row[split_faces][:, weights.argmax(axis=1)].reshape(-1))
     return np.concatenate(placed), np.concatenate(rows)
 
 
@@ -259,19 +259,19 @@ def better_placement(
         given: The configured placement.
         georeference: Georeference of the scene, or None.
     """
-    drawn = np.linspace(0, len(points) - 1, min(SAMPLE, len(points))).astype(np.int64)
-    points, row = points[drawn], row[drawn]
+    sample = np.linspace(0, len(points) - 1, min(SAMPLE, len(points))).astype(np.int64)
+    points, row = points[sample], row[sample]
     extent = float(np.linalg.norm(np.ptp(grid.index, axis=0) + 1.0)) * grid.size
 
     def fit(placement: Placement) -> _Fit:
         placed = placement(points, georeference)
         if placement.unit != given.unit and float(np.linalg.norm(np.ptp(placed, axis=0))) < SMALL * extent:
             return _Fit(0.0, 0.0)
-        own = fused(placed, row, grid.size, int(max(row.max(), 0)) + 1) if _near(placed, grid) else None
-        if own is None:
+        cloud_grid = fused(placed, row, grid.size, int(max(row.max(), 0)) + 1) if _near(placed, grid) else None
+        if cloud_grid is None:
             return _Fit(0.0, 0.0)
-        at = grid.rows(own.index)
-        same = (at != NONE) & (own.label != NONE) & (own.label == grid.label[at])
+        at = grid.rows(cloud_grid.index)
+        same = (at != NONE) & (cloud_grid.label != NONE) & (cloud_grid.label == grid.label[at])
         return _Fit(float(np.mean(at != NONE)), float(same.mean()))
 
     before = fit(given)
@@ -298,22 +298,22 @@ def _near(placed: Float64, grid: Grid) -> bool:
     )
 
 
-def _turned(given: Placement, georeference: Georeference | None) -> Iterator[Placement]:
+def _turned(configured: Placement, georeference: Georeference | None) -> Iterator[Placement]:
     """Yield placements with other frames, units and axes, those that change least first."""
     systems: Sequence[System] = ("scene",) if georeference is None else ("scene", "projection")
     tried = [
-        replace(given, system=system, unit=unit, axes=(a, b, c))
+        replace(configured, system=system, unit=unit, axes=(a, b, c))
         for system in systems
         for unit in UNITS
         for order in itertools.permutations(AXES)
         for a, b, c in itertools.product(*((name, f"-{name}") for name in order))
     ]
-    yield from sorted(tried, key=lambda own: _changes(own, given))
+    yield from sorted(tried, key=lambda placement: _changes(placement, configured))
 
 
-def _changes(placement: Placement, given: Placement) -> int:
-    axes = sum(own != before for own, before in zip(placement.axes, given.axes, strict=True))
-    return 4 * (placement.system != given.system) + 4 * (placement.unit != given.unit) + axes
+def _changes(placement: Placement, configured: Placement) -> int:
+    axes = sum(axis != before for axis, before in zip(placement.axes, configured.axes, strict=True))
+    return 4 * (placement.system != configured.system) + 4 * (placement.unit != configured.unit) + axes
 
 
 def _shifted(placement: Placement, size: float) -> Iterator[Placement]:

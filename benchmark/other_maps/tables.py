@@ -43,9 +43,9 @@ def overview(agreements: tuple[MapAgreement, ...], run: str) -> Table:
         Column("miou_run", "run", 3, over="mIoU"), Column("miou_map", "map", 3, over="mIoU"),
     )  # fmt: skip
     rows = tuple(
-        (own.name, own.voxels, 100 * own.covers, 100 * own.covered, 100 * own.outside, 100 * own.unlabelled,
-         100 * own.same, *own.accuracy, *own.miou)
-        for own in agreements
+        (row.name, row.voxels, 100 * row.covers, 100 * row.covered, 100 * row.outside, 100 * row.unlabelled,
+         100 * row.same, *row.accuracy, *row.miou)
+        for row in agreements
     )  # fmt: skip
     caption = (
         f"Holds: the share of the voxels of {run} that the map holds; in run: the share of the map's voxels that {run}"
@@ -62,8 +62,8 @@ def _classes(agreements: tuple[MapAgreement, ...], run: str) -> Table:
         Column("recall_map", "map", 3, over="Recall"),
     )  # fmt: skip
     groups = tuple(
-        Group(own.name, tuple((c.name, c.voxels, 100 * c.same, c.instead, *c.recall) for c in own.classes))
-        for own in agreements
+        Group(agreement.name, tuple((c.name, c.voxels, 100 * c.same, c.instead, *c.recall) for c in agreement.classes))
+        for agreement in agreements
     )
     caption = f"Voxels that both hold and label, by their class in {run}; recall is by the true class."
     return Table("maps_classes", "By class", caption, columns, groups, "map")
@@ -76,8 +76,11 @@ def _strata(agreements: tuple[MapAgreement, ...], run: str) -> Table:
         Column("accuracy_map", "map", 3, over="Acc."),
     )  # fmt: skip
     groups = tuple(
-        Group(own.name, tuple((s.name, s.voxels, 100 * s.covered, 100 * s.same, *s.accuracy) for s in own.strata))
-        for own in agreements
+        Group(
+            agreement.name,
+            tuple((s.name, s.voxels, 100 * s.covered, 100 * s.same, *s.accuracy) for s in agreement.strata),
+        )
+        for agreement in agreements
     )
     caption = f"Voxels of {run} by the number of frames that saw them; holds: the share that the other map holds."
     return Table("maps_op", "By OP", caption, columns, groups, "map")
@@ -89,7 +92,11 @@ def _places(agreements: tuple[MapAgreement, ...], run: str) -> Table:
         Column("voxels", "Voxels", 0), Column("x", "x", 2), Column("y", "y", 2), Column("z", "z", 2),
         Column("size", "Size, m", 1),
     )  # fmt: skip
-    groups = tuple(Group(own.name, tuple(map(_place, own.places[:MOST_PLACES]))) for own in agreements if own.places)
+    groups = tuple(
+        Group(agreement.name, tuple(map(_place, agreement.places[:MOST_PLACES])))
+        for agreement in agreements
+        if agreement.places
+    )
     caption = (
         f"Neighbouring voxels to which {run} and the map give two different classes, the most voxels first; coordinates"
         " of the scene, metres."
@@ -118,14 +125,14 @@ def print_maps(agreements: tuple[MapAgreement, ...], run: str, console: Console,
     """Print the table of maps and what to know about each; verbose: also classes, strata of OP and places."""
     for table in tables(agreements, run):
         if table.name == "maps" or verbose:
-            shown = table.only(*OVERVIEW) if table.name == "maps" else table
+            display_table = table.only(*OVERVIEW) if table.name == "maps" else table
             groups = tuple(
                 Group(short(group.name), tuple((short(str(row[0])), *row[1:]) for row in group.rows))
-                for group in shown.groups
+                for group in display_table.groups
             )
-            text = to_terminal(dataclasses.replace(shown, caption="", groups=groups), WIDTH)
+            text = to_terminal(dataclasses.replace(display_table, caption="", groups=groups), WIDTH)
             console.print(f"{text.rstrip()}\n", highlight=False, markup=False, soft_wrap=True)
-    for own in agreements:
-        for line in lines(own):
+    for agreement in agreements:
+        for line in lines(agreement):
             wrapped = textwrap.wrap(f"  {line}", console.width, subsequent_indent="    ")
             console.print("\n".join(wrapped), highlight=False, markup=False)

@@ -47,9 +47,9 @@ def write(comparison: MapComparison, out: Path) -> list[Path]:
     from semstab.recording.other_maps import Colored, record_maps
 
     written = [*save_tables(tables(comparison.agreements, comparison.run.name), out), *_write_places(comparison, out)]
-    drawn = [path for figure in pictures(comparison) for path in figure.save(out / FIGURES)]
-    keep_only(drawn, out / FIGURES)
-    unions = {own.agreement.name: own.laid_together(comparison.run) for own in comparison.maps}
+    figure_paths = [path for figure in pictures(comparison) for path in figure.save(out / FIGURES)]
+    keep_only(figure_paths, out / FIGURES)
+    unions = {voxelwise.agreement.name: voxelwise.laid_together(comparison.run) for voxelwise in comparison.maps}
     palette, size = comparison.first.colors, comparison.run.grid.size
     views = {
         name: [
@@ -60,24 +60,27 @@ def write(comparison: MapComparison, out: Path) -> list[Path]:
         for name, union in unions.items()
     }
     places = {
-        own.name: [
-            (f"{place.number} {place.ours} / {place.theirs}", place.centre) for place in own.places[:MOST_NUMBERED]
+        agreement.name: [
+            (f"{place.number} {place.ours} / {place.theirs}", place.centre)
+            for place in agreement.places[:MOST_NUMBERED]
         ]
-        for own in comparison.agreements
+        for agreement in comparison.agreements
     }
     record_maps(out / RECORDING, comparison.scene, views, places, size, comparison.first.up)
-    return [*written, *drawn, out / RECORDING]
+    return [*written, *figure_paths, out / RECORDING]
 
 
 def _write_places(comparison: MapComparison, out: Path) -> list[Path]:
     first = comparison.first
-    found = [(own.name, place) for own in comparison.agreements for place in own.places]
-    if not found:
+    named_places = [(agreement.name, place) for agreement in comparison.agreements for place in agreement.places]
+    if not named_places:
         for name in ("places.csv", "places.geojson"):
             (out / name).unlink(missing_ok=True)
         return []
-    points = first.in_file(np.array([place.centre for _, place in found]))
-    rows = [_row(name, place, point, first.georeference) for (name, place), point in zip(found, points, strict=True)]
+    points = first.in_file(np.array([place.centre for _, place in named_places]))
+    rows = [
+        _row(name, place, point, first.georeference) for (name, place), point in zip(named_places, points, strict=True)
+    ]
     degrees = None if first.georeference is None else degrees_of(points, first.georeference, out / "places.geojson")
     write_text(out / "places.csv", places_table(rows, degrees))
     write_json(out / "places.geojson", geojson(rows, points.tolist(), degrees, first))
@@ -97,13 +100,14 @@ def pictures(comparison: MapComparison) -> list[Figure]:
     """Return a picture of each map: its classes against the run's, and their correctness with ground truth."""
     return [
         Figure(
-            slug("maps", own.agreement.name),
-            f"{own.agreement.name} and {comparison.run.name}",
+            slug("maps", voxelwise.agreement.name),
+            f"{voxelwise.agreement.name} and {comparison.run.name}",
             "In each column of voxels the one that differs most is shown; numbers name the largest places.",
-            f"The maps of {comparison.scene}: where {own.agreement.name} and {comparison.run.name} give other classes.",
-            partial(draw, comparison, own),
+            f"The maps of {comparison.scene}: where {voxelwise.agreement.name} and {comparison.run.name}"
+            " give other classes.",
+            partial(draw, comparison, voxelwise),
         )
-        for own in comparison.maps
+        for voxelwise in comparison.maps
     ]
 
 
@@ -117,17 +121,17 @@ def draw(comparison: MapComparison, own: Voxelwise) -> Canvas:
     union, run, georeference = own.laid_together(comparison.run), comparison.run, comparison.first.georeference
     size, up = run.grid.size, comparison.first.up or (0.0, 0.0, 1.0)
     laid = centers(union.index, size)
-    shown, axis, view = best_view_of(laid, size, up)
-    laid = laid[shown]
+    visible, axis, view = best_view_of(laid, size, up)
+    laid = laid[visible]
     panels: list[tuple[str, Any, Any, Any, Any]] = [
-        (f"{short(own.agreement.name)}, {view}", union.kind[shown], RANK_OF_KIND, OF_KIND, tuple(KINDS.values()))
+        (f"{short(own.agreement.name)}, {view}", union.kind[visible], RANK_OF_KIND, OF_KIND, tuple(KINDS.values()))
     ]
     if union.right is not None:
-        panels.append(("which is right", union.right[shown], RANK_OF_RIGHT, OF_RIGHT, RIGHT))
-    seen = [top_down(laid, size, axis, rank[values]) for _, values, rank, _, _ in panels]
-    figure, axes = map_panels(seen[0].rows, len(panels))
+        panels.append(("which is right", union.right[visible], RANK_OF_RIGHT, OF_RIGHT, RIGHT))
+    projections = [top_down(laid, size, axis, rank[values]) for _, values, rank, _, _ in panels]
+    figure, axes = map_panels(projections[0].rows, len(panels))
     for panel, letter, (title, values, _, colors, names), (rows, cell, corner) in zip(
-        axes, LETTERS, panels, seen, strict=False
+        axes, LETTERS, panels, projections, strict=False
     ):
         draw_kinds(figure, panel, rows, values, colors, names)
         located = Located.seen_along(axis, corner, (rows.shape[1] * cell, rows.shape[0] * cell), laid, georeference)

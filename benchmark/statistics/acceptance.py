@@ -169,19 +169,19 @@ def calibrate(
     result = {}
     for k, name in enumerate(names):
         rows = np.flatnonzero((label == k) & (true >= 0))
-        own = {by: value[rows] for by, value in values.items()}
-        sample = _Labels(index[rows], true[rows] == k, own, size)
+        evidence = {by: value[rows] for by, value in values.items()}
+        sample = _Labels(index[rows], true[rows] == k, evidence, size)
         result[name] = sample.least(precision, 1 - confidence)
-    every = AcceptanceThresholds(
+    thresholds = AcceptanceThresholds(
         schema=SCHEMA, precision=precision, confidence=confidence, voxel_size=size, calibrated_on=on, classes=result
     )
-    decided = [every.decide(table) for table in tables]
-    left = float((np.concatenate(decided) >= 0).mean())
+    decided = [thresholds.decide(table) for table in tables]
+    retained = float((np.concatenate(decided) >= 0).mean())
     of_class = {
         name: float((np.concatenate(decided) == k).sum() / max((label == k).sum(), 1)) for k, name in enumerate(names)
     }
-    classes = {name: each.model_copy(update={"left": of_class[name]}) for name, each in result.items()}
-    return every.model_copy(update={"left": left, "classes": classes})
+    classes = {name: threshold.model_copy(update={"left": of_class[name]}) for name, threshold in result.items()}
+    return thresholds.model_copy(update={"left": retained, "classes": classes})
 
 
 class _Labels:
@@ -194,32 +194,34 @@ class _Labels:
 
     def least(self, precision: float, error: float) -> Threshold:
         """Return the threshold that retains most of them."""
-        tried, left = self._tried()
+        tried, retained = self._tried()
         best = Threshold(never=True)
-        for by, at in sorted(tried, key=lambda pair: -left[pair]):
+        for by, at in sorted(tried, key=lambda pair: -retained[pair]):
             share, low = self._share(by, at, error / len(tried))
-            result = Threshold(by=by, at_least=at, never=low < precision, precision=share, low=low, voxels=left[by, at])
+            result = Threshold(
+                by=by, at_least=at, never=low < precision, precision=share, low=low, voxels=retained[by, at]
+            )
             if low >= precision:
                 return result
-            best = max(best, result, key=lambda each: each.low)
+            best = max(best, result, key=lambda threshold: threshold.low)
         return best
 
     def _tried(self) -> tuple[list[tuple[Evidence, float]], dict[tuple[Evidence, float], int]]:
         """Return thresholds that retain different labels, chosen without the truth, and how many each retains."""
         tried: dict[bytes, tuple[Evidence, float]] = {}
-        left = {}
+        retained = {}
         for by, values in self._evidence.items() if len(self._right) else ():
             for at in np.unique(np.quantile(values, np.arange(STEPS) / STEPS, method="lower")).tolist():
                 accepted = values >= at
-                left[tried.setdefault(np.packbits(accepted).tobytes(), (by, at))] = int(accepted.sum())
-        return list(tried.values()), left
+                retained[tried.setdefault(np.packbits(accepted).tobytes(), (by, at))] = int(accepted.sum())
+        return list(tried.values()), retained
 
     def _share(self, by: Evidence, at: float, error: float) -> tuple[float, float]:
         """Return the share of those with so much evidence that is right, and its lower end."""
         accepted = self._evidence[by] >= at
         of, cells = self._of[accepted], len(self._cell)
-        right, every = self._right[accepted].astype(np.float64), np.ones(len(of))
-        sums: Float64 = np.stack([np.bincount(of, each, cells) for each in (right, every)], axis=1).astype(np.float64)
+        right, ones = self._right[accepted].astype(np.float64), np.ones(len(of))
+        sums: Float64 = np.stack([np.bincount(of, w, cells) for w in (right, ones)], axis=1).astype(np.float64)
         sums = sums[sums[:, 1] > 0]
         if np.count_nonzero(sums[:, 0] < sums[:, 1]) <= FEW_CUBES:
             return _of_few(sums, error)

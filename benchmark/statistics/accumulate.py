@@ -84,8 +84,11 @@ class Cubes:
 
     def means(self, values: Mapping[str, npt.NDArray[Any]]) -> dict[str, Float64]:
         """Return (G, 2) by name: the sum and the count of the values (n,) that are defined in each cube."""
-        both = by_group(self.at, [*values.values()], self.count)
-        return {name: np.stack(pair, axis=1) for name, *pair in zip(values, both[0].T, both[1].T, strict=True)}
+        sums_and_counts = by_group(self.at, [*values.values()], self.count)
+        return {
+            name: np.stack(pair, axis=1)
+            for name, *pair in zip(values, sums_and_counts[0].T, sums_and_counts[1].T, strict=True)
+        }
 
     def sums_by_class(self, evidence: Evidence, *values: ByEntry) -> list[Float64]:
         """Return (G, K) for values of the entries of the voxels' evidence: their sums by cube and class."""
@@ -140,12 +143,12 @@ def cluster_sums_of(
         else np.nan_to_num(consistency_posterior(table) if consistent is None else consistent)
     )
     if events is None:
-        whole = _sums_of_table(table, cubes, true_label, likely)
+        sums = _sums_of_table(table, cubes, true_label, likely)
     else:
-        whole = _sums_of_log(events, cubes, dominant(table), true_label, likely)
-    whole = _with_frameless_sums(whole, table, cubes, true_label, sbd_excess)
-    whole = whole.coarsened(whole.edge, whole.step)  # one row for each cube and group of frames, in order
-    return whole if spots is None else with_spots(whole, spots)
+        sums = _sums_of_log(events, cubes, dominant(table), true_label, likely)
+    sums = _with_frameless_sums(sums, table, cubes, true_label, sbd_excess)
+    sums = sums.coarsened(sums.edge, sums.step)  # one row for each cube and group of frames, in order
+    return sums if spots is None else with_spots(sums, spots)
 
 
 def with_spots(whole: ClusterSums, spots: SpotObservations, edge: float | None = None) -> ClusterSums:
@@ -207,12 +210,12 @@ def _sums_of_log(
     slices = layout(K, truth=truth, meaning=distances is not None)
     sums = np.zeros((cubes.count * len(groups), width(slices)))
     longest = int((events.ends - events.starts).max(initial=0))
-    own = np.zeros(0, np.int64) if fused is None else fused
+    fused_label = np.zeros(0, np.int64) if fused is None else fused
     label = np.zeros(0, np.int64) if true_label is None else true_label
     consistent = np.zeros(0) if likely is None else likely
     in_chunks(
-        add_influences, order, bounds, (events.starts, events.ends), longest, events.evidence.entries, K, group, own,
-        label, consistent, FirstColumns.of(K, truth=truth), len(groups), sums,
+        add_influences, order, bounds, (events.starts, events.ends), longest, events.evidence.entries, K, group,
+        fused_label, label, consistent, FirstColumns.of(K, truth=truth), len(groups), sums,
     )  # fmt: skip
     if square is not None:
         counted = np.flatnonzero(cubes.at[events.voxel] >= 0)
@@ -247,8 +250,8 @@ def _with_frameless_sums(
     measured = tuple(values)
     slices = layout(sums.K, truth=sums.truth, measured=measured)
     columns = np.zeros((cubes.count, width(slices)))
-    for key, both in cubes.means(values).items():
-        for name, column in zip(of_measure(key), both.T, strict=True):
+    for key, sum_and_count in cubes.means(values).items():
+        for name, column in zip(of_measure(key), sum_and_count.T, strict=True):
             columns[:, slices[name].start] = column
     if sbd_excess is not None:
         for name, values in zip(DRIFT, cubes.means({"": sbd_excess})[""].T, strict=True):
@@ -256,9 +259,9 @@ def _with_frameless_sums(
     if true_label is not None:
         confidence, right = vss(table), dominant(table) == true_label
         group = np.where((cubes.at >= 0) & (true_label >= 0), cubes.at * BINS + confidence_bin(confidence), -1)
-        gap, known = by_group(group, [right - confidence], cubes.count * BINS)
+        gap, count = by_group(group, [right - confidence], cubes.count * BINS)
         columns[:, slices["gap"]] = gap.reshape(-1, BINS)
-        columns[:, slices["calibrated"]] = known.reshape(-1, BINS).sum(axis=1, keepdims=True)
+        columns[:, slices["calibrated"]] = count.reshape(-1, BINS).sum(axis=1, keepdims=True)
     filled = columns.any(axis=1)
     of_frames = np.zeros((len(sums.columns), columns.shape[1]))
     of_frames[:, : sums.columns.shape[1]] = sums.columns
@@ -288,16 +291,16 @@ def _sums_of_table(table: VoxelTable, cubes: Cubes, true_label: Int64 | None, li
         "own": table.self_sum, "twice": twice, "twice_agreeing": twice * agreement, "recurrent": recurrent,
         "vss": recurrent * vss(table), "entropy": entropy(table),
     }  # fmt: skip
-    others = np.maximum(T - 1, 1)
+    num_others = np.maximum(T - 1, 1)
 
     def disagreement(weight: Float64, voxel: Int64) -> Float64:  # of each observation
-        return 2.0 * (others[voxel] * weight - weight * weight + weight) / others[voxel]
+        return 2.0 * (num_others[voxel] * weight - weight * weight + weight) / num_others[voxel]
 
     shares, apart = cubes.sums_by_class(table.evidence, lambda weight, _: weight, disagreement)
     by_class = {"evidence": shares}
     if K <= MOST_CLASSES:
-        known = np.where(one_hot_where(table, cubes.at >= 0), 1.0, np.nan)
-        by_class |= {"class_own": known * shares, "class_apart": known * apart}
+        one_hot = np.where(one_hot_where(table, cubes.at >= 0), 1.0, np.nan)
+        by_class |= {"class_own": one_hot * shares, "class_apart": one_hot * apart}
     if true_label is not None:
         likely = recurrent if likely is None else likely * recurrent
         plain, further = _sums_with_truth(table, cubes, true_label, likely)
@@ -326,11 +329,11 @@ def _sums_with_truth(
     of = np.repeat(np.arange(len(table)), np.diff(evidence.starts))
     hit = evidence.label == label[of]
     observed_right = np.bincount(of[hit], weights=evidence.weight[hit], minlength=len(table))
-    known, right = label >= 0, label == predicted
-    consistent, counted = known * likely, known & (cubes.at >= 0)
+    has_truth, right = label >= 0, label == predicted
+    consistent, counted = has_truth * likely, has_truth & (cubes.at >= 0)
     values: dict[str, npt.NDArray[Any]] = {
-        "known": known, "right": known & right, "observed": known * T, "observed_right": known * observed_right,
-        "consistent": consistent, "consistent_wrong": consistent * ~right,
+        "known": has_truth, "right": has_truth & right, "observed": has_truth * T,
+        "observed_right": has_truth * observed_right, "consistent": consistent, "consistent_wrong": consistent * ~right,
     }  # fmt: skip
 
     def by_class(which: Int64, where: Mask) -> Float64:

@@ -112,7 +112,7 @@ def alpha_sums(table: VoxelTable) -> Float64:
 
 def _sums(columns: Callable[[VoxelTable], Float64], table: VoxelTable) -> Float64:
     """Return sums (C,) of columns (n, C) over a table's voxels, of which few are dense at a time."""
-    return functools.reduce(np.add, (columns(table.rows(some)).sum(axis=0) for some in table.evidence.chunks()))
+    return functools.reduce(np.add, (columns(table.rows(rows)).sum(axis=0) for rows in table.evidence.chunks()))
 
 
 def psa_columns(table: VoxelTable) -> Float64:
@@ -147,8 +147,10 @@ def alpha_columns(table: VoxelTable) -> Float64:
     """Return (n, 3 + K): the columns whose sums over voxels, each counting by its OP, give Krippendorff's alpha."""
     again = table.op >= 2
     w = np.where(again, table.op, 0.0)
-    agreeing, own = w * np.where(again, psa(table), 0.0), w * table.self_sum / table.op
-    return np.concatenate([np.stack([agreeing, w, own], axis=1), (w / table.op)[:, None] * table.evidence], axis=1)
+    agreeing, self_agreement = w * np.where(again, psa(table), 0.0), w * table.self_sum / table.op
+    return np.concatenate(
+        [np.stack([agreeing, w, self_agreement], axis=1), (w / table.op)[:, None] * table.evidence], axis=1
+    )
 
 
 def alpha_of(sums: Float64) -> Float64:
@@ -193,8 +195,8 @@ def disagreement(table: VoxelTable) -> tuple[Float64, Float64]:
     """
     agreement = psa(table)
     again = table.op >= 2
-    own = np.where(again, table.self_sum / table.op, np.nan)
-    return 1 - own, np.maximum(own - agreement, 0.0)
+    self_agreement = np.where(again, table.self_sum / table.op, np.nan)
+    return 1 - self_agreement, np.maximum(self_agreement - agreement, 0.0)
 
 
 def class_agreement(table: VoxelTable, events: Events | None = None) -> tuple[ClassAgreement, ...]:
@@ -211,9 +213,9 @@ def class_sums(table: VoxelTable, events: Events | None = None) -> Float64:
     They are evidence, that / OP, disagreement, that * OP, squares of single observations, voxels and observations.
     """
     K, again, T = table.K, table.op >= 2, table.op.astype(np.float64)
-    one_hot, known = table.self_sum == table.op, True
+    one_hot, has_squares = table.self_sum == table.op, True
     if events is None:
-        one_hot, known = np.ones(len(table), np.bool_), one_hot_where(table, again)
+        one_hot, has_squares = np.ones(len(table), np.bool_), one_hot_where(table, again)
     pairs = np.where(again, T * np.maximum(T - 1, 1), 1.0)
 
     def squares(s: Float64, voxel: Int64) -> Float64:
@@ -242,7 +244,7 @@ def class_sums(table: VoxelTable, events: Events | None = None) -> Float64:
         )
         sums[2:] = [a + b for a, b in zip(sums[2:], logged, strict=True)]
     by_class = np.concatenate(sums)
-    if not known:
+    if not has_squares:
         by_class[2:, by_class[0] > 0] = np.nan
     counts = np.full((2, K), [[np.count_nonzero(again)], [table.op.sum(where=again, dtype=np.float64)]], np.float64)
     return np.concatenate([by_class, counts])
@@ -320,9 +322,9 @@ def consistent_share(agreement: float = CONSISTENT) -> float:
 
 def shares_of(table: VoxelTable) -> Float64:
     """Return how many of a map's locations (STEPS,) have which share of the dominant class."""
-    seen, most, of = _votes(table)
-    count, likelihood, share = np.bincount(of), _likelihood(seen, most), np.full(STEPS, 1 / STEPS)
-    if not len(seen):
+    num_frames, most, of = _votes(table)
+    count, likelihood, share = np.bincount(of), _likelihood(num_frames, most), np.full(STEPS, 1 / STEPS)
+    if not len(num_frames):
         return share
     for _ in range(ROUNDS):  # probability of each share, a posteriori
         share = share * ((count / (likelihood @ share)) @ likelihood) / count.sum()
@@ -342,8 +344,8 @@ def consistency_posterior(
     """
     if not table.counts_frames:
         return np.full(len(table), np.nan)
-    seen, most, of = _votes(table)
-    posterior = _likelihood(seen, most) * (shares_of(table) if shares is None else shares)
+    num_frames, most, of = _votes(table)
+    posterior = _likelihood(num_frames, most) * (shares_of(table) if shares is None else shares)
     posterior /= posterior.sum(axis=1, keepdims=True)
     likely = np.full(len(table), np.nan)
     likely[table.op >= 2] = posterior[:, consistent_share(consistent) <= STEPS_OF_P].sum(axis=1)[of]
@@ -353,12 +355,12 @@ def consistency_posterior(
 STEPS_OF_P = 0.5 + 0.5 * (np.arange(STEPS) + 0.5) / STEPS
 
 
-def _likelihood(seen: Int64, most: Int64) -> Float64:
+def _likelihood(num_frames: Int64, most: Int64) -> Float64:
     """Return (v, STEPS) of votes given each share, up to a factor of each row."""
-    m, rest, p, q = most[:, None], (seen - most)[:, None], np.log(STEPS_OF_P), np.log1p(-STEPS_OF_P)
-    own, folded = m * p + rest * q, rest * p + m * q
-    best = np.maximum(own, folded).max(axis=1, keepdims=True)
-    likelihood: Float64 = np.exp(own - best) + np.exp(folded - best)
+    m, rest, p, q = most[:, None], (num_frames - most)[:, None], np.log(STEPS_OF_P), np.log1p(-STEPS_OF_P)
+    direct, folded = m * p + rest * q, rest * p + m * q
+    best = np.maximum(direct, folded).max(axis=1, keepdims=True)
+    likelihood: Float64 = np.exp(direct - best) + np.exp(folded - best)
     return likelihood
 
 
@@ -371,5 +373,5 @@ def _votes(table: VoxelTable) -> tuple[Int64, Int64, Int64]:
     T = table.op[again].astype(np.int64)
     longest = int(T.max(initial=0)) + 1
     pairs, of = np.unique(np.rint(vss(table)[again] * T).astype(np.int64) + T * longest, return_inverse=True)
-    seen, most = np.divmod(pairs, longest)
-    return seen, most, of
+    num_frames, most = np.divmod(pairs, longest)
+    return num_frames, most, of

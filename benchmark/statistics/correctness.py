@@ -126,7 +126,7 @@ class PredictionSums:
 
     def __add__(self, other: PredictionSums) -> PredictionSums:
         """Return the sums over both."""
-        return PredictionSums(*(getattr(self, each.name) + getattr(other, each.name) for each in fields(self)))
+        return PredictionSums(*(getattr(self, column.name) + getattr(other, column.name) for column in fields(self)))
 
     @property
     def voxels(self) -> int:
@@ -199,10 +199,10 @@ def by_stratum(predictions: Predictions, op: Int32, known: Mask, edges: Sequence
     """Return the correctness of all voxels whose true class is known (n,), by stratum of OP (n,), then of OP >= 2."""
     sums = _prediction_sums_by_group(predictions, np.where(known, groups_of(op, edges), -1), len(edges) + 1)
     names = ["all", *(name for name, _, _ in strata(edges))]
-    whole = functools.reduce(operator.add, sums)
+    total = functools.reduce(operator.add, sums)
     repeated = prediction_sums(predictions, known & (op >= 2))
-    every = zip([whole, *sums, repeated], [*names, "OP>=2"], strict=True)
-    return tuple(correctness_of(of_group, name) for of_group, name in every)
+    sums_and_names = zip([total, *sums, repeated], [*names, "OP>=2"], strict=True)
+    return tuple(correctness_of(of_group, name) for of_group, name in sums_and_names)
 
 
 QUADRANTS = ("consistent_right", "consistent_wrong", "inconsistent_right", "inconsistent_wrong")

@@ -79,17 +79,17 @@ def in_bins(
         K: Number of columns of evidence.
         number: The number, which is of `ALPHA_SUMS`.
     """
-    seen = spots.observations()
-    cubes, of, edge = _cubes(seen)
+    log = spots.observations()
+    cubes, of, edge = _cubes(log)
     step, most = 1, min(MOST_GROUPS, max(1, MOST_SUMS // (max(len(cubes), 1) * (4 + K))))
-    while len(frames := np.unique(seen.frame // step)) > most:
+    while len(frames := np.unique(log.frame // step)) > most:
         step *= 2
-    group = np.searchsorted(frames, seen.frame // step)
-    keys, cluster = np.unique(of[seen.voxel].astype(np.int64) * len(frames) + group, return_inverse=True)
+    group = np.searchsorted(frames, log.frame // step)
+    keys, cluster = np.unique(of[log.voxel].astype(np.int64) * len(frames) + group, return_inverse=True)
     cube, group = np.divmod(keys, max(len(frames), 1))
     pairs, distance = np.zeros((2, len(BINS) + 1))
     by_lag = []
-    for first, second, apart in _pairs(spots, seen):
+    for first, second, apart in _pairs(spots, log):
         bins = _bins(apart)
         pairs += np.bincount(bins.ravel(), minlength=len(pairs))
         distance += np.bincount(bins.ravel(), weights=apart.ravel(), minlength=len(pairs))
@@ -98,11 +98,11 @@ def in_bins(
     columns = side_by_side(dict(zip((*ALPHA_SUMS, "square"), (1, 1, 1, K, 1), strict=True)))
     rows, specs = [], []
     for k in np.flatnonzero(pairs[:-1] >= LEAST_PAIRS):
-        some = np.flatnonzero(sums[0][k, :, 1])
-        if len(np.unique(cube[some])) < LEAST_CUBES:
+        occupied = np.flatnonzero(sums[0][k, :, 1])
+        if len(np.unique(cube[occupied])) < LEAST_CUBES:
             continue
-        where = cubes[cube[some]], frames[group[some]]
-        answers = tuple(ClusterSums(*where, each[k, some], columns, edge, step) for each in sums)
+        where = cubes[cube[occupied]], frames[group[occupied]]
+        answers = tuple(ClusterSums(*where, of_answer[k, occupied], columns, edge, step) for of_answer in sums)
         of_bin = dataclasses.replace(answers[0], answers=answers)
         specs.append(spec_of(of_bin, number, scope=scope_of(of_bin, key=number)))
         rows.append((k, float(distance[k] / pairs[k]), int(pairs[k])))
@@ -130,25 +130,25 @@ def _sums(
     return sums
 
 
-def _cubes(seen: Events) -> tuple[Any, Any, float]:
-    index = seen.ix, seen.iy, seen.iz
-    cubes, of, edge = cubes_of(index, seen.voxel_size)
+def _cubes(log: Events) -> tuple[Any, Any, float]:
+    index = log.ix, log.iy, log.iz
+    cubes, of, edge = cubes_of(index, log.voxel_size)
     while len(cubes) > MOST_CUBES:
-        cubes, of, edge = cubes_of(index, seen.voxel_size, 2 * edge)
+        cubes, of, edge = cubes_of(index, log.voxel_size, 2 * edge)
     return cubes, of, edge
 
 
-def _pairs(spots: SpotObservations, seen: Events) -> Iterator[tuple[Int64, Int64, Float64]]:
+def _pairs(spots: SpotObservations, log: Events) -> Iterator[tuple[Int64, Int64, Float64]]:
     """Yield the pairs (m,) of observations with lags of 1, 2, 4 and so on.
 
     Lag by lag, the third array has their distance (m, 5) along `AXES`.
     """
-    rank, centre = spots.views.rank(seen.frame), spots.views.centre
-    index = np.stack([seen.ix, seen.iy, seen.iz], axis=1)
-    ray = centre[rank] - ((index + 0.5) * seen.voxel_size)[seen.voxel]
+    rank, centre = spots.views.rank(log.frame), spots.views.centre
+    index = np.stack([log.ix, log.iy, log.iz], axis=1)
+    ray = centre[rank] - ((index + 0.5) * log.voxel_size)[log.voxel]
     distance = np.linalg.norm(ray, axis=1)
     lag = 1
-    while len(first := np.flatnonzero(seen.voxel[lag:] == seen.voxel[:-lag])):
+    while len(first := np.flatnonzero(log.voxel[lag:] == log.voxel[:-lag])):
         second = first + lag
         near, far = np.sort([distance[first], distance[second]], axis=0)
         cosine = (ray[first] * ray[second]).sum(axis=1) / (distance[first] * distance[second])

@@ -112,13 +112,13 @@ class FlippingSums:
         """Return the share of the locations that are not consistent, and the two classes that most often meet there."""
         share = estimate(self.share, mean_functional("inconsistent"))
         locations = float(self.share["inconsistent"][:, 1].sum())
-        seen = self.often / locations if locations else float("nan")
+        share_seen_often = self.often / locations if locations else float("nan")
         total = float(self.together.sum())
         if not total > 0:
-            return Flipping(share, seen)
+            return Flipping(share, share_seen_often)
         a, b = np.unravel_index(self.together.argmax(), self.together.shape)
         names = classes or tuple(str(k) for k in range(len(self.together)))
-        return Flipping(share, seen, names[int(a)], names[int(b)], float(self.together[a, b]) / total)
+        return Flipping(share, share_seen_often, names[int(a)], names[int(b)], float(self.together[a, b]) / total)
 
 
 def _together(table: VoxelTable, inconsistent: Float64) -> Float64:

@@ -46,18 +46,18 @@ def expected_sbd(table: VoxelTable, events: Events | None = None, *, seed: int =
     from semstab.statistics.loops.orders import LONGEST_TABLE, expected_one_hot, mean_drifts, one_hot_drifts
 
     T, evidence = table.op, table.evidence
-    known = (T >= 2) & (LONGEST_TABLE >= T) & (np.abs(table.self_sum - T) <= ONE_HOT * T)
+    is_exact = (T >= 2) & (LONGEST_TABLE >= T) & (np.abs(table.self_sum - T) <= ONE_HOT * T)
     number = np.diff(evidence.starts)
-    entries = np.flatnonzero(np.repeat(known, number))
-    of = np.repeat(np.flatnonzero(known), number[known])
+    entries = np.flatnonzero(np.repeat(is_exact, number))
+    of = np.repeat(np.flatnonzero(is_exact), number[is_exact])
     times = np.rint(evidence.weight[entries]).astype(np.int64)
     pairs, which = np.unique(times * (LONGEST_TABLE + 1) + T[of], return_inverse=True)
-    part, drifts = np.zeros(len(pairs)), one_hot_drifts(int(T.max(initial=2, where=known)))
+    part, drifts = np.zeros(len(pairs)), one_hot_drifts(int(T.max(initial=2, where=is_exact)))
     log_factorials = np.concatenate([[0.0], np.cumsum(np.log(np.arange(1, LONGEST_TABLE + 1)))])
     in_chunks(expected_one_hot, *np.divmod(pairs, LONGEST_TABLE + 1), log_factorials, drifts, part)
     total = np.bincount(of, weights=part[which], minlength=len(table))
-    null = np.where(known, total / np.maximum(T - 1, 1), np.nan)
-    rest = np.flatnonzero((T >= 2) & ~known)
+    null = np.where(is_exact, total / np.maximum(T - 1, 1), np.nan)
+    rest = np.flatnonzero((T >= 2) & ~is_exact)
     if events is not None and len(rest):
         log = events.evidence.entries
         most = int((log[0][events.ends] - log[0][events.starts]).max())
@@ -97,6 +97,6 @@ def streams(table: VoxelTable, rows: Any, seed: int) -> UInt64:
     from semstab.statistics.loops import orders
 
     index = np.stack([table.ix[rows], table.iy[rows], table.iz[rows]], axis=1)
-    drawn = np.empty(len(index), np.uint64)
-    orders.draw_streams(index, np.random.default_rng(seed).integers(2**64, dtype=np.uint64), drawn)
-    return drawn
+    random_numbers = np.empty(len(index), np.uint64)
+    orders.draw_streams(index, np.random.default_rng(seed).integers(2**64, dtype=np.uint64), random_numbers)
+    return random_numbers

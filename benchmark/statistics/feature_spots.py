@@ -97,8 +97,8 @@ class FeatureStore:
             self._vectors = _longer(self._vectors, min(room, self.most + len(rows)))
         if end > len(self._vectors):
             self._vectors = _longer(self._vectors, end)
-        some = slice(self._count, end)
-        self._spot[some], self._view[some], self._vectors[some] = spot[rows], view, features.at(cell[rows])
+        new_rows = slice(self._count, end)
+        self._spot[new_rows], self._view[new_rows], self._vectors[new_rows] = spot[rows], view, features.at(cell[rows])
         self._count = end
         while self._count > self.most and self.share > 1:
             self.share //= 2
@@ -188,10 +188,10 @@ class FeatureObservations:
     @functools.cached_property
     def _order(self) -> tuple[Int64, Int64]:
         """The answers in order of observations, and (m + 1,) the first one of each observation."""
-        spots, seen = self.spots, np.unique(self.spots.spot)
-        place = np.floor(spots.point[seen] * (PARTS / spots.spacing)).astype(np.int64)
+        spots, spot_ids = self.spots, np.unique(self.spots.spot)
+        place = np.floor(spots.point[spot_ids] * (PARTS / spots.spacing)).astype(np.int64)
         number = np.zeros(len(spots.point), np.int64)
-        number[seen] = distinct_rows(place)[1]  # as the log numbers its voxels
+        number[spot_ids] = distinct_rows(place)[1]  # as the log numbers its voxels
         key = number[self.spots.spot] * max(len(self.spots.views), 1) + self.spots.view
         order = np.argsort(key, kind="stable")
         first = np.flatnonzero(np.diff(key[order], prepend=-1))
@@ -203,14 +203,14 @@ class FeatureObservations:
         start, stop, _ = some.indices(len(bounds) - 1)
         if stop <= start:
             return np.zeros((0, self.D))
-        own = bounds[start : stop + 1]
-        answers = self.vectors[order[own[0] : own[-1]]].astype(np.float64)
+        answer_bounds = bounds[start : stop + 1]
+        answers = self.vectors[order[answer_bounds[0] : answer_bounds[-1]]].astype(np.float64)
         lengths = np.sqrt(np.einsum("ij,ij->i", answers, answers))  # half precision rounds them
         answers /= lengths[:, None]
         if len(answers) == stop - start:
             return answers
-        sums: Float64 = np.add.reduceat(answers, own[:-1] - own[0], axis=0)
-        return sums / np.diff(own)[:, None]
+        sums: Float64 = np.add.reduceat(answers, answer_bounds[:-1] - answer_bounds[0], axis=0)
+        return sums / np.diff(answer_bounds)[:, None]
 
     def stretches(self) -> list[slice]:
         """Return observations in stretches of whole spots, so that their vectors are in memory stretch by stretch."""
@@ -224,8 +224,8 @@ class FeatureObservations:
 
     def within(self, share: int) -> FeatureObservations:
         """Return the answers for the spots of a smaller share of the coarse cells."""
-        kept = self.spots.drawn[self.spots.spot] < share
-        return dataclasses.replace(self, spots=self.spots.within(share), vectors=self.vectors[kept])
+        in_share = self.spots.drawn[self.spots.spot] < share
+        return dataclasses.replace(self, spots=self.spots.within(share), vectors=self.vectors[in_share])
 
     def only(self, answers: Mask) -> FeatureObservations:
         """Return some of the answers (a,)."""

@@ -71,22 +71,22 @@ def likeness(seen: FeatureObservations) -> Likeness:
     """Return what vectors tell of each observation, with whole spots in memory one stretch after the other."""
     log = seen.log
     T, total = np.diff(log.bounds)[log.voxel], np.zeros(seen.D)
-    for some in seen.stretches():
-        total += (T[some] >= 2) @ seen.rows(some)
+    for stretch in seen.stretches():
+        total += (T[stretch] >= 2) @ seen.rows(stretch)
     along_all = total / (np.linalg.norm(total) or 1.0)
-    own, others, among, spot, along = np.full((5, len(log)), np.nan)
-    for some in seen.stretches():
-        s, voxel, n = seen.rows(some), log.voxel[some], T[some].astype(np.float64)
+    squared_length, mean_with_others, among, spot, along = np.full((5, len(log)), np.nan)
+    for stretch in seen.stretches():
+        s, voxel, n = seen.rows(stretch), log.voxel[stretch], T[stretch].astype(np.float64)
         start, of = np.flatnonzero(np.diff(voxel, prepend=-1)), voxel - voxel[0]
         sums, square = np.add.reduceat(s, start, axis=0), np.einsum("ij,ij->i", s, s)
         with_others = np.einsum("ij,ij->i", s, sums[of]) - square
         pairs = (np.einsum("ij,ij->i", sums, sums) - np.add.reduceat(square, start))[of]  # of the spot, both ways
-        own[some], along[some] = square, s @ along_all
+        squared_length[stretch], along[stretch] = square, s @ along_all
         with np.errstate(invalid="ignore", divide="ignore"):
-            others[some], spot[some] = with_others / (n - 1), pairs / (n * (n - 1))
-            among[some] = (pairs - 2 * with_others) / ((n - 1) * (n - 2))
+            mean_with_others[stretch], spot[stretch] = with_others / (n - 1), pairs / (n * (n - 1))
+            among[stretch] = (pairs - 2 * with_others) / ((n - 1) * (n - 2))
     among[T < LEAST_VIEWS] = np.nan
-    return Likeness(T, own, others, among, spot, along)
+    return Likeness(T, squared_length, mean_with_others, among, spot, along)
 
 
 def feature_sums(seen: FeatureObservations, of: Likeness, edge: float | None = None) -> ClusterSums:
@@ -110,7 +110,7 @@ def feature_sums(seen: FeatureObservations, of: Likeness, edge: float | None = N
         of.along[counted],
     ]  # fmt: skip
     total = cubes.count * len(groups)
-    sums: Float64 = np.stack([np.bincount(at[counted], each, total).astype(np.float64) for each in columns], axis=1)
+    sums: Float64 = np.stack([np.bincount(at[counted], column, total).astype(np.float64) for column in columns], axis=1)
     rows = np.flatnonzero(sums[:, 1])
     cell, frame = np.divmod(rows, max(len(groups), 1))
     return ClusterSums(
@@ -142,7 +142,7 @@ def feature_agreement(
     """
     of = likeness(seen)
     sums = feature_sums(seen, of)
-    n, similar, own = (float(sums[key].sum()) for key in ("observations", "agreeing", "own"))
+    n, similar, squares = (float(sums[key].sum()) for key in ("observations", "agreeing", "own"))
     total = float((sums["evidence"].sum(axis=0) ** 2).sum())
     return FeatureAgreement(
         components=seen.D,
@@ -151,7 +151,7 @@ def feature_agreement(
         one_in=seen.one_in,
         alpha=_alpha(sums, scope),
         cosine=similar / n if n else math.nan,
-        chance=(total - own) / (n * (n - 1)) if n > 1 else math.nan,
+        chance=(total - squares) / (n * (n - 1)) if n > 1 else math.nan,
         alone=alone,
         correlogram=in_bins(seen.spots, functools.partial(_sums_of_pairs, seen, of), 1, PAIRED),
         ranges=_ranges(seen, scope),
@@ -165,51 +165,51 @@ def _alpha(sums: ClusterSums, scope: Scope) -> Interval:
 
 
 def _sums_of_pairs(
-    seen: FeatureObservations, of: Likeness, by_lag: Sequence[Lag], cluster: Int64, clusters: int
+    features: FeatureObservations, of: Likeness, by_lag: Sequence[Lag], cluster: Int64, clusters: int
 ) -> list[Float64]:
     """Return the sums (bins + 1, clusters, 5) of pairs, as `in_bins` takes them: along the sum of a bin's vectors."""
     from semstab.statistics.loops.pairs import add_feature_pairs
 
-    pairs_in = [_pairs_within(some, by_lag) for some in seen.stretches()]
-    totals = np.zeros((len(BINS) + 1, seen.D))
-    for some, pairs in zip(seen.stretches(), pairs_in, strict=True):
-        often = np.zeros((len(totals), some.stop - some.start))
+    pairs_in = [_pairs_within(stretch, by_lag) for stretch in features.stretches()]
+    totals = np.zeros((len(BINS) + 1, features.D))
+    for stretch, pairs in zip(features.stretches(), pairs_in, strict=True):
+        often = np.zeros((len(totals), stretch.stop - stretch.start))
         for first, second, bins in pairs:
             for axis in bins.T:
-                np.add.at(often, (axis, first - some.start), 1)
-                np.add.at(often, (axis, second - some.start), 1)
-        totals += often @ seen.rows(some)
+                np.add.at(often, (axis, first - stretch.start), 1)
+                np.add.at(often, (axis, second - stretch.start), 1)
+        totals += often @ features.rows(stretch)
     length = np.linalg.norm(totals, axis=1, keepdims=True)
     totals /= np.where(length > 0, length, 1.0)
     sums = np.zeros((len(totals), clusters, 5))
-    for some, pairs in zip(seen.stretches(), pairs_in, strict=True):
-        s = seen.rows(some)
+    for stretch, pairs in zip(features.stretches(), pairs_in, strict=True):
+        s = features.rows(stretch)
         along = s @ totals.T
         for first, second, bins in pairs:
-            agreed = np.einsum("ij,ij->i", s[first - some.start], s[second - some.start])
-            add_feature_pairs(first, second, some.start, bins, cluster, agreed, of.own, along, sums)
+            agreed = np.einsum("ij,ij->i", s[first - stretch.start], s[second - stretch.start])
+            add_feature_pairs(first, second, stretch.start, bins, cluster, agreed, of.own, along, sums)
     return [sums]
 
 
-def _pairs_within(some: slice, by_lag: Sequence[Lag]) -> list[Lag]:
+def _pairs_within(stretch: slice, by_lag: Sequence[Lag]) -> list[Lag]:
     """Return the pairs of each lag whose observations are in a stretch."""
-    at = (slice(*np.searchsorted(first, (some.start, some.stop))) for first, _, _ in by_lag)
+    at = (slice(*np.searchsorted(first, (stretch.start, stretch.stop))) for first, _, _ in by_lag)
     return [(first[pairs], second[pairs], bins[pairs]) for pairs, (first, second, bins) in zip(at, by_lag, strict=True)]
 
 
-def _ranges(seen: FeatureObservations, scope: Scope) -> tuple[RangeStratum, ...]:
+def _ranges(features: FeatureObservations, scope: Scope) -> tuple[RangeStratum, ...]:
     """Return alpha of the observations from each range; empty if all were seen from about one distance."""
-    distance = seen.spots.distance
+    distance = features.spots.distance
     edges = edges_of(distance) if len(distance) else []
     if len(edges) < 3:
         return ()
     strata = []
     for low, high in itertools.pairwise(edges):
-        within = seen.only((distance >= low) & ((distance < high) | (high == edges[-1])))
+        within = features.only((distance >= low) & ((distance < high) | (high == edges[-1])))
         sums = feature_sums(within, likeness(within))
         spots = round(float(sums["voxels"].sum()))
         alpha = _alpha(sums, scope) if spots >= LEAST_SEEN_TWICE else UNKNOWN
-        strata.append(RangeStratum(low, high, len(within.vectors) / len(seen.vectors), spots, alpha))
+        strata.append(RangeStratum(low, high, len(within.vectors) / len(features.vectors), spots, alpha))
     return tuple(strata)
 
 
@@ -228,27 +228,27 @@ def lone_features(seen: FeatureObservations, of: Likeness) -> LoneDisagreement:
     return LoneDisagreement(frame.astype(np.int64), places, share, null)
 
 
-def _places(seen: FeatureObservations, of: Likeness) -> tuple[FeaturePlace, ...]:
+def _places(features: FeatureObservations, of: Likeness) -> tuple[FeaturePlace, ...]:
     """Return the cubes of SIDE coarse cells where features of two views differ most."""
-    log = seen.log
+    log = features.log
     again = np.flatnonzero(of.views >= 2)
     spot, first = np.unique(log.voxel[again], return_index=True)
     if not len(spot):
         return ()
     apart = 1 - of.spot[again][first]
     centre = (np.stack([log.ix, log.iy, log.iz], axis=1)[spot] + 0.5) * log.voxel_size
-    _, at = distinct_rows(np.floor(centre / (SIDE * seen.spots.spacing)).astype(np.int64))
+    _, at = distinct_rows(np.floor(centre / (SIDE * features.spots.spacing)).astype(np.int64))
     count, lost = np.bincount(at), np.bincount(at, apart)
     order = np.argsort(-lost, kind="stable")
     order = order[count[order] >= LEAST_SPOTS][:MOST_PLACES]
-    whole, of_spot = float(lost.sum()), np.full(len(log.ix), -1)
+    total_loss, of_spot = float(lost.sum()), np.full(len(log.ix), -1)
     of_spot[spot] = at
     places = []
     for k in order.tolist():
         x, y, z = centre[at == k].mean(axis=0).tolist()
         frames, often = np.unique(log.frame[of_spot[log.voxel] == k], return_counts=True)
         most = frames[np.argsort(-often, kind="stable")[:MOST_FRAMES]]
-        share = float(lost[k]) / whole if whole > 0 else math.nan
+        share = float(lost[k]) / total_loss if total_loss > 0 else math.nan
         cosine = 1 - float(lost[k] / count[k])
         places.append(FeaturePlace((x, y, z), int(count[k]), cosine, share, tuple(sorted(most.tolist()))))
     return tuple(places)

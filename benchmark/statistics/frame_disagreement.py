@@ -89,17 +89,17 @@ def lone_disagreement(spots: SpotObservations) -> LoneDisagreement:
     several = LEAST_VIEWS <= T
     frame, of = np.unique(log.frame[several], return_inverse=True)
     places = np.bincount(of, minlength=len(frame))
-    others = (total - alone)[several] / (T - 1)[several]
-    share, null = (np.bincount(of, x, len(frame)) / places for x in (alone[several], others))
+    share_of_others = (total - alone)[several] / (T - 1)[several]
+    share, null = (np.bincount(of, x, len(frame)) / places for x in (alone[several], share_of_others))
     return LoneDisagreement(frame.astype(np.int64), places, share, null)
 
 
 def by_frame(lone: LoneDisagreement, outlying: OutlyingFrames | None) -> dict[int, dict[str, float]]:
     """Return the numbers of each frame by its index, as the time series names them."""
-    named = {each.frame for each in outlying.frames} if outlying else set()
+    outliers = {row.frame for row in outlying.frames} if outlying else set()
     rows = zip(lone.frame.tolist(), lone.share.tolist(), lone.null.tolist(), strict=True)
     return {
-        frame: {"lone_percent": 100 * share, "lone_null_percent": 100 * null, "outlying": int(frame in named)}
+        frame: {"lone_percent": 100 * share, "lone_null_percent": 100 * null, "outlying": int(frame in outliers)}
         for frame, share, null in rows
     }
 
@@ -131,9 +131,9 @@ def outlying_rows(values: Float64, level: float = LEVEL) -> Int64:
     """
     order, outlying = np.argsort(-values, kind="stable"), 0
     for i in range((len(values) - 1) // 2):
-        left = values[order[i:]]
-        deviation = float(left.std(ddof=1))
-        if deviation > 0 and left[0] - left.mean() > largest_deviate(len(left), level) * deviation:
+        remaining = values[order[i:]]
+        deviation = float(remaining.std(ddof=1))
+        if deviation > 0 and remaining[0] - remaining.mean() > largest_deviate(len(remaining), level) * deviation:
             outlying = i + 1
     return np.asarray(np.sort(order[:outlying]), np.int64)
 
@@ -159,18 +159,18 @@ def outlying_frames(lone: LoneDisagreement, views: int, *, name: Callable[[int],
         views: Distinct views of the map; views without enough places are counted, not tested.
         name: Returns the name of a frame's file by its index.
     """
-    judged = np.flatnonzero(lone.places >= LEAST_PLACES)
-    if len(judged) < LEAST_FRAMES:
+    testable = np.flatnonzero(lone.places >= LEAST_PLACES)
+    if len(testable) < LEAST_FRAMES:
         return OutlyingFrames(judged=0, unjudged=views, usual=math.nan)
-    places, excess = lone.places[judged], lone.excess[judged]
-    odds = lone.log_odds_ratio[judged]
+    places, excess = lone.places[testable], lone.excess[testable]
+    odds = lone.log_odds_ratio[testable]
     above = outlying_rows((odds - np.median(odds)) * np.sqrt(np.minimum(places / np.median(places), 1.0)))
     usual = float(np.delete(excess, above).mean())
-    named = above[excess[above] >= usual + LEAST_EXCESS]
-    rows = judged[named[np.argsort(-excess[named], kind="stable")]]
+    outliers = above[excess[above] >= usual + LEAST_EXCESS]
+    rows = testable[outliers[np.argsort(-excess[outliers], kind="stable")]]
     return OutlyingFrames(
-        judged=len(judged),
-        unjudged=views - len(judged),
+        judged=len(testable),
+        unjudged=views - len(testable),
         usual=usual,
         frames=tuple(
             FrameDisagreement(

@@ -71,9 +71,9 @@ def rendered(frames: Iterable[Frame], world: VoxelTable, views: Iterable[Frame] 
     """
     labels = _Labels(world)
     for frame, view in ((frame, frame) for frame in frames) if views is None else _paired(frames, views):
-        seen = np.full(view.shape, labels.ignore, dtype=labels.dtype)
-        seen[view.valid] = labels.at(voxel_index(back_project(view), world.voxel_size, view))
-        yield dataclasses.replace(frame, labels=seen, scores=None)
+        rendered_labels = np.full(view.shape, labels.ignore, dtype=labels.dtype)
+        rendered_labels[view.valid] = labels.at(voxel_index(back_project(view), world.voxel_size, view))
+        yield dataclasses.replace(frame, labels=rendered_labels, scores=None)
 
 
 def losses(table: VoxelTable, limit: VoxelTable) -> Losses:
@@ -83,8 +83,8 @@ def losses(table: VoxelTable, limit: VoxelTable) -> Losses:
         DataError: If the maps differ in K or voxel size.
     """
     rows, limit_rows = shared_rows(table, limit)
-    both = (table.op[rows] >= 2) & (limit.op[limit_rows] >= 2)
-    rows, limit_rows = rows[both], limit_rows[both]
+    repeated = (table.op[rows] >= 2) & (limit.op[limit_rows] >= 2)
+    rows, limit_rows = rows[repeated], limit_rows[repeated]
     total, geometry = 1 - psa(table)[rows], 1 - psa(limit)[limit_rows]
     cubes = Cubes.of(table.rows(rows), where=np.ones(len(rows), np.bool_))
     means = cubes.means({"total": total, "geometry": geometry, "model": total - geometry})

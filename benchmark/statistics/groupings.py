@@ -114,15 +114,15 @@ Step = tuple[int, int]
 
 def merges_of(found: Coincidences) -> list[Step]:
     """Return merges down to two groups; each raises alpha more than any other one would."""
-    left = np.flatnonzero(found.shares > 0)  # a class of each group
-    merged, steps = Coincidences(found.pairs[np.ix_(left, left)]), []
-    while len(left) > 2:
+    representatives = np.flatnonzero(found.shares > 0)  # a class of each group
+    merged, steps = Coincidences(found.pairs[np.ix_(representatives, representatives)]), []
+    while len(representatives) > 2:
         a, b = merged.best_merge()
-        steps.append((int(left[a]), int(left[b])))
-        group = np.arange(len(left))
+        steps.append((int(representatives[a]), int(representatives[b])))
+        group = np.arange(len(representatives))
         group[b:] -= 1
         group[b] = a
-        merged, left = merged.merged(group), np.delete(left, b)
+        merged, representatives = merged.merged(group), np.delete(representatives, b)
     return steps
 
 
@@ -130,8 +130,8 @@ def groups_after(K: int, steps: Sequence[Step]) -> Int64:
     """Return the group (K,) of each class after merges, numbered from 0 on by their first classes."""
     group = np.arange(K)
     for a, b in steps:
-        both = group == group[b]
-        group[both] = group[a]
+        members = group == group[b]
+        group[members] = group[a]
     _, first, of = np.unique(group, return_index=True, return_inverse=True)
     return np.argsort(np.argsort(first))[of].astype(np.int64)
 
@@ -143,9 +143,9 @@ def flattery(halves: Sequence[Coincidences], most: int) -> Float64:
     """
     K, (one, other) = len(halves[0].pairs), (merges_of(half) for half in halves)
     lost = np.zeros((2, most))
-    for row, half, own, others in zip(lost, halves, (one, other), (other, one), strict=True):
+    for row, half, steps_of_half, steps_of_other in zip(lost, halves, (one, other), (other, one), strict=True):
         for n in range(most):
-            alphas = (half.merged(groups_after(K, steps[: n + 1])).alpha() for steps in (own, others))
+            alphas = (half.merged(groups_after(K, steps[: n + 1])).alpha() for steps in (steps_of_half, steps_of_other))
             row[n] = next(alphas) - next(alphas)
     mean: Float64 = np.nan_to_num(lost).mean(axis=0).clip(min=0)
     return mean
@@ -166,8 +166,8 @@ def groupings(
     if not (sums.answers and 2 < K <= MOST_CLASSES):
         return None
     pairs = halves_of(spots, sums)
-    whole = Coincidences.of(pairs.sum(axis=0))
-    if not (steps := merges_of(whole)):
+    coincidences = Coincidences.of(pairs.sum(axis=0))
+    if not (steps := merges_of(coincidences)):
         return None
     less = flattery([Coincidences.of(half) for half in pairs], len(steps))
     names = spots.classes or tuple(str(k) for k in range(K))
@@ -175,12 +175,12 @@ def groupings(
     for n, step in enumerate(steps):
         before = groups_after(K, steps[:n])
         first, second = (tuple(names[k] for k in np.flatnonzero(before == before[of])) for of in step)
-        merged = whole.merged(groups_after(K, steps[: n + 1]))
+        merged = coincidences.merged(groups_after(K, steps[: n + 1]))
         merges.append(Merge(first, second, *merged.size, merged.alpha() - less[n]))
 
     def finest(level: Literal["stable", "usable"], least: float) -> Grouping | None:
         """Return the finest grouping that is surely enough of a level, with its interval."""
-        if whole.alpha() >= least:
+        if coincidences.alpha() >= least:
             return None
         for n, merge in enumerate(merges):
             if not merge.alpha >= least:
@@ -188,8 +188,8 @@ def groupings(
             group = groups_after(K, steps[: n + 1])
             alpha = _alpha_of(spots, group, scope, less[n])
             if probability_above(alpha, least, "agreement") >= DECIDED:
-                members = (np.flatnonzero(group == own) for own in range(int(group.max()) + 1))
-                merged = tuple(tuple(names[k] for k in some) for some in members if len(some) > 1)
+                members = (np.flatnonzero(group == number) for number in range(int(group.max()) + 1))
+                merged = tuple(tuple(names[k] for k in classes) for classes in members if len(classes) > 1)
                 return Grouping(level, merged, merge.groups, merge.effective, alpha)
             least = merge.alpha + FURTHER
         return None
@@ -197,7 +197,7 @@ def groupings(
     stable, usable = finest("stable", limits.stable), finest("usable", limits.usable)
     if stable is not None and usable is not None and usable.groups <= stable.groups:
         usable = None
-    return Groupings(whole.size[0], tuple(merges), stable, usable)
+    return Groupings(coincidences.size[0], tuple(merges), stable, usable)
 
 
 def grouped(spots: SpotObservations, group: Int64) -> SpotObservations:

@@ -144,7 +144,7 @@ def difference(
 
 def identical(a: ClusterSums, b: ClusterSums, number: Functional) -> bool:
     """Return whether a number has identical sums in two maps, so that it has no difference anywhere."""
-    one, other = ([part for part, _ in parts_of(each, number)] for each in aligned(a, b))
+    one, other = ([part for part, _ in parts_of(sums, number)] for sums in aligned(a, b))
     if len(one) != len(other):
         return False
     for pair in zip(one, other, strict=True):
@@ -169,8 +169,8 @@ def scope_of(
 ) -> Scope:
     """Return the scope of a number's interval: the wanted one if enough frames show it, else these frames."""
     number = functional(key, k)
-    shown = frames_of(sums, number) >= LEAST_FRAMES and not number.of_space_alone
-    return wanted if shown else THESE_FRAMES
+    has_enough_frames = frames_of(sums, number) >= LEAST_FRAMES and not number.of_space_alone
+    return wanted if has_enough_frames else THESE_FRAMES
 
 
 def headline_specs(sums: ClusterSums, wanted: Scope = THIS_SCENE) -> Iterator[EstimateSpec]:
@@ -437,8 +437,8 @@ def same_flight(a: ClusterSums, b: ClusterSums) -> bool:
 def within_a_flight(a: ClusterSums, b: ClusterSums) -> bool:
     """Return whether one has no groups of frames but the other's, as where a model gives no label in whole frames."""
     one, other = _groups_of(a, b)
-    both = len(np.intersect1d(one, other))
-    return both > 0 and both in (len(one), len(other))
+    common = len(np.intersect1d(one, other))
+    return common > 0 and common in (len(one), len(other))
 
 
 def _groups_of(a: ClusterSums, b: ClusterSums) -> tuple[Int64, Int64]:
@@ -447,6 +447,8 @@ def _groups_of(a: ClusterSums, b: ClusterSums) -> tuple[Int64, Int64]:
     Without a log these are the views of the cells.
     """
     a, b = (part if part.step or not part.answers else part.answers[0] for part in (a, b))
-    step, known = max(a.step, b.step), bool(a.step and b.step)
-    one, other = (np.unique(part.frame[part.frame >= 0] // (step // part.step if known else 1)) for part in (a, b))
-    return (one.astype(np.int64), other.astype(np.int64)) if known else (np.zeros(0, np.int64), np.zeros(0, np.int64))
+    step, has_groups = max(a.step, b.step), bool(a.step and b.step)
+    one, other = (np.unique(part.frame[part.frame >= 0] // (step // part.step if has_groups else 1)) for part in (a, b))
+    return (
+        (one.astype(np.int64), other.astype(np.int64)) if has_groups else (np.zeros(0, np.int64), np.zeros(0, np.int64))
+    )

@@ -116,11 +116,11 @@ class Analysis:
         (-1 elsewhere), and for all where `truth`, the true labels' map of the part, is given.
         """
         table = table.summing_to_op()
-        rows, drawn = shared_rows(table, self.sample.table)
+        rows, sample_rows = shared_rows(table, self.sample.table)
         spread: Columns = {}
         for name, values in self.drawn.items():
             spread[name] = np.full(len(table), -1 if values.dtype == np.int64 else np.nan, values.dtype)
-            spread[name][rows] = values[drawn]
+            spread[name][rows] = values[sample_rows]
         null = expected_sbd(table)
         if "sbd_null" in spread:
             null[rows] = spread.pop("sbd_null")[rows]
@@ -210,15 +210,15 @@ def analyse(
     sums = cluster_sums_of(
         table, events, true_label, spots=spots, sbd_excess=columns["sbd_excess"], cubes=cubes, consistent=consistent
     )
-    drawn, log = log_sums(sample, cubes)
+    sample_columns, log = log_sums(sample, cubes)
     if log is not None:
-        drawn["sbd_null"] = null
+        sample_columns["sbd_null"] = null
     if true_label is not None:
-        drawn["true_label"] = true_label
+        sample_columns["true_label"] = true_label
 
-    whole = sample.summary.summary(table.voxel_size, table.classes, edges)
-    repeats = whole.means.voxels[SBD.key]
-    repeated = Repeated(repeats, repeats / whole.voxels if whole.voxels else math.nan)
+    map_summary = sample.summary.summary(table.voxel_size, table.classes, edges)
+    repeats = map_summary.means.voxels[SBD.key]
+    repeated = Repeated(repeats, repeats / map_summary.voxels if map_summary.voxels else math.nan)
     headline = HeadlineStatistics(*confidence_intervals(headline_specs(sums, scope)))
     means = _means(locations, sums, scope)
     flips = FlippingSums.of(table, consistent, cubes).flipping(table.classes)
@@ -234,7 +234,7 @@ def analyse(
     )  # fmt: skip
     summary = MapStatistics(
         schema=SCHEMA, name=name, seed=seed, K=table.K, voxel_size=table.voxel_size,
-        voxels=whole.voxels, observations=whole.observations, repeated=repeated, cubes=len(cubes.cell),
+        voxels=map_summary.voxels, observations=map_summary.observations, repeated=repeated, cubes=len(cubes.cell),
         verdict=stability,
         agreement=_agreement(means, class_agreement_of(class_sums(table, events), table.classes)),
         flipping=flips,
@@ -245,7 +245,7 @@ def analyse(
         uncertainty=EntropyParts(means["entropy"], means["entropy_within"], means["entropy_between"]),
         geometry=None if limit is None else losses(table, limit),
         correctness=None if truth is None else _correctness(table, truth, consistent, sums, edges, headline),
-        strata=_strata(whole, table, columns, edges),
+        strata=_strata(map_summary, table, columns, edges),
         outlying_frames=outlying,
         ranges=None if spots is None else range_agreement(spots, scope, limits),
         groupings=None if spots is None else groupings(spots, sums, scope, limits),
@@ -256,7 +256,7 @@ def analyse(
     if alone:
         summary, lone = _without_classes(summary), None
     moving = {} if spots is None else moving_percent(spots)
-    return Analysis(summary, whole, sums, sample, shares, drawn, lone, moving)
+    return Analysis(summary, map_summary, sums, sample, shares, sample_columns, lone, moving)
 
 
 def _without_classes(summary: MapStatistics) -> MapStatistics:
@@ -269,7 +269,7 @@ def _without_classes(summary: MapStatistics) -> MapStatistics:
         return dataclasses.replace(section, **changed)
 
     means = MeasureMeans(dict.fromkeys((measure.key for measure in measures()), math.nan), {})
-    strata = tuple(dataclasses.replace(unknown(own), means=means) for own in summary.strata)
+    strata = tuple(dataclasses.replace(unknown(stratum), means=means) for stratum in summary.strata)
     sections = {name: unknown(getattr(summary, name)) for name in ("agreement", "headline", "drift", "uncertainty")}
     sections |= dict.fromkeys(("flipping", "correlogram", "geometry", "correctness"))
     sections |= dict.fromkeys(("outlying_frames", "ranges", "groupings", "moved"))
@@ -296,13 +296,13 @@ def _drift(
     repeats: int, means: Mapping[str, Interval], locations: ClusterSums, log: ClusterSums | None
 ) -> DriftStatistics:
     """Return SBD and its null; without a log only for one-hot evidence, and without flips."""
-    rates, (sampled, known) = None, (locations[name][:, 1].sum() for name in ("psa", "null"))
+    rates, (sampled, with_null) = None, (locations[name][:, 1].sum() for name in ("psa", "null"))
     if log is not None:
         (since,) = _intervals(log, OF_CHANGES)
         rate, null, excess = _intervals(log, OF_FLIPS)
         rates = FlipRates(rate, null, excess, since)
     return DriftStatistics(
-        voxels=round(known / sampled * repeats) if sampled else 0,
+        voxels=round(with_null / sampled * repeats) if sampled else 0,
         sbd_op2=means["sbd"],
         null=means["null"],
         excess=means["excess"],
@@ -337,7 +337,7 @@ BY_STRATUM = ("psa", "sbd_null", "sbd_excess", "entropy_within", "entropy_betwee
 
 
 def _strata(
-    whole: TableSummary, table: VoxelTable, columns: Columns, edges: Sequence[int]
+    map_summary: TableSummary, table: VoxelTable, columns: Columns, edges: Sequence[int]
 ) -> tuple[StratumStatistics, ...]:
     sums, count = by_group(groups_of(table.op, edges), [columns[name] for name in BY_STRATUM], len(edges) + 1)
     with np.errstate(invalid="ignore"):
@@ -346,5 +346,5 @@ def _strata(
         StratumStatistics(
             stratum.name, stratum.voxels, stratum.means, **dict(zip(BY_STRATUM, of_stratum.tolist(), strict=True))
         )
-        for stratum, of_stratum in zip(whole.strata, means, strict=True)
+        for stratum, of_stratum in zip(map_summary.strata, means, strict=True)
     )

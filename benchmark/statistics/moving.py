@@ -43,21 +43,21 @@ def moved_spots(
         return None
     asked = np.zeros(len(spots.point), np.bool_)
     asked[spots.spot] = True
-    known, moved = asked & votes.known, asked & votes.moved
+    decided, moved = asked & votes.known, asked & votes.moved
     share, static = 0.0, alpha
     if moved.any():
         rest = sums_of_spots(static_spots(spots))
         share, static = share_of_disagreement(sums, rest), estimate(rest, "alpha", scope=scope_of(rest, scope))
     return MovedSpots(
-        spots=int(known.sum()),
-        unknown=1 - float(known.sum() / asked.sum()),
-        moved=float(moved.sum() / known.sum()) if known.any() else math.nan,
+        spots=int(decided.sum()),
+        unknown=1 - float(decided.sum() / asked.sum()),
+        moved=float(moved.sum() / decided.sum()) if decided.any() else math.nan,
         disagreement=share,
         alpha=static,
         gap=votes.gap,
         false_rate=votes.false_rate,
         false_share=votes.false_share,
-        classes=_classes(spots, known, moved),
+        classes=_classes(spots, decided, moved),
         misplaced=misplaced_frames(spots, frame_name),
     )
 
@@ -108,14 +108,14 @@ def share_of_disagreement(sums: ClusterSums, rest: ClusterSums) -> float:
     return min(max(1 - disagreement(rest) / everywhere, 0.0), 1.0) if everywhere > 0 else math.nan
 
 
-def _classes(spots: SpotObservations, known: Mask, moved: Mask) -> tuple[MovedClass, ...]:
+def _classes(spots: SpotObservations, decided: Mask, moved: Mask) -> tuple[MovedClass, ...]:
     """Return the classes of which spots moved, by the class that most views give a spot."""
-    own = _dominant(spots)
-    of_class = (np.bincount(own[some & (own >= 0)], minlength=spots.K) for some in (known, moved))
+    label = _dominant(spots)
+    of_class = (np.bincount(label[mask & (label >= 0)], minlength=spots.K) for mask in (decided, moved))
     names = spots.classes or tuple(str(k) for k in range(spots.K))
     rows = [
         MovedClass(name, n, n_moved / n)
-        for name, n, n_moved in zip(names, *(each.tolist() for each in of_class), strict=True)
+        for name, n, n_moved in zip(names, *(counts.tolist() for counts in of_class), strict=True)
         if n_moved
     ]
     return tuple(sorted(rows, key=lambda row: -row.moved))
@@ -124,9 +124,9 @@ def _classes(spots: SpotObservations, known: Mask, moved: Mask) -> tuple[MovedCl
 def _dominant(spots: SpotObservations) -> Int64:
     """Return the dominant class (n,) of each spot; -1 without a label."""
     log, at = spots.observations(), spots.of_log()
-    own = np.full(len(spots.point), -1, np.int64)
-    own[at] = dominant(log.table())
-    return own
+    label = np.full(len(spots.point), -1, np.int64)
+    label[at] = dominant(log.table())
+    return label
 
 
 def misplaced_frames(spots: SpotObservations, frame_name: Callable[[int], str] = str) -> tuple[MisplacedFrame, ...]:

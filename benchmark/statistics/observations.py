@@ -70,8 +70,8 @@ class Views:
 
     def rows(self) -> Float64:
         """Return rows (V, 6), as `of` takes them."""
-        others = self.timestamp[:, None], self.footprint[:, None]
-        return np.concatenate([self.frame[:, None], self.centre, *others], axis=1)
+        time_and_footprint = self.timestamp[:, None], self.footprint[:, None]
+        return np.concatenate([self.frame[:, None], self.centre, *time_and_footprint], axis=1)
 
     def take(self, rows: Int64) -> Views:
         """Return some of the views."""
@@ -163,9 +163,9 @@ class SpotObservations:
 
     def labelled_share(self) -> float:
         """Return the share of the spots seen by two views that have a label in at least half of these views."""
-        seen, of = distinct_rows(np.stack([self.spot, self.view], axis=1))
+        pairs, of = distinct_rows(np.stack([self.spot, self.view], axis=1))
         answers, labelled = np.bincount(of), np.bincount(of, self.label < self.K)
-        _, of = np.unique(seen[:, 0], return_inverse=True)
+        _, of = np.unique(pairs[:, 0], return_inverse=True)
         views, with_label = np.bincount(of), np.bincount(of, 2 * labelled >= answers)
         return mean((2 * with_label >= views)[views >= 2].astype(np.float64))
 
@@ -192,12 +192,12 @@ class SpotObservations:
 
     def within(self, share: int) -> SpotObservations:
         """Return the answers for the spots of a smaller share of the coarse cells."""
-        drawn = self.drawn < share
-        number = np.cumsum(drawn, dtype=np.int32) - 1
-        some = self.only(drawn[self.spot])
-        votes = None if self.votes is None else self.votes.take(drawn)
+        inside = self.drawn < share
+        number = np.cumsum(inside, dtype=np.int32) - 1
+        part = self.only(inside[self.spot])
+        votes = None if self.votes is None else self.votes.take(inside)
         return dataclasses.replace(
-            some, spot=number[some.spot], point=self.point[drawn], drawn=self.drawn[drawn], share=share, votes=votes
+            part, spot=number[part.spot], point=self.point[inside], drawn=self.drawn[inside], share=share, votes=votes
         )
 
     @classmethod
@@ -272,7 +272,7 @@ class SpotObservations:
             columns[name] = pa.ListArray.from_arrays(arrays.column(ends), values)
         about: dict[str, Any] = {name: getattr(self, name) for name in ("spacing", "K", "share", "classes", "frames")}
         if self.votes is not None:
-            columns |= {name: arrays.column(own) for name, own in self.votes.columns.items()}
+            columns |= {name: arrays.column(column) for name, column in self.votes.columns.items()}
             about["votes"] = self.votes.of_views()
         if self.distances is not None:
             about["distances"] = self.distances.tolist()
@@ -301,19 +301,19 @@ class SpotObservations:
                 about["distances"] = np.array(about["distances"], np.float64).reshape(about["K"], about["K"])
             point = np.stack([arrays.values_of(content.column(name)) for name in "xyz"], axis=1)
             lists = {name: content.column(name).combine_chunks() for name in COLUMNS[1:]}
-            counts = {name: np.asarray(each.value_lengths()) for name, each in lists.items()}
+            counts = {name: np.asarray(values.value_lengths()) for name, values in lists.items()}
             answers = counts["view"].astype(np.int64)
             if not all(np.array_equal(answers, count) for count in counts.values()):
                 raise DataError("the lists of a spot's answers have different lengths")
             columns: dict[str, Any] = {
-                name: np.asarray(each.flatten()).astype(TYPES[name]) for name, each in lists.items()
+                name: np.asarray(values.flatten()).astype(TYPES[name]) for name, values in lists.items()
             }
             columns["spot"] = np.repeat(np.arange(len(answers), dtype=np.int32), answers)
-            drawn = arrays.values_of(content.column("drawn")).astype(np.uint32)
+            cell_hash = arrays.values_of(content.column("drawn")).astype(np.uint32)
             if "votes" in about:
                 counts = {name: arrays.values_of(content.column(name)) for name in OF_SPOTS}
                 about["votes"] = SpotVotes.of(counts, about["votes"])
-            read = cls(**columns, point=point.astype(np.float64), drawn=drawn, views=views, **about)
+            read = cls(**columns, point=point.astype(np.float64), drawn=cell_hash, views=views, **about)
             read._require_sound()
             return read
 
@@ -344,20 +344,20 @@ def numbered_as_one_flight(samples: Sequence[SpotObservations]) -> list[SpotObse
     Programs that give some frames of a flight number them from 0 on. A frame of another number is known by the place
     and the time at which it was taken, if no two views of the first sample have the same ones.
     """
-    first, *others = samples
+    first, *rest = samples
     number = dict(zip(_taken(first.views), first.views.frame.tolist(), strict=True))
     if len(number) < len(first.views):
         return list(samples)
     same = [first]
-    for other in others:
+    for other in rest:
         keys = _taken(other.views)
-        found = [number.get(key) for key in keys]
-        known = [frame for frame in found if frame is not None]
-        if len(set(known)) < len(known) or not known:
+        matches = [number.get(key) for key in keys]
+        matched_frames = [frame for frame in matches if frame is not None]
+        if len(set(matched_frames)) < len(matched_frames) or not matched_frames:
             same.append(other)
             continue
         further = itertools.count(max(number.values(), default=-1) + 1)
-        frame = np.array([next(further) if own is None else own for own in found], np.int64)
+        frame = np.array([next(further) if match is None else match for match in matches], np.int64)
         same.append(dataclasses.replace(other, views=dataclasses.replace(other.views, frame=frame)))
     return same
 
@@ -381,20 +381,20 @@ def same_spots(samples: Sequence[SpotObservations]) -> list[SpotObservations]:
     cells = [cells_of(sample.point, spacing) for sample in samples]
     distinct, of = distinct_rows(np.concatenate(cells))
     firsts = []
-    for own in np.split(of, np.cumsum([len(cell) for cell in cells])[:-1]):
+    for cell_numbers in np.split(of, np.cumsum([len(cell) for cell in cells])[:-1]):
         first = np.full(len(distinct), -1, np.int64)
-        first[own[::-1]] = np.arange(len(own))[::-1]
+        first[cell_numbers[::-1]] = np.arange(len(cell_numbers))[::-1]
         firsts.append(first)
     common: Mask = np.all([first >= 0 for first in firsts], axis=0)
     same = []
     for sample, first in zip(samples, firsts, strict=True):
         number = np.full(len(sample.point), -1, np.int32)
         number[first[common]] = np.arange(np.count_nonzero(common), dtype=np.int32)
-        some = sample.only(number[sample.spot] >= 0)
+        subset = sample.only(number[sample.spot] >= 0)
         rank = views.rank(sample.views.frame)
         same.append(
             dataclasses.replace(
-                some, spot=number[some.spot], view=rank[some.view].astype(np.int32), views=views, spacing=spacing,
+                subset, spot=number[subset.spot], view=rank[subset.view].astype(np.int32), views=views, spacing=spacing,
                 point=samples[0].point[firsts[0][common]], drawn=samples[0].drawn[firsts[0][common]], votes=None,
             )
         )  # fmt: skip

@@ -81,8 +81,8 @@ class Place:
 def places_of(record: Record, most: int = MOST) -> list[Place]:
     """Return the worst places of a unit whose voxels are stored."""
     spots = record.observations_file
-    seen = None if spots is None or not spots.exists() else SpotObservations.load(spots)
-    return worst_places(record.tiles(), seen, most)
+    observations = None if spots is None or not spots.exists() else SpotObservations.load(spots)
+    return worst_places(record.tiles(), observations, most)
 
 
 def worst_places(tables: Iterable[VoxelTable], spots: SpotObservations | None, most: int = MOST) -> list[Place]:
@@ -90,10 +90,10 @@ def worst_places(tables: Iterable[VoxelTable], spots: SpotObservations | None, m
 
     The disagreement of a place is the sum of 1 - PSA over its voxels.
     """
-    parts, whole = list[VoxelTable](), 0.0
+    parts, total_loss = list[VoxelTable](), 0.0
     for part in tables:
         lost = 1 - np.nan_to_num(psa(part), nan=1.0)
-        whole += float(lost.sum())
+        total_loss += float(lost.sum())
         parts.append(_least_agreed(part.rows(lost >= 1 - DISAGREES)))
         if sum(map(len, parts)) > 2 * VOXELS:
             parts = [_least_agreed(VoxelTable.joined(parts))]
@@ -109,7 +109,7 @@ def worst_places(tables: Iterable[VoxelTable], spots: SpotObservations | None, m
     number = np.full(len(total), -1)
     number[order] = np.arange(len(order))
     views = [()] * len(order) if spots is None else _views(table, number[place], len(order), spots)
-    return [_place(k, number[place] == k, table, evidence, loss, whole, views[k]) for k in range(len(order))]
+    return [_place(k, number[place] == k, table, evidence, loss, total_loss, views[k]) for k in range(len(order))]
 
 
 def _least_agreed(table: VoxelTable) -> VoxelTable:
@@ -131,19 +131,19 @@ def connected(index: Int32, classes: npt.NDArray[np.integer[Any]]) -> Int64:
 
 def _place(
     number: int,
-    own: Mask,
+    inside: Mask,
     table: VoxelTable,
     evidence: Float64,
     loss: Float64,
-    whole: float,
+    total_loss: float,
     views: tuple[PlaceView, ...],
 ) -> Place:
     """Return a place from the rows of its voxels, their losses (n,), and the loss of the whole map."""
-    points, size = table.centers[own], table.voxel_size
+    points, size = table.centers[inside], table.voxel_size
     x, y, z = points[np.linalg.norm(points - points.mean(axis=0), axis=1).argmin()].tolist()
-    label, other = np.argsort(-evidence[own].sum(axis=0), kind="stable")[:2].tolist()
+    label, other = np.argsort(-evidence[inside].sum(axis=0), kind="stable")[:2].tolist()
     extent = float(np.linalg.norm(np.ptp(points, axis=0) + size))
-    agreement, share, op = 1 - loss[own].mean(), loss[own].sum() / whole, np.median(table.op[own])
+    agreement, share, op = 1 - loss[inside].mean(), loss[inside].sum() / total_loss, np.median(table.op[inside])
     return Place(
         number + 1, label, other, len(points), float(agreement), float(share), float(op), extent, (x, y, z), points,
         views,
@@ -152,15 +152,15 @@ def _place(
 
 def _views(table: VoxelTable, place: Int64, places: int, spots: SpotObservations) -> list[tuple[PlaceView, ...]]:
     """Return the views of each place, from the spots that lie in its voxels (n,), whose place is -1 for none."""
-    cells, wanted = voxel_keys(np.floor(spots.point / table.voxel_size).astype(np.int32), table.index)
-    at = np.minimum(np.searchsorted(wanted, cells), len(wanted) - 1)
-    of_spot = np.where(wanted[at] == cells, place[at], -1)
+    cells, table_keys = voxel_keys(np.floor(spots.point / table.voxel_size).astype(np.int32), table.index)
+    at = np.minimum(np.searchsorted(table_keys, cells), len(table_keys) - 1)
+    of_spot = np.where(table_keys[at] == cells, place[at], -1)
     rows = np.flatnonzero(of_spot[spots.spot] >= 0)
     votes = np.zeros((places, len(spots.views), spots.K + 1), np.int64)
     np.add.at(votes, (of_spot[spots.spot[rows]], spots.view[rows], spots.label[rows]), 1)
     count = votes.sum(axis=2)
-    named = votes[..., : spots.K].sum(axis=2) > 0
-    label = np.where(named, votes[..., : spots.K].argmax(axis=2), -1)
+    labelled = votes[..., : spots.K].sum(axis=2) > 0
+    label = np.where(labelled, votes[..., : spots.K].argmax(axis=2), -1)
     frame = spots.views.frame
     order = np.argsort(frame, kind="stable")
     return [

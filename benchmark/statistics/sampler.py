@@ -305,9 +305,9 @@ class Sampler:
 
     def _learn(self, earlier: int, spot: npt.NDArray[np.int32], error: Float64) -> None:
         """Take how much a frame's depth differs at the spots that it did not find itself."""
-        seen = np.abs(error[(spot < earlier) & (np.abs(error) < GATE)])
-        if len(seen) >= ENOUGH:
-            self._errors.append(float(np.median(seen)) / 0.6745)
+        deviations = np.abs(error[(spot < earlier) & (np.abs(error) < GATE)])
+        if len(deviations) >= ENOUGH:
+            self._errors.append(float(np.median(deviations)) / 0.6745)
 
     def _answers_of_image(self, frame: Frame, T: Float64, seed: int) -> tuple[Any, ...]:
         from semstab.statistics.loops.spots import answer, project
@@ -354,10 +354,10 @@ class Sampler:
         """Add the answers of a view; drop every second spot while there are too many of them."""
         end = self._answers + len(spot)
         if end > len(self._columns["spot"]):
-            self._columns = {name: _longer(each, max(2 * len(each), end)) for name, each in self._columns.items()}
+            self._columns = {name: _longer(column, max(2 * len(column), end)) for name, column in self._columns.items()}
         values = spot, np.full(len(spot), view), label, second, third, square[:, 0], square[:, 1]
-        for name, own in zip(COLUMNS, values, strict=True):
-            self._columns[name][self._answers : end] = own
+        for name, value in zip(COLUMNS, values, strict=True):
+            self._columns[name][self._answers : end] = value
         self._answers = end
         while self._answers > self.budget or self._spots > MOST_SPOTS:
             self._halve()
@@ -367,8 +367,8 @@ class Sampler:
         assert frame.features is not None
         assert self._pixel is not None
         spot = spot[label <= self.K]
-        seen, pixel = self._pixel
-        pixel = pixel[np.searchsorted(seen, spot)]
+        spots_with_pixel, pixel = self._pixel
+        pixel = pixel[np.searchsorted(spots_with_pixel, spot)]
         if sparse is None:
             v, u = np.divmod(pixel, frame.shape[1])
         else:
@@ -377,15 +377,15 @@ class Sampler:
 
     def _halve(self) -> None:
         self._share //= 2
-        left = self._hash[: self._spots] < self._share
-        number = np.cumsum(left, dtype=np.int32) - 1
-        self._features.renumber(left, number)
-        rows = np.flatnonzero(left[self._columns["spot"][: self._answers]])
+        remaining = self._hash[: self._spots] < self._share
+        number = np.cumsum(remaining, dtype=np.int32) - 1
+        self._features.renumber(remaining, number)
+        rows = np.flatnonzero(remaining[self._columns["spot"][: self._answers]])
         for name, column in self._columns.items():
             column[: len(rows)] = number[column[rows]] if name == "spot" else column[rows]
-        self._answers, n = len(rows), int(left.sum())
-        for own in (self._point, self._hash, self._found, self._firm):
-            own[:n] = own[: self._spots][left]
+        self._answers, n = len(rows), int(remaining.sum())
+        for array in (self._point, self._hash, self._found, self._firm):
+            array[:n] = array[: self._spots][remaining]
         self._spots = n
         self._table = self._rebuilt(len(self._table))
 
@@ -486,9 +486,9 @@ def _noise(frame: Frame) -> float:
     from semstab.statistics.loops.spots import second_differences
 
     stride = 2 * _stride(frame.shape)
-    found = np.empty((frame.shape[0] // stride + 1) * (frame.shape[1] // stride + 1))
-    n = second_differences(fixed(frame.depth), stride, found)
-    return float(np.median(found[:n])) / 0.6745 / math.sqrt(6) if n else 0.0
+    differences = np.empty((frame.shape[0] // stride + 1) * (frame.shape[1] // stride + 1))
+    n = second_differences(fixed(frame.depth), stride, differences)
+    return float(np.median(differences[:n])) / 0.6745 / math.sqrt(6) if n else 0.0
 
 
 @functools.lru_cache(maxsize=64)

@@ -57,6 +57,6 @@ def mean_products(log: Events, shares: Float64) -> Float64:
     T = np.diff(np.append(starts, len(log))).astype(np.float64)
     again = T >= 2
     total = np.add.reduceat(shares, starts, axis=0)[again] if len(T) else np.zeros((0, shares.shape[1]))
-    own = np.add.reduceat((shares**2).sum(axis=1), starts)[again] if len(T) else np.zeros(0)
-    products: Float64 = ((total**2).sum(axis=1) - own) / (T * (T - 1))[again]
+    squares = np.add.reduceat((shares**2).sum(axis=1), starts)[again] if len(T) else np.zeros(0)
+    products: Float64 = ((total**2).sum(axis=1) - squares) / (T * (T - 1))[again]
     return products

@@ -44,7 +44,7 @@ def spot_agreement(
         limits: Limits of the verdict.
     """
     first = sums.answers[0]
-    names, named = sums.classes or tuple(str(k) for k in range(table.K)), set(critical) & set(sums.classes)
+    names, critical_names = sums.classes or tuple(str(k) for k in range(table.K)), set(critical) & set(sums.classes)
     locations = np.bincount(dominant(table)[table.op >= 2], minlength=table.K).tolist()
     scope_of_spots, evidence = scope_of(sums, scope), first["evidence"].sum(axis=0)
     alphas = confidence_intervals(
@@ -68,7 +68,7 @@ def spot_agreement(
             ClassAlpha(
                 name,
                 locations[k],
-                name in named if named else locations[k] >= limits.class_locations,
+                name in critical_names if critical_names else locations[k] >= limits.class_locations,
                 alpha,
                 1 - probability_above(alpha, limits.usable, "agreement"),
                 float(disagreement[k]),
@@ -102,8 +102,8 @@ def moving_classes(spots: SpotObservations, sums: ClusterSums, moving: Sequence[
         return float(first["observations"].sum()) * (1 - alpha) * (1 - chance_of(first))
 
     rest = sums_of_spots(spots.without(moving))
-    whole, alpha = (min(value(each, "alpha"), 1.0) for each in (sums, rest))  # extrapolated to the spot itself
-    if not (everywhere := disagreeing(sums, whole)) > 0:
+    alpha_of_all, alpha = (min(value(part, "alpha"), 1.0) for part in (sums, rest))  # extrapolated to the spot itself
+    if not (everywhere := disagreeing(sums, alpha_of_all)) > 0:
         return None
     share = 1 - disagreeing(rest, alpha) / everywhere
     return MovingClasses(tuple(sums.classes[k] for k in moving), min(max(share, 0.0), 1.0), alpha)

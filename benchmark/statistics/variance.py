@@ -129,14 +129,14 @@ def variances(
     contrasts = _contrasts(n)
     error = contrasts.T @ noise @ contrasts + 1e-9 * effect.var() * np.eye(n - 1)
     whiten = np.linalg.inv(np.linalg.cholesky(error)) @ contrasts.T
-    seen, largest = whiten @ effect, (n - 1) / special.chdtri(n - 1, 1 - UNLIKELY)
+    whitened, largest = whiten @ effect, (n - 1) / special.chdtri(n - 1, 1 - UNLIKELY)
     sizes = effect.var() * n / (n - 1) * np.geomspace(SMALLEST, largest, SIZES)
     logs, result = [], []
     for reach, prior in ranges.items():
         alike = np.exp(-distance / reach) if reach > 0 else np.eye(n)
         eigenvalues, vectors = np.linalg.eigh(whiten @ alike @ whiten.T)
         total = 1 + np.outer(sizes, np.maximum(eigenvalues, 0.0))
-        logs.append(math.log(prior) - 0.5 * (np.log(total) + (vectors.T @ seen) ** 2 / total).sum(axis=1))
+        logs.append(math.log(prior) - 0.5 * (np.log(total) + (vectors.T @ whitened) ** 2 / total).sum(axis=1))
         result.append(sizes * (weight @ alike @ weight))
     log = np.concatenate(logs)
     likely = np.exp(log - log.max())
@@ -216,13 +216,13 @@ def influences(
         influence if halves is None else influence + gradient[0] * (halves[:, 0] - total[0] / total[1] * halves[:, 1])
     )
     by_frame, size = index.by_both(shared), index.by_both(np.abs(columns[:, 1]))
-    seen = size.sum(axis=0) > 0
+    occupied_frames = size.sum(axis=0) > 0
     return Influences(
         index.cubes[occupied],
-        index.frames[seen],
+        index.frames[occupied_frames],
         index.by_cube(influence)[occupied],
-        by_frame[np.ix_(occupied, seen)],
-        size[np.ix_(occupied, seen)],
+        by_frame[np.ix_(occupied, occupied_frames)],
+        size[np.ix_(occupied, occupied_frames)],
         everything[occupied],
         index.edge,
         index.per_group,
@@ -262,8 +262,8 @@ class Effects:
         location = (cell.sum(axis=1) - size @ frame) / by_location
         residual = cell - size * np.add.outer(location, frame)
         cells, total = int(np.count_nonzero(size)), float(by_location.sum())
-        left = max(cells - len(by_location) - len(by_frame) + 1, 1)
-        unit = float((residual**2 / np.where(size > 0, size, 1.0)).sum()) / left
+        degrees_of_freedom = max(cells - len(by_location) - len(by_frame) + 1, 1)
+        unit = float((residual**2 / np.where(size > 0, size, 1.0)).sum()) / degrees_of_freedom
         mean = by_location @ location / total
         scatter = float(by_location @ (location - mean) ** 2) / total - unit * len(by_location) / total
         shrink = unit / max(scatter, 1e-3 * unit / float(np.median(by_location)), TINY * TINY)
@@ -271,7 +271,7 @@ class Effects:
         normal = np.diag(by_frame * (1 + 1e-9)) - size.T @ ridge
         frame = np.linalg.solve(normal, cell.sum(axis=0) - ridge.T @ cell.sum(axis=1))
         error: Float64 = unit * np.linalg.inv(normal).astype(np.float64)
-        return cls(grid, float((residual**2).sum()) * cells / left, unit, frame, error)
+        return cls(grid, float((residual**2).sum()) * cells / degrees_of_freedom, unit, frame, error)
 
     @functools.cached_property
     def frames(self) -> Variances:

@@ -155,9 +155,9 @@ def verdict(
     level, probability = _level(headline, spots, limits)
     of_all, probability_of_all = _level(headline, spots, limits, spots.pairs)
     silent = spots.labelled < limits.labelled
-    both = StabilityVerdict(level, probability, "", labelled=spots.pixels_labelled)
+    result = StabilityVerdict(level, probability, "", labelled=spots.pixels_labelled)
     if of_all != level:
-        both = dataclasses.replace(both, of_all=of_all, probability_of_all=probability_of_all)
+        result = dataclasses.replace(result, of_all=of_all, probability_of_all=probability_of_all)
     wrong = headline.wrong_of_consistent_op3
     same = spots.agreeing(of_all_spots.value)
     parts = [
@@ -172,13 +172,13 @@ def verdict(
         parts.append(f"{wrong.value:.0%} of the consistent locations are wrong ({wrong.low:.0%} to {wrong.high:.0%})")
     if silent:
         parts.append(f"{1 - spots.labelled:.0%} of the locations have no label in most frames")
-    if flips is not None and both.decisive in ACTED_ON:
+    if flips is not None and result.decisive in ACTED_ON:
         parts += _flips(flips)
     how_sure = "" if math.isnan(probability) or level == "undecided" else f" ({probability:.0%})"
-    stated = both.difference or f"{level}{how_sure}"
+    stated = result.difference or f"{level}{how_sure}"
     reasons = ", ".join(parts)
-    line = f"{model}: {stated}, {ADVICE[both.decisive]}: {reasons}; {support}; {_for(headline.alpha)}"
-    return dataclasses.replace(both, line=line)
+    line = f"{model}: {stated}, {ADVICE[result.decisive]}: {reasons}; {support}; {_for(headline.alpha)}"
+    return dataclasses.replace(result, line=line)
 
 
 def _missing(spots: SpotAgreement | None, voxels: int) -> str:
@@ -225,8 +225,8 @@ def _alpha(alpha: Interval, spots: SpotAgreement, name: str = "alpha") -> str:
     """Return 'alpha 0.71 (0.69 to 0.73), probably unstable: car (98%)'."""
     chance = ", no better than chance" if alpha.value < 0 else ""
     unstable = [row for row in spots.critical_classes[:3] if row.unstable >= PROBABLE]
-    named = ", ".join(f"{row.name} ({row.unstable:.0%})" for row in unstable)
-    classes = f", probably unstable: {named}" if named else ""
+    names_text = ", ".join(f"{row.name} ({row.unstable:.0%})" for row in unstable)
+    classes = f", probably unstable: {names_text}" if names_text else ""
     return f"{name} {alpha.value:.2f} ({alpha.low:.2f} to {alpha.high:.2f}){chance}{classes}"
 
 

@@ -73,21 +73,21 @@ def _classes(visited: VisitedSpots, levers: Levers) -> list[VisitedClass]:
     K = visited.spots.K
     names = visited.spots.classes or tuple(str(k) for k in range(K))
     before, after = visited.dominant
-    told = np.isin(visited.change, (STAYED, GONE, NEW))
-    common = [np.bincount(own[visited.common], minlength=K) for own in (before, after)]
+    decided = np.isin(visited.change, (STAYED, GONE, NEW))
+    common = [np.bincount(label[visited.common], minlength=K) for label in (before, after)]
     rows = []
     for k in range(K):
-        own, then = (before == k) & told, (after == k) & told
-        if not (own.any() or then.any() or common[0][k]):
+        earlier, then = (before == k) & decided, (after == k) & decided
+        if not (earlier.any() or then.any() or common[0][k]):
             continue
         enough = K <= MOST_CLASSES and max(common[0][k], common[1][k]) >= LEAST_SPOTS
         other = after[visited.relabelled & (before == k)]
         rows.append(
             VisitedClass(
                 name=names[k],
-                spots=int(own.sum()),
+                spots=int(earlier.sum()),
                 alpha=_across(visited, 2, of=k, levers=levers)[0] if enough else NOTHING,
-                gone=_share(visited.change[own] == GONE),
+                gone=_share(visited.change[earlier] == GONE),
                 new=_share(visited.change[then] == NEW),
                 relabelled=len(other) / int(common[0][k]) if common[0][k] else math.nan,
                 becomes=names[int(np.bincount(other).argmax())] if len(other) else "",
@@ -140,15 +140,15 @@ class _Sums:
         back = np.argsort(order)
         sums = ClusterSums.of_cubes(self.cell, self.edge, {"": self.columns[:, order]})
         if which is None:
-            return estimate(sums, Functional(("",), lambda own: cost(own[..., back]), -2.0, 2.0, "plain"))
-        return estimate(sums, Functional(("",), lambda own: alpha(own[..., back], which), -1.0, 1.0, "agreement"))
+            return estimate(sums, Functional(("",), lambda totals: cost(totals[..., back]), -2.0, 2.0, "plain"))
+        return estimate(sums, Functional(("",), lambda totals: alpha(totals[..., back], which), -1.0, 1.0, "agreement"))
 
     def _alpha(self, part: Float64, n: Float64, kind: int) -> Float64:
         """Return alpha (...,) of the answers of one part of the columns."""
         evidence = np.split(part[..., 3:], VISITS, axis=-1)
         first, second = (evidence[0], evidence[1]) if kind == ACROSS else (evidence[kind], evidence[kind])
-        own = 0.0 if kind == ACROSS else self.own[kind]
-        expected = ((first * second).sum(axis=-1) - own) / (n * n - own)
+        self_pairs = 0.0 if kind == ACROSS else self.own[kind]
+        expected = ((first * second).sum(axis=-1) - self_pairs) / (n * n - self_pairs)
         return beyond_chance(1 - part[..., kind] / n, 1 - expected)
 
 
@@ -177,13 +177,13 @@ def _sums(visited: VisitedSpots, K: int, of: int | None, levers: Levers | None) 
     for answer in (spots.label, spots.neighbour, spots.beyond):
         label = answer if of is None else (answer == of).astype(np.int64)
         shares = visited.shares_of(label, K)
-        mine = shares[0][common], shares[1][common]
-        agree.append(agreeing(mine, counts, visited.from_one_place(label)[:, common]))
-        columns += [into @ agree[-1].T, *((into @ own).toarray() for own in mine)]
-    own = (weight**2 / counts).sum(axis=1)
+        common_shares = shares[0][common], shares[1][common]
+        agree.append(agreeing(common_shares, counts, visited.from_one_place(label)[:, common]))
+        columns += [into @ agree[-1].T, *((into @ share).toarray() for share in common_shares)]
+    self_pairs = (weight**2 / counts).sum(axis=1)
     levers = levers or _levers(visited, common, weight, agree)
     of_answers = columns[: ANSWERS * (1 + VISITS)]
-    return _Sums(cell, edge, np.hstack([*of_answers, into.sum(axis=1)[:, None]]), own, levers)
+    return _Sums(cell, edge, np.hstack([*of_answers, into.sum(axis=1)[:, None]]), self_pairs, levers)
 
 
 def _levers(visited: VisitedSpots, common: Int64, weight: Float64, agree: Sequence[Float64]) -> Levers:
@@ -192,13 +192,14 @@ def _levers(visited: VisitedSpots, common: Int64, weight: Float64, agree: Sequen
     of, squares = visited.visit[spots.view], []
     for square in (spots.near, spots.far):
         sums = [
-            np.bincount(spots.spot[of == own], square[of == own], len(spots.point))[common] for own in range(VISITS)
+            np.bincount(spots.spot[of == visit], square[of == visit], len(spots.point))[common]
+            for visit in range(VISITS)
         ]
         means = np.stack(sums) / visited.counts[:, common] @ weight / total
         squares.append([*means, means.mean()])
-    falls = [own @ weight / total for own in agree]
+    falls = [agreement @ weight / total for agreement in agree]
     return (
-        lever_from(squares[0][FIRST], squares[1][FIRST], [float(own[FIRST]) for own in falls]),
-        lever_from(squares[0][SECOND], squares[1][SECOND], [float(own[SECOND]) for own in falls]),
-        lever_from(squares[0][ACROSS], squares[1][ACROSS], [float(own[ACROSS]) for own in falls]),
+        lever_from(squares[0][FIRST], squares[1][FIRST], [float(fall[FIRST]) for fall in falls]),
+        lever_from(squares[0][SECOND], squares[1][SECOND], [float(fall[SECOND]) for fall in falls]),
+        lever_from(squares[0][ACROSS], squares[1][ACROSS], [float(fall[ACROSS]) for fall in falls]),
     )

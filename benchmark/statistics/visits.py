@@ -95,11 +95,11 @@ class VisitSampler(Sampler):
         """Return the answers of both visits, and what the views of each say of all spots."""
         visit, n = np.array(self._visit_of_view, np.int64), self._spots
         votes = []
-        for own, memory in enumerate(self._memories):
-            views = int(np.count_nonzero(visit == own))
+        for visit_index, memory in enumerate(self._memories):
+            views = int(np.count_nonzero(visit == visit_index))
             number, of = np.divmod(self._found[:n], VISITS)
-            found = np.where(of == own, number, views).astype(np.int32)
-            votes.append(memory.votes_on(self._point[:n], found, self._firm[:n], views + 1, self._sigma))
+            finding_view = np.where(of == visit_index, number, views).astype(np.int32)
+            votes.append(memory.votes_on(self._point[:n], finding_view, self._firm[:n], views + 1, self._sigma))
         return VisitedSpots(self.sample(classes), visit, np.array(self._places, np.int64), (votes[0], votes[1]))
 
 
@@ -137,8 +137,8 @@ class VisitedSpots:
         """
         first, second = self.votes
         change = np.full(len(self.spots.point), UNKNOWN)
-        for own in self.votes:
-            change[(own.seen > 0) & own.moved] = MOVED
+        for votes in self.votes:
+            change[(votes.seen > 0) & votes.moved] = MOVED
         change[first.static & second.static] = STAYED
         change[first.static & second.moved] = GONE
         change[first.moved & second.static] = NEW
@@ -155,7 +155,7 @@ class VisitedSpots:
     def counts(self) -> Int64:
         """(2, n) answers of each visit for each spot."""
         of, n = self.visit[self.answers.view], len(self.spots.point)
-        return np.stack([np.bincount(self.answers.spot[of == own], minlength=n) for own in range(VISITS)])
+        return np.stack([np.bincount(self.answers.spot[of == visit], minlength=n) for visit in range(VISITS)])
 
     @cached_property
     def common(self) -> Mask:
@@ -174,10 +174,10 @@ class VisitedSpots:
 
         of = self.visit[self.answers.view]
         shape, made = (len(self.spots.point), K), []
-        for own in range(VISITS):
-            rows = np.flatnonzero(of == own)
+        for visit in range(VISITS):
+            rows = np.flatnonzero(of == visit)
             spot = self.answers.spot[rows]
-            share = 1.0 / np.maximum(self.counts[own], 1)
+            share = 1.0 / np.maximum(self.counts[visit], 1)
             made.append(csr_array((share[spot], (spot, label[rows].astype(np.int64))), shape=shape))
         return made[0], made[1]
 
@@ -214,17 +214,17 @@ class VisitedSpots:
         """
         if not self.common.any():
             return math.nan
-        rng, found = np.random.default_rng(0), 0
-        for own in range(VISITS):
-            rows = np.flatnonzero(self.common[self.answers.spot] & (self.visit[self.answers.view] == own))
+        rng, num_relabelled = np.random.default_rng(0), 0
+        for visit in range(VISITS):
+            rows = np.flatnonzero(self.common[self.answers.spot] & (self.visit[self.answers.view] == visit))
             rows = rows[np.argsort(self.answers.spot[rows], kind="stable")]
-            starts = np.concatenate([[0], np.cumsum(np.where(self.common, self.counts[own], 0))])[:-1]
+            starts = np.concatenate([[0], np.cumsum(np.where(self.common, self.counts[visit], 0))])[:-1]
             spot = self.answers.spot
             for _ in range(DRAWS):
-                drawn = starts[spot] + rng.integers(0, np.maximum(self.counts[own][spot], 1))
-                label = self.answers.label[rows[np.where(self.common[spot], drawn, 0)]]
-                found += int((self.common & _differ(*self.shares_of(label, self.spots.K), self.counts)).sum())
-        return found / (VISITS * DRAWS) / int(self.common.sum())
+                draws = starts[spot] + rng.integers(0, np.maximum(self.counts[visit][spot], 1))
+                label = self.answers.label[rows[np.where(self.common[spot], draws, 0)]]
+                num_relabelled += int((self.common & _differ(*self.shares_of(label, self.spots.K), self.counts)).sum())
+        return num_relabelled / (VISITS * DRAWS) / int(self.common.sum())
 
 
 def _dominant(shares: Any) -> Int64:
@@ -250,11 +250,11 @@ def agreeing(shares: tuple[Any, Any], counts: Int64, from_one_place: Float64 | N
         from_one_place: (2, n) pairs across that do not count, and those of them that agree.
     """
     within = []
-    for own, n in zip(shares, counts, strict=True):
-        pairs = _products(own, own) * n**2 - n
+    for share, n in zip(shares, counts, strict=True):
+        pairs = _products(share, share) * n**2 - n
         within.append(pairs / np.maximum(n * (n - 1), 1))
-    left, total = np.zeros((2, counts.shape[1])) if from_one_place is None else from_one_place, counts.prod(axis=0)
-    return np.stack([*within, (_products(*shares) * total - left[1]) / np.maximum(total - left[0], 1)])
+    excluded, total = np.zeros((2, counts.shape[1])) if from_one_place is None else from_one_place, counts.prod(axis=0)
+    return np.stack([*within, (_products(*shares) * total - excluded[1]) / np.maximum(total - excluded[0], 1)])
 
 
 def _differ(first: Any, second: Any, counts: Int64, from_one_place: Float64 | None = None) -> Mask:

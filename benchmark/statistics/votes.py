@@ -137,7 +137,7 @@ class KeptDepth:
         from semstab.statistics.loops.moving import STEP, vote
 
         votes = np.empty(len(point), np.uint8)
-        gap, near_by = (math.ceil(math.log1p(each(sigma)) / STEP) for each in (gap_of, near_by_of))
+        gap, near_by = (math.ceil(math.log1p(limit_of(sigma)) / STEP) for limit_of in (gap_of, near_by_of))
         place = self.T_wc, self.camera, self.around, self.stride
         vote(point, *place, self.near, self.far, self.margin, gap, near_by, votes)
         return votes
@@ -159,7 +159,7 @@ class DepthMemory:
         self.kept.append(depth)
         while len(self.kept) > MOST_KEPT:
             self._step *= 2
-            self.kept = [each for each in self.kept if each.view % self._step == 0]
+            self.kept = [view_depth for view_depth in self.kept if view_depth.view % self._step == 0]
 
     def votes_on(self, point: Float64, found: npt.NDArray[np.int32], firm: Mask, views: int, sigma: float) -> SpotVotes:
         """Return what the kept views say of spots.
@@ -174,15 +174,15 @@ class DepthMemory:
         from semstab.statistics.loops.moving import tally
 
         votes = np.zeros((len(self.kept), len(point)), np.uint8)
-        for own, each in zip(votes, self.kept, strict=True):
-            own[firm] = each.votes(point[firm], sigma)
-        kept = np.array([each.view for each in self.kept], np.int64)
-        fits, shares = _fitting(votes, kept, found, views)
+        for view_votes, depth in zip(votes, self.kept, strict=True):
+            view_votes[firm] = depth.votes(point[firm], sigma)
+        depth_views = np.array([depth.view for depth in self.kept], np.int64)
+        fits, shares = _fitting(votes, depth_views, found, views)
         counts, between = np.zeros((len(point), 3), np.uint16), np.zeros(2, np.int64)
-        tally(votes, fits[kept], counts, between)
+        tally(votes, fits[depth_views], counts, between)
         counts[~fits[found]] = 0
-        seen, hidden, through = counts.T.copy()
-        return SpotVotes(seen, hidden, through, shares, ~fits, between, gap_of(sigma))
+        num_seen, hidden, through = counts.T.copy()
+        return SpotVotes(num_seen, hidden, through, shares, ~fits, between, gap_of(sigma))
 
     def moving_pixels(self, frame: Frame, sigma: float, misplaced: Mask, *, sparse: bool = False) -> Mask:
         """Return the pixels (H, W) of a frame whose surface moved: the kept views, but for misplaced ones, tell.
@@ -195,23 +195,23 @@ class DepthMemory:
         step = 1 if sparse else max(1, round(math.sqrt(frame.depth.size / BLOCKS)))
         depth = frame.depth[step // 2 :: step, step // 2 :: step].astype(np.float64)
         valid, K = (depth > 0) & (depth < np.inf), frame.intrinsics
-        row, column = (step // 2 + step * each for each in np.nonzero(valid))
+        row, column = (step // 2 + step * indices for indices in np.nonzero(valid))
         z = depth[valid]
         rays = np.stack([(column - K.cx) / K.fx, (row - K.cy) / K.fy, np.ones(len(z))], axis=1)
         point = (rays * z[:, None]) @ frame.T_wc[:3, :3].T + frame.T_wc[:3, 3]
-        seen, through = np.zeros((2, len(z)), np.int64)
-        for each in self.kept:
-            if not misplaced[each.view]:
-                own = each.votes(point, sigma) & 3
-                seen += own == SEEN
-                through += own == THROUGH
+        num_seen, through = np.zeros((2, len(z)), np.int64)
+        for view_depth in self.kept:
+            if not misplaced[view_depth.view]:
+                kinds = view_depth.votes(point, sigma) & 3
+                num_seen += kinds == SEEN
+                through += kinds == THROUGH
         moves = np.zeros(depth.shape, np.bool_)
-        moves[valid] = has_moved(through, seen + through)
+        moves[valid] = has_moved(through, num_seen + through)
         small = _grown(moves, np.where(valid, depth, np.nan), gap_of(sigma))
-        whole = small.repeat(step, axis=0).repeat(step, axis=1)
-        bottom, right = (max(0, n - m) for n, m in zip(frame.depth.shape, whole.shape, strict=True))
-        whole = np.pad(whole, ((0, bottom), (0, right)), mode="edge")
-        return np.asarray(whole[: frame.depth.shape[0], : frame.depth.shape[1]], np.bool_)
+        mask = small.repeat(step, axis=0).repeat(step, axis=1)
+        bottom, right = (max(0, n - m) for n, m in zip(frame.depth.shape, mask.shape, strict=True))
+        mask = np.pad(mask, ((0, bottom), (0, right)), mode="edge")
+        return np.asarray(mask[: frame.depth.shape[0], : frame.depth.shape[1]], np.bool_)
 
 
 def _grown(moves: Mask, depth: Float64, gap: float) -> Mask:
@@ -285,8 +285,8 @@ class SpotVotes:
         misplaced = np.zeros(len(shares), np.bool_)
         misplaced[np.array(of_views["misplaced"], np.int64)] = True
         between = np.array(of_views["between"], np.int64).reshape(2)
-        seen, hidden, through = (columns[name].astype(np.uint16) for name in OF_SPOTS)
-        return cls(seen, hidden, through, shares, misplaced, between, float(of_views["gap"]))
+        num_seen, hidden, through = (columns[name].astype(np.uint16) for name in OF_SPOTS)
+        return cls(num_seen, hidden, through, shares, misplaced, between, float(of_views["gap"]))
 
     @property
     def votes(self) -> Int64:
@@ -349,7 +349,7 @@ def firm(
 
 
 def _fitting(
-    votes: npt.NDArray[np.uint8], kept: Int64, found: npt.NDArray[np.int32], views: int
+    votes: npt.NDArray[np.uint8], depth_views: Int64, finding_view: npt.NDArray[np.int32], views: int
 ) -> tuple[Mask, Float64]:
     """Return which views (V,) fit the others, and the share (V,) of their spots that each sees through.
 
@@ -360,21 +360,21 @@ def _fitting(
     from semstab.statistics.loops.moving import HIDDEN, SEEN, SIDES, THROUGH
 
     parts, (trusted, against) = SIDES * SIDES, _trusted(votes)
-    seen, through = np.zeros((2, votes.shape[1]), np.int32)
-    for own in votes[trusted]:
-        seen += own & 3 == SEEN
-        through += own & 3 == THROUGH
-    usual = (seen >= np.maximum(through, LEAST_VOTES)) & np.isin(found, kept[~trusted], invert=True)
-    counts = np.zeros((len(kept), parts, 4), np.int64)
-    for k, own in enumerate(votes):
-        others = own[usual & (found != kept[k])]
-        counts[k] = np.bincount(others, minlength=4 * parts).reshape(parts, 4)
+    num_seen, through = np.zeros((2, votes.shape[1]), np.int32)
+    for view_votes in votes[trusted]:
+        num_seen += view_votes & 3 == SEEN
+        through += view_votes & 3 == THROUGH
+    usual = (num_seen >= np.maximum(through, LEAST_VOTES)) & np.isin(finding_view, depth_views[~trusted], invert=True)
+    counts = np.zeros((len(depth_views), parts, 4), np.int64)
+    for k, view_votes in enumerate(votes):
+        votes_on_others = view_votes[usual & (finding_view != depth_views[k])]
+        counts[k] = np.bincount(votes_on_others, minlength=4 * parts).reshape(parts, 4)
     away, seen_there = counts[..., THROUGH], counts[..., SEEN]
     shares, fits = np.full(views, np.nan), np.ones(views, np.bool_)
     with np.errstate(invalid="ignore"):
-        shares[kept] = np.fmax(away.sum(axis=1) / (away + seen_there).sum(axis=1), against)
+        shares[depth_views] = np.fmax(away.sum(axis=1) / (away + seen_there).sum(axis=1), against)
     spread = _is_spread(away + counts[..., HIDDEN], counts[..., 1:].sum(axis=2))
-    fits[kept] = trusted | ~(spread & (shares[kept] > MISPLACED))
+    fits[depth_views] = trusted | ~(spread & (shares[depth_views] > MISPLACED))
     return fits, shares
 
 
@@ -385,34 +385,34 @@ def _trusted(votes: npt.NDArray[np.uint8]) -> tuple[Mask, Float64]:
     """
     from scipy.sparse.csgraph import connected_components
 
-    away, told = _of_pairs(votes)
-    enough = told >= MANY
-    contradicts = enough & (away > CONTRADICTS * told)
+    away, num_decided = _of_pairs(votes)
+    enough = num_decided >= MANY
+    contradicts = enough & (away > CONTRADICTS * num_decided)
     _, group = connected_components(enough & ~contradicts, directed=False)
     trusted = np.zeros(len(votes), np.bool_)
-    for each in np.argsort(-np.bincount(group, minlength=1), kind="stable"):
-        own = group == each
-        against = contradicts[own][:, trusted]
-        if 2 * np.count_nonzero(against) <= np.count_nonzero(enough[own][:, trusted]):
-            trusted |= own
+    for number in np.argsort(-np.bincount(group, minlength=1), kind="stable"):
+        members = group == number
+        against = contradicts[members][:, trusted]
+        if 2 * np.count_nonzero(against) <= np.count_nonzero(enough[members][:, trusted]):
+            trusted |= members
     with np.errstate(invalid="ignore"):
-        return trusted, away[:, trusted].sum(axis=1) / told[:, trusted].sum(axis=1)
+        return trusted, away[:, trusted].sum(axis=1) / num_decided[:, trusted].sum(axis=1)
 
 
 def _of_pairs(votes: npt.NDArray[np.uint8]) -> tuple[Int64, Int64]:
     """Return of how many spots, of some, that one of two views sees the other sees through (k, k), and tells at all."""
     from semstab.statistics.loops.moving import SEEN, THROUGH
 
-    some = votes[:, :: max(1, votes.shape[1] // MOST_OF_PAIRS)] & 3
-    seen, through = ((some == kind).astype(np.float32) for kind in (SEEN, THROUGH))
-    away = through @ seen.T
+    sample = votes[:, :: max(1, votes.shape[1] // MOST_OF_PAIRS)] & 3
+    is_seen, through = ((sample == kind).astype(np.float32) for kind in (SEEN, THROUGH))
+    away = through @ is_seen.T
     away += away.T
-    return away.astype(np.int64), (away + 2 * (seen @ seen.T)).astype(np.int64)
+    return away.astype(np.int64), (away + 2 * (is_seen @ is_seen.T)).astype(np.int64)
 
 
-def _is_spread(other: Int64, told: Int64) -> Mask:
+def _is_spread(other: Int64, num_decided: Int64) -> Mask:
     """Return which views (n,) show another surface than that of the spots in a third of the image, by counts (n, p)."""
-    total = told.sum(axis=1)
-    counts = told >= np.maximum(MANY, total[:, None]) / (10 * other.shape[1])
-    spread = (other > SPREAD * told) & counts
+    total = num_decided.sum(axis=1)
+    counts = num_decided >= np.maximum(MANY, total[:, None]) / (10 * other.shape[1])
+    spread = (other > SPREAD * num_decided) & counts
     return np.asarray((total >= MANY) & (3 * spread.sum(axis=1) >= counts.sum(axis=1)), np.bool_)

@@ -123,7 +123,7 @@ def compare_visits(
     """
     handles = open_runs([first, second])
     alignment = None if align is None else Alignment.read(Path(align))
-    visits, scenes, seen = [], list[VisitedScene](), dict[str, Visited]()
+    visits, scenes, visited_by_scene = [], list[VisitedScene](), dict[str, Visited]()
     for handle in handles:
         if handle.source is None or not handle.source.is_dir():
             raise ConfigError(f"{handle.where}: two visits are read again frame by frame; give the folder of a run")
@@ -132,25 +132,25 @@ def compare_visits(
         progress(names[0])
         scene, visited = _scene(handles, names, alignment, code)
         scenes.append(scene)
-        seen[scene.scene] = visited
+        visited_by_scene[scene.scene] = visited
     fitted = (None, 0) if alignment is None else (alignment.residual, alignment.points)
     comparison = VisitComparison((visits[0], visits[1]), tuple(scenes), *fitted)
     if out is not None:
         from semstab.two_visits.written import write
 
         with only_writer(Path(out) / "visits"):
-            write(comparison, seen, Path(out))
+            write(comparison, visited_by_scene, Path(out))
     return comparison
 
 
 def _scenes(handles: Sequence[RunHandle]) -> list[tuple[str, str]]:
     """Return the scenes of the same name, or the only one of each run."""
     names = [list(handle.scenes) for handle in handles]
-    if all(len(own) == 1 for own in names):
+    if all(len(scene_names) == 1 for scene_names in names):
         return [(names[0][0], names[1][0])]
     if common := [name for name in names[0] if name in names[1]]:
         return [(name, name) for name in common]
-    listed = " and ".join(", ".join(own) for own in names)
+    listed = " and ".join(", ".join(scene_names) for scene_names in names)
     raise ConfigError(f"{handles[0].where} and {handles[1].where} have no scene in common: {listed}")
 
 
@@ -205,4 +205,4 @@ def _asked(tasks: Sequence[tuple[Task, int]], to_first: Float64, handles: Sequen
 
 def _frames(task: Task, pixel_stride: int) -> Iterator[Frame]:
     """Yield the frames of a visit as they were fused."""
-    return (each.item for each in prefetch(lambda index: read(task, index, pixel_stride), task.indices))
+    return (result.item for result in prefetch(lambda index: read(task, index, pixel_stride), task.indices))

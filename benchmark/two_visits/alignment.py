@@ -93,7 +93,7 @@ def between(
     if first is None and second is None:
         return np.eye(4)
     if first is None or second is None or first.crs != second.crs:
-        names = " and ".join("none" if own is None else own.name for own in (first, second))
+        names = " and ".join("none" if georeference is None else georeference.name for georeference in (first, second))
         raise ConfigError(
             f"{where}: the georeferences of the visits differ ({names}); give points that both know: --align"
         )

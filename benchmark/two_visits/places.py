@@ -46,7 +46,7 @@ def changed_places(visited: VisitedSpots, georeference: Georeference | None) -> 
     """Return the places, the most spots first, in the coordinates of the exports."""
     spots, (before, after) = visited.spots, visited.dominant
     names = (*(spots.classes or tuple(str(k) for k in range(spots.K))), "")
-    found = []
+    places = []
     for change, rows, pair in (
         ("gone", visited.change == GONE, (before, np.full_like(after, -1))),
         ("new", visited.change == NEW, (np.full_like(before, -1), after)),
@@ -57,9 +57,9 @@ def changed_places(visited: VisitedSpots, georeference: Georeference | None) -> 
             size = float(np.linalg.norm(np.ptp(point, axis=0)))
             centre = point.mean(axis=0, keepdims=True)
             x, y, z = (centre if georeference is None else georeference.projected(centre))[0].tolist()
-            found.append((change, names[pair[0][at[0]]], names[pair[1][at[0]]], len(at), (x, y, z), size))
-    found.sort(key=lambda own: -own[3])
-    return tuple(ChangedPlace(number, *own) for number, own in enumerate(found[:MOST], 1))
+            places.append((change, names[pair[0][at[0]]], names[pair[1][at[0]]], len(at), (x, y, z), size))
+    places.sort(key=lambda place: -place[3])
+    return tuple(ChangedPlace(number, *place) for number, place in enumerate(places[:MOST], 1))
 
 
 def _together(visited: VisitedSpots, where: Mask, pair: tuple[Int64, Int64]) -> list[Int64]:
@@ -72,10 +72,10 @@ def _together(visited: VisitedSpots, where: Mask, pair: tuple[Int64, Int64]) -> 
     if not len(rows):
         return []
     pairs = cKDTree(visited.spots.point[rows]).query_pairs(REACH * visited.spots.spacing, output_type="ndarray")
-    kinds = np.stack([own[rows] for own in pair], axis=1)
+    kinds = np.stack([label[rows] for label in pair], axis=1)
     pairs = pairs[(kinds[pairs[:, 0]] == kinds[pairs[:, 1]]).all(axis=1)]
     links = csr_array((np.ones(len(pairs)), (pairs[:, 0], pairs[:, 1])), shape=(len(rows), len(rows)))
     _, group = connected_components(links, directed=False)
     order = np.argsort(group, kind="stable")
     groups = np.split(rows[order], np.cumsum(np.bincount(group))[:-1])
-    return [own for own in groups if len(own) >= LEAST]
+    return [members for members in groups if len(members) >= LEAST]

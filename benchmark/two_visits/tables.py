@@ -55,7 +55,7 @@ def _alphas(comparison: VisitComparison) -> Table:
     rows = list[Row]()
     for scene in comparison.scenes:
         alpha = scene.visits.alpha
-        parts = (own.ends for own in (alpha.first, alpha.second, alpha.across, alpha.cost))
+        parts = (interval.ends for interval in (alpha.first, alpha.second, alpha.across, alpha.cost))
         rows.append((scene.scene, scene.visits.spots, *parts))
     return Table("visits", "Agreement within and across", ALPHAS, columns, (Group("", tuple(rows)),), "")
 
@@ -67,9 +67,9 @@ def _changes(comparison: VisitComparison) -> Table:
         Column("relabelled_percent", "Other class %", 1), Column("by_chance_percent", "By chance %", 1),
     )  # fmt: skip
     rows = tuple(
-        (scene.scene, own.stayed, own.gone, own.new, own.moved, own.unknown, 100 * own.relabelled, 100 * own.by_chance)
+        (scene.scene, row.stayed, row.gone, row.new, row.moved, row.unknown, 100 * row.relabelled, 100 * row.by_chance)
         for scene in comparison.scenes
-        for own in [scene.visits]
+        for row in [scene.visits]
     )
     caption = (
         "Spots by their surface: there in both visits, gone in the second one, new in it, moved within a visit, or not"
@@ -90,9 +90,9 @@ def _classes(comparison: VisitComparison) -> Table:
         Group(
             scene.scene,
             tuple(
-                (own.name, own.spots, own.alpha.first.ends, own.alpha.second.ends, own.alpha.across.ends,
-                 own.alpha.cost.ends, 100 * own.gone, 100 * own.new, 100 * own.relabelled, own.becomes)
-                for own in scene.visits.classes
+                (row.name, row.spots, row.alpha.first.ends, row.alpha.second.ends, row.alpha.across.ends,
+                 row.alpha.cost.ends, 100 * row.gone, 100 * row.new, 100 * row.relabelled, row.becomes)
+                for row in scene.visits.classes
             ),
         )
         for scene in comparison.scenes
@@ -114,8 +114,8 @@ def _places(comparison: VisitComparison) -> Table:
         Group(
             scene.scene,
             tuple(
-                (str(own.number), own.change, own.before, own.after, own.spots, *own.centre, own.size)
-                for own in scene.places
+                (str(place.number), place.change, place.before, place.after, place.spots, *place.centre, place.size)
+                for place in scene.places
             ),
         )
         for scene in comparison.scenes
@@ -136,26 +136,26 @@ def sentences(comparison: VisitComparison) -> list[str]:
 
 
 def _of_scene(comparison: VisitComparison, scene: VisitedScene) -> Iterator[str]:
-    (first, second), own = _names(comparison), scene.visits
-    if not own.spots:
+    (first, second), visits = _names(comparison), scene.visits
+    if not visits.spots:
         yield (
             f"{scene.scene}: no spot that both visits label; are their frames of reference the same? Give points that"
             " both know: --align"
         )
         return
-    alpha = own.alpha
-    where = f"at {own.spots:,} spots that did not change"
+    alpha = visits.alpha
+    where = f"at {visits.spots:,} spots that did not change"
     yield (
         f"{scene.scene}: alpha within {first} {alpha.first.text()}, within {second} {alpha.second.text()}, across"
         f" {alpha.across.text()}, {where}."
     )
-    yield f"{_cost(own)}."
-    yield f"{_surface(own)}."
-    yield f"{_labels(own)}."
+    yield f"{_cost(visits)}."
+    yield f"{_surface(visits)}."
+    yield f"{_labels(visits)}."
 
 
-def _cost(own: TwoVisits) -> str:
-    cost = own.alpha.cost
+def _cost(visits: TwoVisits) -> str:
+    cost = visits.alpha.cost
     if cost.high < 0:
         return f"Views agree better across the visits than within: a cost of {cost.text()} of alpha, for {cost.scope}"
     if cost.low > 0:
@@ -163,24 +163,25 @@ def _cost(own: TwoVisits) -> str:
     return f"No cost of the other visit is shown: {cost.text()} of alpha, for {cost.scope}"
 
 
-def _surface(own: TwoVisits) -> str:
-    told = own.stayed + own.gone + own.new
-    if not told:
+def _surface(visits: TwoVisits) -> str:
+    num_decided = visits.stayed + visits.gone + visits.new
+    if not num_decided:
         return "Whether the surface changed is not told: no spot is seen twice by both visits"
-    all_spots = told + own.moved + own.unknown
+    all_spots = num_decided + visits.moved + visits.unknown
     return (
-        f"Surface: {own.gone / told:.1%} gone and {own.new / told:.1%} new of {told:,} spots that both visits tell;"
-        f" {own.moved / all_spots:.1%} of all spots moved within a visit, {own.unknown / all_spots:.0%} are not told"
+        f"Surface: {visits.gone / num_decided:.1%} gone and {visits.new / num_decided:.1%} new of {num_decided:,} spots"
+        f" that both visits tell; {visits.moved / all_spots:.1%} of all spots moved within a visit,"
+        f" {visits.unknown / all_spots:.0%} are not told"
     )
 
 
-def _labels(own: TwoVisits) -> str:
-    text = f"Labels: {own.relabelled:.1%} of the spots that did not change have another class"
-    text += f" ({own.by_chance:.1%} would by chance)"
-    changed = (each for each in own.classes if each.relabelled >= LEAST_NAMED)
-    worst = sorted(changed, key=lambda each: -each.relabelled * each.spots)
-    named = [f"{each.relabelled:.0%} of {each.name}, to {each.becomes}" for each in worst[:MOST_NAMED]]
-    return f"{text}: {'; '.join(named)}" if named else text
+def _labels(visits: TwoVisits) -> str:
+    text = f"Labels: {visits.relabelled:.1%} of the spots that did not change have another class"
+    text += f" ({visits.by_chance:.1%} would by chance)"
+    changed = (row for row in visits.classes if row.relabelled >= LEAST_NAMED)
+    worst = sorted(changed, key=lambda row: -row.relabelled * row.spots)
+    descriptions = [f"{row.relabelled:.0%} of {row.name}, to {row.becomes}" for row in worst[:MOST_NAMED]]
+    return f"{text}: {'; '.join(descriptions)}" if descriptions else text
 
 
 def notes(comparison: VisitComparison) -> Iterator[str]:
@@ -191,14 +192,14 @@ def notes(comparison: VisitComparison) -> Iterator[str]:
             f" {comparison.residual:.3g} m are left (root mean square)"
         )
     for scene in comparison.scenes:
-        own = scene.visits
-        total = own.stayed + own.gone + own.new + own.moved + own.unknown
-        if total and own.spots < FEW * total:
+        visits = scene.visits
+        total = visits.stayed + visits.gone + visits.new + visits.moved + visits.unknown
+        if total and visits.spots < FEW * total:
             yield (
-                f"{scene.scene}: only {own.spots / total:.1%} of the spots are labelled twice by both visits: are their"
-                " frames of reference the same?"
+                f"{scene.scene}: only {visits.spots / total:.1%} of the spots are labelled twice by both visits: are"
+                " their frames of reference the same?"
             )
-        for visit, count in zip(comparison.visits, own.misplaced, strict=True):
+        for visit, count in zip(comparison.visits, visits.misplaced, strict=True):
             if count:
                 yield f"{scene.scene}: poses of {count} frames of {visit.name} do not fit (semstab-bench check)"
 

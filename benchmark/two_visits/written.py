@@ -50,20 +50,22 @@ TOPICS = (
 
 def write(comparison: VisitComparison, seen: Mapping[str, Visited], out: Path) -> None:
     """Write visits.json, tables, the map of each scene, and report.html."""
-    made, drawn = tables(comparison), pictures(comparison, seen)
+    made, figures = tables(comparison), pictures(comparison, seen)
     write_json(out / CONTENT, comparison)
     save_tables(made, out)
-    keep_only([path for figure in drawn for path in figure.save(out / FIGURES)], out / FIGURES)
-    write_text(out / REPORT, page(comparison, made, drawn, out))
+    keep_only([path for figure in figures for path in figure.save(out / FIGURES)], out / FIGURES)
+    write_text(out / REPORT, page(comparison, made, figures, out))
 
 
 def page(comparison: VisitComparison, made: Sequence[Table], drawn: Sequence[Figure], out: Path) -> str:
     """Return report.html."""
     topics = []
     for key, title, names in TOPICS:
-        own = [table for table in made if table.name in names]
-        shown = [figure for figure in drawn if figure.name.partition("__")[0] in names]
-        topics.append({"id": key, "title": title, "charts": [], "blocks": list(blocks(own, shown, out))})
+        topic_tables = [table for table in made if table.name in names]
+        topic_figures = [figure for figure in drawn if figure.name.partition("__")[0] in names]
+        topics.append(
+            {"id": key, "title": title, "charts": [], "blocks": list(blocks(topic_tables, topic_figures, out))}
+        )
     return filled(
         "comparison.html.j2",
         title=" and ".join(visit.name for visit in comparison.visits),
@@ -107,8 +109,8 @@ def draw(seen: Visited, places: Sequence[ChangedPlace]) -> Canvas:
     asked = np.flatnonzero(visited.counts.sum(axis=0) > 0)
     size = COARSER * visited.spots.spacing * math.sqrt((1 << 32) / visited.spots.share)
     point, kind = visited.spots.point[asked], kinds(visited)[asked]
-    shown, axis, view = best_view_of(point, size, seen.up)
-    point, kind = point[shown], kind[shown]
+    visible, axis, view = best_view_of(point, size, seen.up)
+    point, kind = point[visible], kind[visible]
     rows, cell, corner = top_down(point, size, axis, RANK[kind])
     figure, (panel,) = map_panels(rows, 1)
     draw_kinds(figure, panel, rows, kind, COLORS, KINDS)

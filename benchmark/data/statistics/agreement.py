@@ -97,8 +97,10 @@ class Meaning:
     @property
     def text(self) -> str:
         """'by meaning: alpha .91 (.90 to .92); 63 % of the disagreement is between near classes'."""
-        told = "" if math.isnan(self.near) else f"; {100 * self.near:.0f} % of the disagreement is between near classes"
-        return f"by meaning: alpha {self.alpha.text()}{told}"
+        near_text = (
+            "" if math.isnan(self.near) else f"; {100 * self.near:.0f} % of the disagreement is between near classes"
+        )
+        return f"by meaning: alpha {self.alpha.text()}{near_text}"
 
 
 @dataclass(frozen=True)
@@ -161,8 +163,8 @@ class RangeAgreement:
 
         Where neither is known, or the interval is all that was seen, the verdict alone is printed.
         """
-        known = self.low > 0 or self.high < self.farthest
-        return known and self.low < self.farthest and (self.reliable > 0 or self.high == 0)
+        is_bounded = self.low > 0 or self.high < self.farthest
+        return is_bounded and self.low < self.farthest and (self.reliable > 0 or self.high == 0)
 
     @property
     def text(self) -> str:
@@ -274,8 +276,8 @@ class SpotAgreement:
     @property
     def critical_classes(self) -> tuple[ClassAlpha, ...]:
         """The classes that count for the verdict, those most probably unstable first."""
-        known = [row for row in self.classes if row.counts_for_verdict and not math.isnan(row.unstable)]
-        return tuple(sorted(known, key=lambda row: (-row.unstable, row.alpha.value)))
+        critical = [row for row in self.classes if row.counts_for_verdict and not math.isnan(row.unstable)]
+        return tuple(sorted(critical, key=lambda row: (-row.unstable, row.alpha.value)))
 
 
 @dataclass(frozen=True)

@@ -113,15 +113,15 @@ def poses_that_do_not_fit(misplaced: Sequence[MisplacedFrame]) -> str:
     if not misplaced:
         return ""
     runs: list[list[MisplacedFrame]] = []
-    for each in sorted(misplaced, key=lambda own: own.frame):
-        if runs and each.frame == runs[-1][-1].frame + 1:
-            runs[-1].append(each)
+    for misfit in sorted(misplaced, key=lambda pose: pose.frame):
+        if runs and misfit.frame == runs[-1][-1].frame + 1:
+            runs[-1].append(misfit)
         else:
-            runs.append([each])
-    named = [run[0].name if len(run) == 1 else f"{run[0].name} to {run[-1].name}" for run in runs]
-    more = f" and {len(named) - MOST_RUNS} more" if len(named) > MOST_RUNS else ""
-    share = sum(each.through for each in misplaced) / len(misplaced)
-    listed = f"{', '.join(named[:MOST_RUNS])}{more}"
+            runs.append([misfit])
+    run_names = [run[0].name if len(run) == 1 else f"{run[0].name} to {run[-1].name}" for run in runs]
+    more = f" and {len(run_names) - MOST_RUNS} more" if len(run_names) > MOST_RUNS else ""
+    share = sum(misfit.through for misfit in misplaced) / len(misplaced)
+    listed = f"{', '.join(run_names[:MOST_RUNS])}{more}"
     if len(misplaced) == 1:
         return f"the pose of frame {listed} does not fit: {100 * share:.0f} % of its spots are seen through"
     return f"poses of frames {listed} do not fit: {100 * share:.0f} % of their spots are seen through"

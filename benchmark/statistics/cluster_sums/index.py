@@ -48,9 +48,9 @@ class ClusterIndex:
         cubes, row = distinct_rows(cell)
         if frame is None:
             return cls(cubes, row, np.array([-1]), np.arange(len(row)), np.zeros(len(row), np.int64), edge, 0)
-        known = np.flatnonzero((frame >= 0) | (per_group == 0))
-        frames, column = np.unique(frame[known].astype(np.int64), return_inverse=True)
-        return cls(cubes, row, frames, known, column, edge, per_group)
+        rows_with_frame = np.flatnonzero((frame >= 0) | (per_group == 0))
+        frames, column = np.unique(frame[rows_with_frame].astype(np.int64), return_inverse=True)
+        return cls(cubes, row, frames, rows_with_frame, column, edge, per_group)
 
     def by_cube(self, values: Float64) -> Float64:
         """Return the sums (G,) of values (m,)."""

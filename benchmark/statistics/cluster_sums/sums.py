@@ -66,7 +66,7 @@ class ClusterSums:
     def of_cubes(cls, cell: npt.NDArray[np.integer], edge: float, sums: Mapping[str, Float64]) -> ClusterSums:
         """Return sums (G, C) by name over the voxels of each cube (G, 3), whose frames are not told apart."""
         columns = np.concatenate([*sums.values()], axis=1)
-        slices = side_by_side({name: each.shape[1] for name, each in sums.items()})
+        slices = side_by_side({name: column.shape[1] for name, column in sums.items()})
         return cls(cell.astype(np.int32), np.full(len(cell), -1, np.int32), columns, slices, edge)
 
     @classmethod
@@ -77,10 +77,10 @@ class ClusterSums:
         cell, frame, columns = (
             np.concatenate([getattr(part, name) for part in parts]) for name in ("cell", "frame", "columns")
         )
-        whole = dataclasses.replace(parts[0], cell=cell, frame=frame, columns=columns)
-        while len(distinct_rows(whole.cell // round(edge / whole.edge))[0]) > MOST_CELLS:
+        merged = dataclasses.replace(parts[0], cell=cell, frame=frame, columns=columns)
+        while len(distinct_rows(merged.cell // round(edge / merged.edge))[0]) > MOST_CELLS:
             edge *= 2
-        return whole.coarsened(edge, 0)
+        return merged.coarsened(edge, 0)
 
     def __getitem__(self, name: str) -> Float64:
         """Return sums (m, 1), or (m, K) by class, of that name."""
@@ -134,8 +134,8 @@ class ClusterSums:
     def map_coarsened(self, edge: float, step: int) -> ClusterSums:
         """Return the sums of the map in larger cubes or groups of frames, with the sums of spots unchanged."""
         cell = _joined(self.cell, edge / self.edge)
-        known = step and self.step
-        frame = _joined(self.frame, step // self.step) if known else np.full(len(cell), -1)
+        has_frames = step and self.step
+        frame = _joined(self.frame, step // self.step) if has_frames else np.full(len(cell), -1)
         key = np.concatenate([cell, frame[:, None]], axis=1)
         rows, of = distinct_rows(key)
         columns = np.zeros((len(rows), self.columns.shape[1]))
@@ -146,7 +146,7 @@ class ClusterSums:
             frame=rows[:, 3].astype(np.int32),
             columns=columns,
             edge=edge,
-            step=step if known else 0,
+            step=step if has_frames else 0,
         )
 
     def without_truth(self) -> ClusterSums:
@@ -200,7 +200,7 @@ class ClusterSums:
             if len(names) < meta.K:
                 raise DataError(f"{len(names) - len(KEYS)} columns of sums for {meta.K} classes")
             stored = dict(zip(names, content.columns, strict=True))
-            measured = tuple(each.key for each in measures() if stored.keys() >= {*of_measure(each.key)})
+            measured = tuple(measure.key for measure in measures() if stored.keys() >= {*of_measure(measure.key)})
             of_map = layout(meta.K, truth=meta.truth, measured=measured)
             of_answers = layout(meta.K, truth=False, meaning="similar" in stored)
             numbers = {
@@ -224,8 +224,8 @@ class ClusterSums:
                         columns[:, k] = numbers[name][rows]
                 where = cell.astype(np.int32), frame.astype(np.int32), columns
                 parts.append(cls(*where, its_layout, edge, step, voxel_size, meta.classes, fused))
-        whole, *answers = parts
-        return dataclasses.replace(whole, answers=tuple(answers))
+        map_sums, *answers = parts
+        return dataclasses.replace(map_sums, answers=tuple(answers))
 
 
 KEYS = ("part", "ix", "iy", "iz", "frame")
@@ -252,7 +252,7 @@ class SumsMeta:
     fused: tuple[int, ...]
 
     def __post_init__(self) -> None:
-        parts = {len(each) for each in (self.edge, self.step, self.voxel_size, self.fused)}
+        parts = {len(values) for values in (self.edge, self.step, self.voxel_size, self.fused)}
         if not (parts <= {1} or parts <= {1 + ANSWERS}):
             raise DataError(f"sums of other parts than a map, and {ANSWERS} answers of spots")
         sizes = all(0 < size < math.inf for size in self.voxel_size)
@@ -293,4 +293,6 @@ def aligned(*parts: ClusterSums) -> tuple[ClusterSums, ...]:
     if not all(part.answers for part in same):
         return tuple(same)
     answers = zip(*(aligned(*of_all) for of_all in zip(*(part.answers for part in same), strict=True)), strict=True)
-    return tuple(dataclasses.replace(part, answers=own) for part, own in zip(same, answers, strict=True))
+    return tuple(
+        dataclasses.replace(part, answers=part_answers) for part, part_answers in zip(same, answers, strict=True)
+    )

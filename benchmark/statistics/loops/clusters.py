@@ -11,12 +11,12 @@ TIE = 1e-12
 
 
 @serial
-def _observations(log, first, T, number, active, x, total, squares, own):
+def _observations(log, first, T, number, active, x, total, squares, squared_norms):
     """Write a voxel's observations by the classes that it ever saw, and return the number of these classes.
 
     log is (starts, label, weight) of all observations. x (T * A,) takes the evidence by observation and class, active
-    (A,) the classes, ascending, total and squares (A,) the sums of evidence and of its squares, own (T,) those of each
-    observation's squares; number (K,) is work space, all -1.
+    (A,) the classes, ascending, total and squares (A,) the sums of evidence and of its squares, squared_norms (T,)
+    those of each observation's squares; number (K,) is work space, all -1.
     """
     at, label, weight = log
     A = 0
@@ -33,13 +33,13 @@ def _observations(log, first, T, number, active, x, total, squares, own):
         number[active[j]], total[j], squares[j] = j, 0.0, 0.0
     x[: T * A] = 0.0
     for t in range(T):
-        own[t] = 0.0
+        squared_norms[t] = 0.0
         for e in range(at[first + t], at[first + t + 1]):
             j, square = number[label[e]], weight[e] ** 2
             x[t * A + j] = weight[e]
             total[j] += weight[e]
             squares[j] += square
-            own[t] += square
+            squared_norms[t] += square
     for j in range(A):
         number[active[j]] = -1
     return A
@@ -93,11 +93,11 @@ def _add_truth(sums, base, x, first, T, group, truth, likely, total, active, A, 
     share = part
     for t in range(T):
         r = base + group[first + t]
-        own = right * share
+        right_share = right * share
         if not alike and true >= 0:
-            own = (right + (T - 1) * (mean[true] - (without[t] == true))) * share
+            right_share = (right + (T - 1) * (mean[true] - (without[t] == true))) * share
         sums[r, columns.known] += share
-        sums[r, columns.right] += own
+        sums[r, columns.right] += right_share
         sums[r, columns.observed] += 1.0
         if true >= 0:
             sums[r, columns.observed_right] += x[t * A + true]
@@ -106,7 +106,7 @@ def _add_truth(sums, base, x, first, T, group, truth, likely, total, active, A, 
             sums[r, columns.consistent_wrong] += likely * (1.0 - right) * share
         if columns.class_known >= 0:
             sums[r, columns.class_known + truth] += share
-            sums[r, columns.class_right + truth] += own
+            sums[r, columns.class_right + truth] += right_share
             if alike:
                 sums[r, columns.class_predicted + active[label]] += share
                 continue
@@ -144,13 +144,13 @@ def add_influences(chunk, order, bounds, rows, longest, log, K, group, fused, tr
     """
     starts, ends = rows
     x, number, active = np.empty(longest * K), np.full(K, -1), np.empty(K, np.int64)
-    total, squares, own, without = np.empty(K), np.empty(K), np.empty(longest), np.empty(longest, np.int64)
+    total, squares, squared_norms, without = np.empty(K), np.empty(K), np.empty(longest), np.empty(longest, np.int64)
     mean, surprise, apart, certain = np.empty(K), np.empty(K), np.empty(K), np.log(K)
     for cell in range(chunk, bounds.shape[0] - 1, CHUNKS):
         for at in range(bounds[cell], bounds[cell + 1]):
             i = order[at]
             first, T, consistent = starts[i], ends[i] - starts[i], likely[i] if likely.shape[0] else 0.0
-            A = _observations(log, first, T, number, active, x, total, squares, own)
+            A = _observations(log, first, T, number, active, x, total, squares, squared_norms)
             agreed, label = (
                 _agreement(total, squares, T, A, certain, surprise, apart),
                 _label(total, active, A, fused[i] if fused.shape[0] else -1),
@@ -166,16 +166,16 @@ def add_influences(chunk, order, bounds, rows, longest, log, K, group, fused, tr
                     sums[r, columns.evidence + k] += s
                     surprised += s * surprise[j]
                     if columns.class_apart >= 0:
-                        others = (total[j] - s) * of_others
-                        differs = s + others - 2.0 * s * others
+                        mean_of_others = (total[j] - s) * of_others
+                        differs = s + mean_of_others - 2.0 * s * mean_of_others
                         sums[r, columns.class_apart + k] += apart[j] + spread * (differs - apart[j])
                         sums[r, columns.class_own + k] += s**2
-                share = agreed + spread * ((with_others - own[t]) * of_others - agreed)
+                share = agreed + spread * ((with_others - squared_norms[t]) * of_others - agreed)
                 sums[r, columns.voxels] += part
                 sums[r, columns.psa] += share * part
                 sums[r, columns.observations] += 1.0
                 sums[r, columns.agreeing] += share
-                sums[r, columns.own] += own[t]
+                sums[r, columns.own] += squared_norms[t]
                 sums[r, columns.entropy] += surprised
                 if T == 2:
                     sums[r, columns.twice] += 1.0

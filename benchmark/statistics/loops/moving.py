@@ -176,13 +176,13 @@ def tally(votes, counted, counts, between):
     for i in range(votes.shape[1]):
         before, last = UNKNOWN, UNKNOWN
         for k in range(votes.shape[0]):
-            own = np.int64(votes[k, i] & 3)
-            if own == UNKNOWN or not counted[k]:
+            kind = np.int64(votes[k, i] & 3)
+            if kind == UNKNOWN or not counted[k]:
                 continue
-            counts[i, own - 1] += 1
-            if own == HIDDEN:
+            counts[i, kind - 1] += 1
+            if kind == HIDDEN:
                 continue
-            if before == SEEN and own == SEEN and last != UNKNOWN:
+            if before == SEEN and kind == SEEN and last != UNKNOWN:
                 between[0] += 1
                 between[1] += last == THROUGH
-            before, last = last, own
+            before, last = last, kind

@@ -46,16 +46,16 @@ def _drifts(x, A, T, drift):
     A step's drift is H(m) - (H(p) + H(q)) / 2 with the mean m of the beliefs p and q before and after: each belief but
     the first and last is one after, then one before.
     """
-    seen, q, m = np.empty(TURNS), np.empty(TURNS), np.empty(TURNS)
+    cumulative, q, m = np.empty(TURNS), np.empty(TURNS), np.empty(TURNS)
     drift[:] = 0.0
     for a in range(A):
-        seen[:] = 0.0
+        cumulative[:] = 0.0
         for t in range(T):
             before, after, weight = 1.0 / max(t, 1), 1.0 / (t + 1), 0.5 if t == 0 or t == T - 1 else 1.0
             for turn in range(TURNS):
-                p = seen[turn] * before
-                seen[turn] += x[a, (t + turn * T // TURNS) % T]
-                q[turn] = seen[turn] * after
+                p = cumulative[turn] * before
+                cumulative[turn] += x[a, (t + turn * T // TURNS) % T]
+                q[turn] = cumulative[turn] * after
                 m[turn] = 0.5 * (p + q[turn])
             _plogp_of_eight(q, 0)
             _plogp_of_eight(m, 0)
@@ -114,11 +114,11 @@ def mean_drifts(chunk, voxels, first, T, log, K, entries, seeds, null):
     for i in voxels:
         longest = max(longest, T[i])
     x, number, at = np.empty((max(1, min(K, entries)), longest)), np.full(K, -1), np.empty(longest, np.int64)
-    value, own = np.empty(TURNS), np.empty(1, np.uint64)
+    value, state = np.empty(TURNS), np.empty(1, np.uint64)
     for j in range(chunk, voxels.shape[0], CHUNKS):
         i = voxels[j]
-        own[0] = seeds[i]
-        _shuffle(at, T[i], own)
+        state[0] = seeds[i]
+        _shuffle(at, T[i], state)
         A = _dense(log, first[i], T[i], number, at, x)
         _drifts(x, A, T[i], value)
         null[i] = value.mean() / (T[i] - 1)
@@ -152,12 +152,12 @@ def expected_one_hot(chunk, n, T, log_factorial, drifts, out):
     with the hypergeometric probability C(n-1, c) C(T-n, t-c) / C(T-1, t).
     """
     for i in range(chunk, n.shape[0], CHUNKS):
-        others, rest = n[i] - 1, T[i] - n[i]
+        num_others, rest = n[i] - 1, T[i] - n[i]
         total = 0.0
         for t in range(1, T[i]):
             ways = log_factorial[T[i] - 1] - log_factorial[t] - log_factorial[T[i] - 1 - t]
-            for c in range(max(0, t - rest), min(others, t) + 1):
-                log_p = log_factorial[others] - log_factorial[c] - log_factorial[others - c] - ways
+            for c in range(max(0, t - rest), min(num_others, t) + 1):
+                log_p = log_factorial[num_others] - log_factorial[c] - log_factorial[num_others - c] - ways
                 log_p += log_factorial[rest] - log_factorial[t - c] - log_factorial[rest - t + c]
                 total += np.exp(log_p) * drifts[c, t]
         out[i] = n[i] / T[i] * total

@@ -30,12 +30,12 @@ def add_pairs(first, second, bins, cluster, log, square, sums):
     for pair in range(first.shape[0]):
         agreed = agreement(log, first[pair], second[pair])
         for one in (first[pair], second[pair]):
-            own, of = agreement(log, one, one), cluster[one]
+            squared_norm, of = agreement(log, one, one), cluster[one]
             for axis in range(bins.shape[1]):
                 k = bins[pair, axis]
                 sums[k, of, 0] += agreed
                 sums[k, of, 1] += 1.0
-                sums[k, of, 2] += own
+                sums[k, of, 2] += squared_norm
                 for e in range(starts[one], starts[one + 1]):
                     sums[k, of, 3 + label[e]] += weight[e]
                 sums[k, of, sums.shape[2] - 1] += square[one]
@@ -132,13 +132,13 @@ def add_similarity(bounds, log, cube, group, groups, products, columns, sums):
         alike /= T * (T - 1.0)
         spread = 2.0 * (T - 1.0) / (T - 2.0) if T > 2 else 0.0
         for one in range(first, end):
-            own, of_all = _with_itself(starts, label, weight, one, products), 0.0
+            squared_norm, of_all = _with_itself(starts, label, weight, one, products), 0.0
             for e in range(starts[one], starts[one + 1]):
                 for i in range(many):
                     of_all += weight[e] * total[met[i]] * products[label[e], met[i]]
             row = cube[spot] * groups + group[one]
-            sums[row, columns[0]] += alike + spread * ((of_all - own) / (T - 1.0) - alike)
-            sums[row, columns[1]] += own
+            sums[row, columns[0]] += alike + spread * ((of_all - squared_norm) / (T - 1.0) - alike)
+            sums[row, columns[1]] += squared_norm
             if T == 2:
                 sums[row, columns[2]] += alike
         for i in range(many):
@@ -148,8 +148,8 @@ def add_similarity(bounds, log, cube, group, groups, products, columns, sums):
 @serial
 def _with_itself(starts, label, weight, one, products):
     """Return the product of an observation's point with itself."""
-    own = 0.0
+    squared_norm = 0.0
     for a in range(starts[one], starts[one + 1]):
         for b in range(starts[one], starts[one + 1]):
-            own += weight[a] * weight[b] * products[label[a], label[b]]
-    return own
+            squared_norm += weight[a] * weight[b] * products[label[a], label[b]]
+    return squared_norm

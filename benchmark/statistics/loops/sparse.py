@@ -95,10 +95,10 @@ def surface(grid, u, v, w, x, y, reach, around):
     if not det > 1e-3 * (cxx + cyy) ** 2:
         return 0.0, 0.0, nearest, least, 0.0, 0.0
     along_x, along_y = (cyy * cxw - cxy * cyw) / det, (cxx * cyw - cxy * cxw) / det
-    left = max(cww - along_x * cxw - along_y * cyw, 0.0)
+    residual = max(cww - along_x * cxw - along_y * cyw, 0.0)
     there = (1.0 + mw - along_x * mx - along_y * my) * reference
     scale = reference / there if there > 0.0 else 0.0
-    return there, np.sqrt(left), nearest, least, along_x * scale, along_y * scale
+    return there, np.sqrt(residual), nearest, least, along_x * scale, along_y * scale
 
 
 @serial
@@ -109,17 +109,17 @@ def shown_by(grid, u, v, w, at, camera, around, reach, allowed):
     taken to face the sensor.
     """
     fx, fy, cx, cy = camera
-    there, left, _, _, along_x, along_y = surface(grid, u, v, w, u[at], v[at], reach, around)
-    if there == 0.0 or left > allowed:
+    there, residual, _, _, along_x, along_y = surface(grid, u, v, w, u[at], v[at], reach, around)
+    if there == 0.0 or residual > allowed:
         return 1.0 / (w[at] * w[at] * fx * fy), 0.0, 0.0, 0.0
     if around:
         narrow = max(np.cos(v[at] / fy - 0.5 * np.pi), 1e-3)
         normal = np.sqrt(1.0 + (along_x * fx / narrow) ** 2 + (along_y * fy) ** 2)
-        shown = min(normal, STEEPEST) * narrow / (w[at] * w[at] * fx * fy)
+        pixel_area = min(normal, STEEPEST) * narrow / (w[at] * w[at] * fx * fy)
     else:
         x, y = (u[at] - cx) / fx, (v[at] - cy) / fy
-        shown = area(w[at], along_x * w[at], along_y * w[at], x, y, fx, fy)
-    return shown, there, along_x, along_y
+        pixel_area = area(w[at], along_x * w[at], along_y * w[at], x, y, fx, fy)
+    return pixel_area, there, along_x, along_y
 
 
 @serial
@@ -128,8 +128,8 @@ def mean_area_of_points(grid, u, v, w, camera, around, reach, spacing, allowed, 
     total, count = 0.0, 0
     for at in range(0, len(w), step):
         if w[at] > 0.0:
-            shown, _, _, _ = shown_by(grid, u, v, w, at, camera, around, reach, allowed)
-            total += shown * spacing * spacing
+            pixel_area, _, _, _ = shown_by(grid, u, v, w, at, camera, around, reach, allowed)
+            total += pixel_area * spacing * spacing
             count += 1
     return total / max(count, 1)
 
@@ -152,8 +152,8 @@ def new_in_points(
         if w[at] == 0.0:
             continue
         number = np.uint32(np.uint32(seed) ^ (np.uint32(at) * np.uint32(0x85EBCA6B)))
-        shown, there, along_x, along_y = shown_by(grid, u, v, w, at, camera, around, reach, allowed)
-        expected = density * shown * spacing * spacing / (edge * edge)
+        pixel_area, there, along_x, along_y = shown_by(grid, u, v, w, at, camera, around, reach, allowed)
+        expected = density * pixel_area * spacing * spacing / (edge * edge)
         for _ in range(number_of(expected, fraction(np.uint32(number ^ np.uint32(0x165667B1))))):
             number = mixed(np.uint32(number + np.uint32(0x9E3779B9)))
             x, y, here = u[at], v[at], w[at]
@@ -203,10 +203,10 @@ def project_sparse(point, grid, u, v, w, camera, around, reach, T, spot, x, y, e
             p, q = X / Z * fx + cx, Y / Z * fy + cy
             if not (-0.5 <= p < columns - 0.5 and -0.5 <= q < rows - 0.5):
                 continue
-        there, left, at, least, along_x, along_y = surface(grid, u, v, w, p, q, reach, around)
+        there, residual, at, least, along_x, along_y = surface(grid, u, v, w, p, q, reach, around)
         if not around and (at < 0 or least > BESIDE):
             continue
-        if there == 0.0 or left > ON_A_PLANE:
+        if there == 0.0 or residual > ON_A_PLANE:
             if at < 0 or least > NEXT:
                 continue
             there, along_x, along_y = w[at], 0.0, 0.0
@@ -228,10 +228,10 @@ def answer_sparse(
         if abs(error[i]) > allowed:
             continue
         column, row, here = np.int64(np.floor(x[i] + 0.5)), np.int64(np.floor(y[i] + 0.5)), w[nearest[i]]
-        own, dx, dy = own_label(labels, unlabelled, row, column, K), column - x[i], row - y[i]
-        out[n], near[n], far[n], beyond[n] = spot[i], own, own, own
+        label, dx, dy = own_label(labels, unlabelled, row, column, K), column - x[i], row - y[i]
+        out[n], near[n], far[n], beyond[n] = spot[i], label, label, label
         square[n] = squared(dx, dy, here, fx, fy)
-        if own < K:
+        if label < K:
             side = first_side(seed, hashed[spot[i]])
             for turn in range(4):
                 step_x, step_y = aside((side + turn) & 3)

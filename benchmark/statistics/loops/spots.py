@@ -199,22 +199,22 @@ def in_world(x, y, z, T):
 def free(px, py, pz, edge, share, low, table, taken):
     """Return the hash of a point's coarse cell if it is in the sample and has no spot, else -1; it is taken if so."""
     i, j, k = cell_of(px, py, pz, edge)
-    own = np.int64(hash_cell(i, j, k))
-    if own >= share:
+    cell_hash = np.int64(hash_cell(i, j, k))
+    if cell_hash >= share:
         return np.int64(-1)
     a, b, c = i - low[0], j - low[1], k - low[2]
     if a < 0 or b < 0 or c < 0 or a >= SPAN or b >= SPAN or c >= SPAN:
         return np.int64(-1)
-    return own if is_new(table, (a << (2 * BITS)) | (b << BITS) | c, taken) else np.int64(-1)
+    return cell_hash if is_new(table, (a << (2 * BITS)) | (b << BITS) | c, taken) else np.int64(-1)
 
 
 @serial
 def add_spot(px, py, pz, edge, share, low, table, point, hashed, n):
     """Add a point as spot n if its coarse cell is in the sample and has none; return how many spots there are."""
-    own = free(px, py, pz, edge, share, low, table, True)
-    if own < 0:
+    cell_hash = free(px, py, pz, edge, share, low, table, True)
+    if cell_hash < 0:
         return n
-    point[n, 0], point[n, 1], point[n, 2], hashed[n] = px, py, pz, own
+    point[n, 0], point[n, 1], point[n, 2], hashed[n] = px, py, pz, cell_hash
     return n + 1
 
 
@@ -281,14 +281,16 @@ def new_in_image(depth, camera, T, allowed, edge, share, low, stride, factor, de
             along_x, along_y = slopes(depth, row, column, here)
             z = 1.0 / max(here + along_x * (u - column) + along_y * (v - row), 0.5 * here)
             px, py, pz = in_world((u - cx) / fx * z, (v - cy) / fy * z, z, T)
-            known = free(px, py, pz, edge, share, low, table, False) < 0
+            is_taken = free(px, py, pz, edge, share, low, table, False) < 0
             if done == 1:
                 along_x, along_y = slopes(depth, row, column, here, stride)
-                shown = area(here, along_x, along_y, (column - cx) / fx, (row - cy) / fy, fx, fy) * stride * stride
-                places = number_of(density * shown / (edge * edge), fraction(np.uint32(number ^ np.uint32(0x165667B1))))
+                block_area = area(here, along_x, along_y, (column - cx) / fx, (row - cy) / fy, fx, fy) * stride * stride
+                places = number_of(
+                    density * block_area / (edge * edge), fraction(np.uint32(number ^ np.uint32(0x165667B1)))
+                )
                 if places == 0:
                     break
-            if known:
+            if is_taken:
                 continue
             there = smoothed(depth, row, column, here, u - column, v - row, allowed)
             z = 1.0 / (there if there > 0.5 * here else here)
@@ -358,9 +360,9 @@ def project(point, depth, camera, T, noise, allowed, spot, pixel, x, y, error, r
                 a, b = towards(u - column, v - row, turn)
                 there = inverse(depth, row + b, column + a)
                 if there > 0.0:
-                    _, left = misfit(depth, row + b, column + a, there, u - column - a, v - row - b, z, noise)
-                    if left <= allowed:
-                        column, row, here, room[n] = column + a, row + b, there, left
+                    _, room_there = misfit(depth, row + b, column + a, there, u - column - a, v - row - b, z, noise)
+                    if room_there <= allowed:
+                        column, row, here, room[n] = column + a, row + b, there, room_there
                         break
         if here == 0.0:
             continue
@@ -454,11 +456,11 @@ def answer(
         if room[i] > allowed:
             continue
         row, column = pixel[i] // depth.shape[1], pixel[i] % depth.shape[1]
-        own, here = own_label(labels, unlabelled, row, column, K), inverse(depth, row, column)
-        out[n], near[n], far[n], beyond[n] = spot[i], own, own, own
+        label, here = own_label(labels, unlabelled, row, column, K), inverse(depth, row, column)
+        out[n], near[n], far[n], beyond[n] = spot[i], label, label, label
         dx, dy = column - x[i], row - y[i]
         square[n] = squared(dx, dy, here, fx, fy)
-        if own < K:
+        if label < K:
             along_x, along_y = slopes(depth, row, column, here)
             side = first_side(seed, hashed[spot[i]])
             for turn in range(4):
@@ -524,8 +526,8 @@ def observe(number, view, label, K, first, of, starts, classes, shares):
         first[n], of[n] = start, spots
         if many > 1:
             met[:many].sort()
-        for own in met[:many]:
-            classes[m], shares[m], sums[own] = own, sums[own] / (end - start), 0.0
+        for k in met[:many]:
+            classes[m], shares[m], sums[k] = k, sums[k] / (end - start), 0.0
             m += 1
         n += 1
         starts[n] = m
