@@ -5,6 +5,8 @@ from __future__ import annotations
 import importlib
 from typing import TYPE_CHECKING, Any
 
+from semstab.core.versions import VERSION as __version__
+
 if TYPE_CHECKING:
     from semstab import backends, datasets, engine, metrics, models, statistics
     from semstab.api import run, run_study
@@ -28,8 +30,6 @@ if TYPE_CHECKING:
     from semstab.report.saved_run import load
     from semstab.statistics.acceptance import AcceptanceThresholds
     from semstab.two_visits import compare_visits
-
-__version__ = "0.4.0"
 
 __all__ = [
     "AcceptanceThresholds",
