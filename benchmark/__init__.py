@@ -5,7 +5,7 @@ from __future__ import annotations
 import importlib
 from typing import TYPE_CHECKING, Any
 
-from semstab.core.versions import VERSION as __version__
+from semstab.core.versions import VERSION
 
 if TYPE_CHECKING:
     from semstab import backends, datasets, engine, metrics, models, statistics
@@ -30,6 +30,8 @@ if TYPE_CHECKING:
     from semstab.report.saved_run import load
     from semstab.statistics.acceptance import AcceptanceThresholds
     from semstab.two_visits import compare_visits
+
+__version__ = VERSION
 
 __all__ = [
     "AcceptanceThresholds",
