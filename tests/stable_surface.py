@@ -23,10 +23,11 @@ from semstab.engine import Observer
 from semstab.gating.gate import GateConfig, gate
 from semstab.gating.report import as_json
 from semstab.gating.result import EXIT_CODES
+from semstab.predict.filters import Filter
 
 Surface = dict[str, list[str]]
 
-PROTOCOLS = (backends.FusionBackend, datasets.Dataset, datasets.Scene, models.Model, Observer)
+PROTOCOLS = (backends.FusionBackend, datasets.Dataset, datasets.Scene, models.Model, Filter, Observer)
 CASES = Path(conformance.__file__).parent / "cases"
 REMEDY = "say it in CHANGELOG.md, then run: python tests/golden/regenerate.py"
 
