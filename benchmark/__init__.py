@@ -5,6 +5,8 @@ from __future__ import annotations
 import importlib
 from typing import TYPE_CHECKING, Any
 
+from semstab.core.versions import VERSION
+
 if TYPE_CHECKING:
     from semstab import backends, datasets, engine, metrics, models, statistics
     from semstab.api import run, run_study
@@ -29,7 +31,7 @@ if TYPE_CHECKING:
     from semstab.statistics.acceptance import AcceptanceThresholds
     from semstab.two_visits import compare_visits
 
-__version__ = "0.4.0"
+__version__ = VERSION
 
 __all__ = [
     "AcceptanceThresholds",

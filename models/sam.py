@@ -86,7 +86,7 @@ KINDS = ("SamModel", "SamHQModel", "Sam2Model")
 # Proposals: masks at a grid of points, those that the model rates well and that are stable, each once.
 
 MOST_REGIONS = 65535
-CACHE_VERSION = 2
+CACHE_VERSION = 1
 """The version of the method: proposals that an earlier one left in a cache are made again."""
 
 

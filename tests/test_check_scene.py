@@ -278,7 +278,7 @@ def test_the_tables_fit_80_columns_and_the_numbers_go_to_a_file(folder, short, t
     assert len(plain.splitlines()) <= 24
     content = json.loads(file.read_text(), parse_constant=lambda text: pytest.fail(f"{text} in JSON"))
     (scene,) = content["scenes"]
-    assert (content["schema"], scene["sound"], scene["problems"]) == (2, True, [])
+    assert (content["schema"], scene["sound"], scene["problems"]) == (1, True, [])
     assert {row["name"] for row in scene["verdict"]["fits"]} >= {"as configured", "camera_axes: opengl"}
     assert scene["persistence"][1]["voxel_size"] == 0.1
     assert scene["overlaps"][0]["error"] < 0.01

@@ -6,6 +6,7 @@ import json
 import os
 import re
 import shutil
+import stat
 import subprocess
 import sys
 import tarfile
@@ -50,6 +51,7 @@ def built(tmp_path_factory: pytest.TempPathFactory) -> tuple[list[Path], Path, P
         shutil.copy(SOURCE / name, copy)
     files = [path.relative_to(copy) for folder in PACKAGES for path in (copy / folder).rglob("*") if path.is_file()]
     with tarfile.open(build("build_sdist", copy, base)) as sdist:
+        assert [member.name for member in sdist if member.issym() or member.islnk()] == []
         trusted: dict[str, Any] = {"filter": "data"} if hasattr(tarfile, "data_filter") else {}  # from 3.11.4 on
         sdist.extractall(base / "unpacked", **trusted)
     (unpacked,) = (base / "unpacked").iterdir()
@@ -64,6 +66,14 @@ def test_wheel_and_sdist_hold_every_file(built) -> None:
     held = set(zipfile.ZipFile(wheel).namelist())
     assert [path for path in installed if str(path) not in held] == []
     assert {name.split("/")[0] for name in held} == {"semstab", f"{wheel.name.split('-py3')[0]}.dist-info"}
+
+
+def test_what_is_published_holds_no_link(built) -> None:
+    """The source links its folders; an archive with links could not be unpacked on every system."""
+    _, unpacked, wheel = built
+    assert (SOURCE / "src/semstab").is_symlink()
+    assert [path for path in unpacked.rglob("*") if path.is_symlink()] == []
+    assert [each.filename for each in zipfile.ZipFile(wheel).infolist() if stat.S_ISLNK(each.external_attr >> 16)] == []
 
 
 def test_the_metadata_say_who_what_and_where(built) -> None:

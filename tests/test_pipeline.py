@@ -90,7 +90,7 @@ def test_the_run_folder_holds_what_the_design_promises(root, tmp_path) -> None:
     result = semstab.run(configure(root, events=True), out=out, command=["semstab-bench", "--x"], report=False)
     summary = json.loads((out / "summary.json").read_text())
     assert summary == json.loads(json.dumps(summary))
-    assert summary["schema"] == 5
+    assert summary["schema"] == 1
     first = summary["runs"][0]
     for key in (
         "scene", "model", "backend", "K", "voxel_size", "frames", "points", "observations", "voxels", "mean_op",

@@ -58,7 +58,7 @@ def described():
 def test_a_description_is_content_for_json_and_every_voxel_has_a_value(described, tmp_path):
     write_json(tmp_path / "statistics.json", described.summary)
     content = read_json(tmp_path / "statistics.json")
-    assert content["schema"] == 5
+    assert content["schema"] == 1
     assert content["agreement"]["voxel_alpha_op2"]["value"] == described.summary.agreement.voxel_alpha_op2.value
     assert content["headline"]["alpha"]["value"] == described.summary.headline.alpha.value
     assert content["strata"][0]["psa"] is None

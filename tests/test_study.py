@@ -270,7 +270,7 @@ def test_the_result_is_read_back_from_its_folder(finished, out, tmp_path) -> Non
     with pytest.raises(DataError, match=r"summary\.json: cannot be read"):
         load_result(tmp_path)
     content = json.loads((out / "summary.json").read_text())
-    (out / "summary.json").write_text(json.dumps({**content, "schema": 1}))
+    (out / "summary.json").write_text(json.dumps({**content, "schema": 2}))
     with pytest.raises(DataError, match=r"summary\.json: is not a summary of this version of semstab; run it again"):
         load_result(out)
     (out / "summary.json").write_text('{"name": "x"}')

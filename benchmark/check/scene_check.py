@@ -46,7 +46,7 @@ from semstab.statistics import Sampler
 from semstab.statistics.moving import misplaced_frames
 from semstab.task import frame_indices, models_of, require_posed, selected
 
-SCHEMA = 2
+SCHEMA = 1
 """Version of the file that --json writes."""
 
 CLUSTERS, SCAN_CLUSTERS = 4, 2

@@ -278,7 +278,7 @@ def class_of_locations(common: Common) -> Int64:
 
 # Each run is compared with the first one, scene by scene and over all scenes.
 
-SCHEMA = 3
+SCHEMA = 1
 COLUMNS = "columns"
 """Folder of the files SCENE__BASE__RUN.parquet: the changes in each voxel."""
 

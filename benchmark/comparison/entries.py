@@ -325,7 +325,7 @@ def _valid(frames: Iterable[int], percents: Iterable[float]) -> bool:
 
 # --- Small summaries --------------------------------------------------------------------------------------------------
 
-SCHEMA, KIND = 4, "semstab small summary"
+SCHEMA, KIND = 1, "semstab small summary"
 CONTENT = "summary.json"
 LARGEST = 100_000_000
 """Most bytes of a file, of its unpacked content, and of the numbers in it."""

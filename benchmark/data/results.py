@@ -14,7 +14,7 @@ from semstab.data.frames import LeftOut
 from semstab.data.measures import RECURRENT, Measure, MeasureMeans
 from semstab.data.statistics import UNKNOWN, MapStatistics
 
-SCHEMA = 5
+SCHEMA = 1
 """Version of summary.json."""
 
 STAGES = ("decode", "network", "wait", "flicker", "association", "update", "logging")

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import importlib.metadata
 import itertools
 import platform
 import resource
@@ -15,6 +14,7 @@ from semstab.backends import rule_of
 from semstab.check import Verdict
 from semstab.config import BACKENDS, BASE, Config
 from semstab.core.process import Stopwatch
+from semstab.core.versions import version_of
 from semstab.data.records import REGIONS, Failure, Record, RegionFlicker, Result, Tables
 from semstab.data.results import Agreement, VoxelAdvice
 from semstab.data.tiles import Tiles, side_by_side
@@ -141,10 +141,10 @@ def origin(config: Config, command: Sequence[str]) -> dict[str, Any]:
     peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss  # in kB on Linux, bytes on macOS
     return {
         "schema": SCHEMA,
-        "semstab": _version("semstab"),
+        "semstab": version_of("semstab"),
         "python": platform.python_version(),
         "platform": platform.platform(),
-        "packages": {name: _version(name) for name in REPORTED_PACKAGES},
+        "packages": {name: version_of(name) for name in REPORTED_PACKAGES},
         "command": list(command),
         "seed": config.dataset.options.get("seed"),
         "peak_memory_bytes": peak if sys.platform == "darwin" else 1024 * peak,
@@ -168,10 +168,3 @@ def manifest(plan: Plan, units: UnitResults, executor: str, command: Sequence[st
         "depth_from": {name: scene.depth_from for name, scene in plan.scenes.items() if scene.depth_from},
         "placed": {name: scene.placed for name, scene in plan.scenes.items() if scene.placed},
     }
-
-
-def _version(package: str) -> str | None:
-    try:
-        return importlib.metadata.version(package)
-    except importlib.metadata.PackageNotFoundError:
-        return None

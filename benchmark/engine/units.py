@@ -47,7 +47,7 @@ OF_MAPS = (
 )  # fmt: skip
 """Settings that a video, which has no map, does not use."""
 
-FORMAT = 16
+FORMAT = 1
 """Part of every key: raise it with any change of the numbers that a unit's settings and input lead to, and with a
 setting's default."""
 

@@ -14,7 +14,7 @@ from semstab.core.json_form import to_json
 from semstab.errors import ConfigError
 from semstab.gating.result import POWER, GateResult, Verdict
 
-SCHEMA = 3
+SCHEMA = 1
 INDENT = 10
 MOST_NAMED = 4
 """Most rules of each verdict that the headline names."""

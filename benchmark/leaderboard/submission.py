@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import importlib.metadata
 import math
 import os
 import platform
@@ -22,6 +21,7 @@ from semstab.comparison.entries import Entry, RunHandle, open_run, save_summary
 from semstab.config import Config, Settings, read_yaml, validated
 from semstab.core.code import only_named
 from semstab.core.json_form import from_json, to_json
+from semstab.core.versions import version_of
 from semstab.data.digests import require_unchanged
 from semstab.data.records import Result
 from semstab.data.results import slug
@@ -219,7 +219,7 @@ def _benchmark_of(run: Path, config: Config) -> Benchmark:
 def _about(benchmark: Benchmark, result: Result, config: Config, handle: RunHandle, card: ModelCard) -> Submission:
     network = [entry.summary.stages_ms.get("network", math.nan) for entry in handle.scenes.values()]
     predicted = config.dataset.name == PREDICTED and not np.isnan(network).all()
-    known = {name: version for name in PACKAGES if (version := _version(name))}
+    known = {name: version for name in PACKAGES if (version := version_of(name))}
     return Submission(
         benchmark.id,
         benchmark.digest,
@@ -247,13 +247,6 @@ def _require_statement(path: Path, about: Submission) -> None:
         raise DataError(f"{path}: about.made: is no day such as 2026-11-29; write it again")
     if about.milliseconds < 0 or about.cores < 1:
         raise DataError(f"{path}: about: milliseconds or cores are negative; write it again")
-
-
-def _version(package: str) -> str | None:
-    try:
-        return importlib.metadata.version(package)
-    except importlib.metadata.PackageNotFoundError:
-        return None
 
 
 def _processor() -> str:

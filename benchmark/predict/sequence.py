@@ -5,7 +5,6 @@ from __future__ import annotations
 import contextlib
 import csv
 import dataclasses
-import importlib.metadata
 import io
 import itertools
 import math
@@ -14,10 +13,10 @@ from collections.abc import Callable, Iterator, Sequence
 from dataclasses import asdict, dataclass, fields
 from functools import partial
 from pathlib import Path
-from typing import Any
 
 from semstab.core.files import content_key, csv_text, write_text
 from semstab.core.prefetch import prefetch
+from semstab.core.versions import version_of
 from semstab.datasets.formats.images import read_labels
 from semstab.metrics import RegionChange, macro_mean, matched_region_flicker
 from semstab.metrics.flicker import compensated_regions
@@ -349,10 +348,4 @@ def _selection(names: Sequence[str]) -> str:
 
 def _versions() -> dict[str, str | None]:
     """Return the versions of the packages that compute; None for those that are not installed."""
-    versions: dict[str, Any] = {"semstab": importlib.metadata.version("semstab")}
-    for package in REPORTED_PACKAGES:
-        try:
-            versions[package] = importlib.metadata.version(package)
-        except importlib.metadata.PackageNotFoundError:
-            versions[package] = None
-    return versions
+    return {package: version_of(package) for package in ("semstab", *REPORTED_PACKAGES)}

@@ -74,7 +74,7 @@ from semstab.statistics.sample import MapSample
 from semstab.statistics.spot_agreement import spot_agreement
 from semstab.statistics.verdict import LIMITS, Limits, verdict
 
-SCHEMA = 5
+SCHEMA = 1
 
 
 @dataclass(frozen=True, eq=False)

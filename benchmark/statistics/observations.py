@@ -91,7 +91,7 @@ TYPES: Mapping[str, type[np.generic]] = {
 
 COLUMNS = tuple(TYPES)
 
-SCHEMA = 6
+SCHEMA = 1
 
 PARTS = 64
 """Parts of a coarse cell's edge in which the place of a spot is told in a log."""

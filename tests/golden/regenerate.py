@@ -117,8 +117,18 @@ def write_table_files():
             write_text(FILE.with_name(f"tables.{suffix}"), "\n".join(write(table) for table in tables(result)))
 
 
+def write_stable_surface():
+    """What docs/stability.md promises, stable.json: names of commands, settings, files and Python."""
+    sys.path[:0] = [str(FILE.parents[1]), str(FILE.parents[2] / "scripts")]
+    from stable_surface import stable_surface
+
+    lines = (f"{json.dumps(surface)}: {json.dumps(names)}" for surface, names in stable_surface().items())
+    write_text(FILE.with_name("stable.json"), "{\n" + ",\n".join(lines) + "\n}\n")
+
+
 if __name__ == "__main__":
     write_json(FILE, golden())
     write_json(FILE.with_name("city.json"), golden_city())
     write_benchmark_digests()
     write_table_files()
+    write_stable_surface()

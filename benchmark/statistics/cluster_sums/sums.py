@@ -24,7 +24,7 @@ from semstab.errors import DataError
 from semstab.statistics.cluster_sums.columns import OF_TRUTH, column_names, layout, of_measure, side_by_side, width
 from semstab.statistics.cluster_sums.index import MOST_CELLS, ClusterIndex, distinct_rows
 
-SCHEMA = 7
+SCHEMA = 1
 
 
 @dataclass(frozen=True, eq=False)
