@@ -137,6 +137,20 @@ def test_where_the_second_answers_are_the_first_ones_alpha_is_that_of_the_first_
     assert value(found, "alpha") == pytest.approx(value(sums_of_spots(spots).answers[0], "voxel_alpha"), abs=1e-12)
 
 
+def test_alpha_stays_within_its_range_where_second_answers_agree_far_less():
+    whole, _ = stripes()
+    first, second, third = whole.answers
+    parts = []
+    for part, share in ((first, 1.0), (second, 0.5), (third, 0.0)):
+        columns = part.columns.copy()
+        columns[:, part.layout["agreeing"]] = share * part["observations"]
+        parts.append(replace(part, columns=columns))
+    sums = replace(whole, answers=tuple(parts))
+    assert value(sums, "alpha") == 1.0
+    assert estimate(sums, "alpha").value == 1.0
+    assert difference(sums, sums, "alpha").value == 0.0
+
+
 def test_without_spots_there_is_no_alpha():
     table, log, _ = flight()
     sums = cluster_sums_of(table, log)

@@ -81,7 +81,7 @@ class State:
         whole, sample = summarise(table), MapSample.draw(table).table.measured()
         alpha = math.nan
         if self.spots is not None and len(self.spots):
-            alpha = min(value(sums_of_spots(self.spots), "alpha"), 1.0)
+            alpha = value(sums_of_spots(self.spots), "alpha")
         numbers = (
             alpha,
             whole.recurrent[VSS],

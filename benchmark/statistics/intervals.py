@@ -96,9 +96,8 @@ def spec_of(
 ) -> EstimateSpec:
     """Return the spec of a number, see `estimate`."""
     number = functional(key, k)
-    bounds, point = (number.low, number.high), value(sums, number)
-    clipped = point if math.isnan(point) else min(max(point, number.low), number.high)
-    return EstimateSpec(clipped, influences_of(sums, number), scope, number.scale, bounds, level)
+    bounds = number.low, number.high
+    return EstimateSpec(value(sums, number), influences_of(sums, number), scope, number.scale, bounds, level)
 
 
 def difference(

@@ -102,7 +102,7 @@ def share_of_disagreement(sums: ClusterSums, rest: ClusterSums) -> float:
 
     def disagreement(of: ClusterSums) -> float:
         first = of.answers[0]
-        return float(first["observations"].sum()) * (1 - min(value(of, "alpha"), 1.0)) * (1 - chance_of(first))
+        return float(first["observations"].sum()) * (1 - value(of, "alpha")) * (1 - chance_of(first))
 
     everywhere = disagreement(sums)
     return min(max(1 - disagreement(rest) / everywhere, 0.0), 1.0) if everywhere > 0 else math.nan

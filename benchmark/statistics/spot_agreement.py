@@ -102,7 +102,7 @@ def moving_classes(spots: SpotObservations, sums: ClusterSums, moving: Sequence[
         return float(first["observations"].sum()) * (1 - alpha) * (1 - chance_of(first))
 
     rest = sums_of_spots(spots.without(moving))
-    alpha_of_all, alpha = (min(value(part, "alpha"), 1.0) for part in (sums, rest))  # extrapolated to the spot itself
+    alpha_of_all, alpha = (value(part, "alpha") for part in (sums, rest))
     if not (everywhere := disagreeing(sums, alpha_of_all)) > 0:
         return None
     share = 1 - disagreeing(rest, alpha) / everywhere

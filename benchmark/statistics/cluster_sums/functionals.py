@@ -202,12 +202,13 @@ def columns_of(part: ClusterSums, number: Functional) -> Float64:
 
 
 def value(sums: ClusterSums, key: str | Functional, k: int | None = None) -> float:
-    """Return the number; NaN if undefined."""
+    """Return the number, within its range although alpha is extrapolated to the spot itself; NaN if undefined."""
     number = functional(key, k)
     parts = parts_of(sums, number)
     if not parts:
         return math.nan
-    return float(sum(weight * number.of(columns_of(part, number).sum(axis=0)) for part, weight in parts))
+    result = float(sum(weight * number.of(columns_of(part, number).sum(axis=0)) for part, weight in parts))
+    return result if math.isnan(result) else min(max(result, number.low), number.high)
 
 
 def frames_of(sums: ClusterSums, key: str | Functional, k: int | None = None) -> int:
