@@ -17,21 +17,18 @@ PAGE = ROOT / "docs/leaderboard.md"
 
 HEAD = """# Leaderboard
 
-Which models are more stable on the [benchmarks](benchmarks.md)? Results that are in `results/`; each number follows
-from sums that are [checked](benchmarks.md#what-is-checked). A page that also has scenes, hardware and cards:
+Which models are more stable on the [benchmarks](benchmarks.md)? Each number follows from sums that are
+[checked](benchmarks.md#what-is-checked). A page with scenes, hardware and cards, of the results in `results/`:
 
 ```bash
 semstab-bench leaderboard results --out site
 ```
 
-- **alpha** counts an answer that a model leaves out as one that disagrees. Numbers are means over scenes, with
-  intervals at 95 %.
-- **rank** is 1 plus the number of models that are shown to be more stable (paired by frames and cubes, Holm).
-  '1 to 7': models that share ranks are not told apart.
+- **alpha** counts an answer that a model leaves out as one that disagrees; means over scenes, intervals at 95 %.
+- **rank** is 1 plus the number of models that are shown to be more stable; '1 to 7' shares ranks.
 - A model may be stable and wrong: read alpha beside accuracy.
-- What the ten networks of `livingroom@1` tell about measures: [real networks](real-networks.md).
 
-The results were made by:
+Made by:
 
 ```bash
 semstab-bench benchmark city@1 -m sim-steady -m sim-flicker -m sim-soft -m trick-two-class \\

@@ -1,14 +1,16 @@
 """Find habits of English that make sentences hard to read: `python scripts/plain.py [FILE ...]`, exit code 1 if any.
 
-It reads docstrings, comments and texts of Python files, and the prose of Markdown pages: of the named files, or of all
-files in git without the tests. Code, tables and texts in backticks are left out. CONTRIBUTING.md says what to write
-instead; a sentence that a rule meets is written again, the word is not replaced. This file is left out: it lists them.
+It reads docstrings, comments and texts of Python files, prose and table cells of Markdown pages, and the Markdown cells
+of notebooks: of the named files, or of all files in git without the tests. Code and texts in backticks are left out.
+CONTRIBUTING.md says what to write instead; a sentence that a rule meets is written again, the word is not replaced.
+This file is left out: it lists them.
 """
 
 from __future__ import annotations
 
 import ast
 import io
+import json
 import re
 import subprocess
 import sys
@@ -27,7 +29,7 @@ RULES = {
     "is none of: is not a": r"\b(?:is|are|be) none of\b",
     "that of, those of: repeat the noun": rf"{START}(?i:that|those) of\b|\bas (?:that|those) of\b",
     "None where: None if, None without": r"\b(?:None|NaN) where\b",
-    "where it, there, no: if": r"\bwhere (?:it|there|no|none|not)\b(?! are on\b| (?:is|was|lies)[.,;:)\n])",
+    "where it, there, no: if": r"\bwhere (?:it|there|no|none|not)\b(?! are on\b| (?:is|was|lies)(?:[.,;:)\n]|$))",
     "less: minus": r"\b(?:1|one) less (?:the|its|what)\b",
     "anew: again": r"\banew\b",
     "alike: the same, similar": r"\balike\b",
@@ -89,7 +91,7 @@ def is_code(text: str) -> bool:
 
 
 def page_texts(source: str) -> Iterator[Text]:
-    """Yield the paragraphs and items of a page, without code and tables."""
+    """Yield the paragraphs, items and table cells of a page, without code."""
     begun, lines, code = 1, [], False
     for number, line in enumerate([*source.splitlines(), ""], 1):
         bare = line.strip()
@@ -103,11 +105,29 @@ def page_texts(source: str) -> Iterator[Text]:
         if prose:
             begun = begun if lines else number
             lines.append(line)
+        elif not code and bare.startswith("|"):
+            yield from (Text(number, cell.strip()) for cell in re.split(r"(?<!\\)\|", bare))
+
+
+def notebook_texts(source: str) -> Iterator[Text]:
+    """Yield what a page yields, of each Markdown cell of a notebook with one line a source line."""
+    position = 0
+    for cell in json.loads(source)["cells"]:
+        lines = "".join(cell["source"]).splitlines(keepends=True)
+        if cell["cell_type"] == "markdown" and lines:
+            position = source.index(json.dumps(lines[0], ensure_ascii=False), position)
+            above = source.count("\n", 0, position)
+            yield from (Text(above + text.line, text.content) for text in page_texts("".join(lines)))
+            position += 1
+
+
+TEXTS = {".py": python_texts, ".md": page_texts, ".ipynb": notebook_texts}
+"""What is read of a file, by its suffix."""
 
 
 def findings(file: str, source: str) -> Iterator[Finding]:
     """Yield what the rules meet in a file."""
-    for text in python_texts(source) if file.endswith(".py") else page_texts(source):
+    for text in TEXTS.get(Path(file).suffix, page_texts)(source):
         content = re.sub(r"(?m)`[^`]*`|^ *(?:>>>|\.\.\.).*", "X", text.content)
         if text.docstring and BEGINS.match(content):
             yield Finding(file, text.line, BEGIN, content.split("\n")[0][:80])
@@ -122,14 +142,14 @@ def findings(file: str, source: str) -> Iterator[Finding]:
 
 
 def files() -> list[str]:
-    """Return the Python files and pages of the repository, without tests, generated pages and links."""
+    """Return the Python files, pages and notebooks of the repository, without tests, generated pages and links."""
     listed = subprocess.run(["git", "ls-files"], cwd=ROOT, capture_output=True, text=True, check=True).stdout.split(
         "\n"
     )
     return [
         name
         for name in listed
-        if name.endswith((".py", ".md"))
+        if name.endswith(tuple(TEXTS))
         and not name.startswith(("tests/", "docs/reference/", "src/"))
         and name != "scripts/plain.py"
         and not (ROOT / name).is_symlink()

@@ -2,12 +2,23 @@
 
 from __future__ import annotations
 
+import json
+
 import plain
 import pytest
 
 
 def rules(file, source):
     return [each.rule.partition(":")[0] for each in plain.findings(file, source)]
+
+
+def notebook(*cells):
+    """The text of a notebook: kinds and sources of its cells in turn, as nbformat writes them."""
+    made = [
+        {"cell_type": kind, "metadata": {}, "source": source.splitlines(keepends=True)}
+        for kind, source in zip(cells[::2], cells[1::2], strict=True)
+    ]
+    return json.dumps({"cells": made, "nbformat": 4}, indent=1)
 
 
 @pytest.mark.parametrize(
@@ -30,6 +41,9 @@ def test_a_habit_is_found_in_a_docstring_a_comment_a_message_and_a_page(sentence
     assert rule in rules("a.py", f"# {sentence}\n")
     assert rule in rules("a.py", f'raise ValueError("{sentence}")\n')
     assert rule in rules("a.md", f"# Title\n\n{sentence}\n")
+    assert rule in rules("a.md", f"| a | {sentence} |\n|---|---|\n| b | fine |\n")
+    assert rule in rules("a.ipynb", notebook("markdown", f"# Title\n\n{sentence}"))
+    assert rules("a.ipynb", notebook("code", f"# {sentence}")) == []
 
 
 def test_the_first_word_of_a_docstring_is_looked_at_and_that_of_a_message_is_not():
@@ -38,9 +52,18 @@ def test_the_first_word_of_a_docstring_is_looked_at_and_that_of_a_message_is_not
 
 
 @pytest.mark.parametrize(
-    "source", ["    so many lines of code\n", "```\nso many\n```\n", "| so many |\n", "Use `so many`.\n"]
+    "source",
+    [
+        "    so many lines of code\n",
+        "```\nso many\n```\n",
+        "```\n| so many |\n```\n",
+        "| `so many` |\n",
+        "| so \\| many |\n",
+        "| so | many |\n",
+        "Use `so many`.\n",
+    ],
 )
-def test_code_and_tables_of_a_page_are_left(source):
+def test_code_of_a_page_is_left_and_cells_are_read_one_by_one(source):
     assert rules("a.md", source) == []
 
 
@@ -63,11 +86,20 @@ def test_a_text_of_many_lines_that_is_no_program_is_read():
 @pytest.mark.parametrize("sentence", ["It is seen where it was.", "The folder where it lies, and the file."])
 def test_a_place_is_no_condition(sentence):
     assert rules("a.md", sentence) == []
+    assert rules("a.md", f"| a | {sentence.removesuffix('.')} |\n") == []
 
 
 def test_the_line_of_a_finding_is_that_of_the_word():
     found = list(plain.findings("a.py", '"""Return a.\n\nDrops so many.\n"""\n'))
     assert [each.line for each in found] == [3]
+    found = list(plain.findings("a.md", "| a | b |\n|---|---|\n| c | drawn anew |\n"))
+    assert [each.line for each in found] == [3]
+
+
+def test_the_line_of_a_finding_in_a_notebook_is_its_line_in_the_file():
+    text = notebook("markdown", "# Title\n\nA line.", "code", "1", "markdown", "# Title\n\nIt is\ndrawn anew.")
+    (found,) = plain.findings("a.ipynb", text)
+    assert "drawn anew" in text.splitlines()[found.line - 1]
 
 
 def test_plain_sentences_pass(tmp_path, capsys):
