@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import importlib.resources
+import re
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -75,7 +76,8 @@ def _named_in(content: Any, field: str = "") -> Iterator[tuple[str, str]]:
     for key, value in items:
         at = f"{field}.{key}" if field else str(key)
         of_backends = at in ("backends", "check") or (field == "backends" and isinstance(content, list))
-        if isinstance(value, str) and (of_backends or key in CODE_KEYS):
+        of_dataset = re.search(r"(^|\.)dataset(\.name)?$", at) is not None
+        if isinstance(value, str) and (of_backends or of_dataset or key in CODE_KEYS):
             yield at, value
         yield from _named_in(value, at)
 

@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import re
 from pathlib import Path
-from typing import Any, cast
+from typing import Any
 
 from pydantic import BaseModel
 
@@ -19,7 +19,7 @@ from semstab.config import DatasetConfig, validated
 from semstab.core.registry import Entry, Registry
 from semstab.data.records import is_run
 from semstab.datasets.scene import GROUND_TRUTH, Dataset, Filtering, Scene
-from semstab.errors import DataError
+from semstab.errors import ConfigError, DataError
 
 __all__ = [
     "GROUND_TRUTH",
@@ -29,6 +29,7 @@ __all__ = [
     "Scene",
     "open_dataset",
     "options_model",
+    "reader",
     "recognise",
     "resolved",
 ]
@@ -133,9 +134,25 @@ REGISTRY = Registry(
 )
 
 
+def reader(name: str) -> type[Dataset]:
+    """Return the class of a dataset, by its name or as FILE.py:NAME.
+
+    Raises:
+        ConfigError: If the name is not known, or the class is no dataset, or lacks a method or its options.
+        MissingDependencyError: If a package that it needs is not installed.
+    """
+    cls = REGISTRY.load(name)
+    if not (isinstance(cls, type) and issubclass(cls, Dataset)):
+        raise ConfigError(f"dataset '{name}': is no subclass of semstab.datasets.Dataset (docs/tutorials/extend.md)")
+    lacking = sorted(cls.__abstractmethods__) + ([] if hasattr(cls, "Options") else ["Options"])
+    if lacking:
+        raise ConfigError(f"dataset '{name}': lacks {', '.join(lacking)} (docs/tutorials/extend.md)")
+    return cls
+
+
 def options_model(name: str) -> type[BaseModel]:
     """Return the pydantic model of a dataset's options."""
-    return cast("type[BaseModel]", REGISTRY.load(name).Options)
+    return reader(name).Options
 
 
 def resolved(config: DatasetConfig) -> DatasetConfig:
@@ -159,10 +176,10 @@ def open_dataset(name: str, options: dict[str, Any] | BaseModel, run_folder: Pat
         DataError: If the data cannot be read.
         MissingDependencyError: If a package that it needs is not installed.
     """
-    cls = REGISTRY.load(name)
+    cls: Any = reader(name)
     title = getattr(cls.Options, "title", f"dataset '{name}', options")
     checked = options if isinstance(options, BaseModel) else validated(cls.Options, options, f"{title}: ")
-    dataset = cast("Dataset", cls(checked))
+    dataset: Dataset = cls(checked)
     dataset.run_folder = run_folder
     return dataset
 

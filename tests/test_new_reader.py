@@ -97,3 +97,47 @@ def test_ids_that_count_from_one_are_named_so(wall) -> None:
     done = bench("check", "--data", "wall", "-m", "a", cwd=wall, code=2)
     text = " ".join((done.stdout + done.stderr).split())
     assert "the ids may count from 1: write them from 0" in text
+
+
+READER = """
+from semstab.datasets.posed_folder import PosedFolder
+
+
+class Mine(PosedFolder):
+    pass
+
+
+class Half:
+    pass
+
+
+def function(options):
+    pass
+"""
+
+
+def test_a_reader_is_named_by_its_file_and_its_content_counts(wall) -> None:
+    (wall / "reader.py").write_text(READER)
+    words = ("--dataset", "reader.py:Mine", "--data", "wall", "-m", "a", "--out", "out")
+    bench(*words, cwd=wall)
+    (first,) = (wall / "out/units").iterdir()
+    bench(*words, cwd=wall)
+    assert [*(wall / "out/units").iterdir()] == [first]
+    (wall / "reader.py").write_text(READER + "CHANGED = True\n")
+    bench(*words, cwd=wall, process=True)
+    assert [*(wall / "out/units").iterdir()] != [first]
+    refused = error_of("relabel", "out", "--out", "fused", cwd=wall)
+    assert "reader.py:Mine" in refused
+    assert "--code" in refused
+    bench("relabel", "out", "--out", "fused", "--code", "reader.py:Mine", cwd=wall)
+
+
+@pytest.mark.parametrize(("name", "line"), [
+    ("Half", "reader.py:Half': is no subclass of semstab.datasets.Dataset (docs/tutorials/extend.md)"),
+    ("function", "reader.py:function': is no subclass of semstab.datasets.Dataset"),
+    ("Min", "has no 'Min'; did you mean 'Mine'?"),
+])  # fmt: skip
+def test_a_reader_that_is_none_is_one_line(wall, name, line) -> None:
+    (wall / "reader.py").write_text(READER)
+    assert line in error_of("--dataset", f"reader.py:{name}", "--data", "wall", "--out", "out", cwd=wall)
+    assert not (wall / "out").exists()

@@ -94,7 +94,7 @@ DatasetOptions = Annotated[list[str] | None, typer.Option(
 DatasetSettings = Annotated[list[str] | None, typer.Option(
     "--set", metavar="KEY=VALUE", help="Any setting, e.g. dataset.options.depth_scale=5000.", rich_help_panel=SETTINGS)]
 DatasetName = Annotated[str | None, typer.Option(
-    help="Dataset, as named by `semstab-bench list`.", show_default="format of --data, else city",
+    help="Dataset: a name of `semstab-bench list`, or FILE.py:NAME.", show_default="format of --data, else city",
     autocompletion=datasets)]
 Scenes = Annotated[list[str] | None, typer.Option(
     "--scene", "-s", help="Scene; repeatable; or 'all'.", show_default="all", autocompletion=scenes)]

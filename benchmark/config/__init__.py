@@ -46,7 +46,7 @@ LEAST_TILE = 8
 class DatasetConfig(Settings):
     """The settings that name a dataset, with the options of its own."""
 
-    name: str = Field("city", description="a name from `semstab-bench list`")
+    name: str = Field("city", description="a name from `semstab-bench list`, FILE.py:NAME or package.module:NAME")
     options: dict[str, Any] = Field(default_factory=dict, description="options of that dataset")
 
     @field_validator("name")
@@ -56,7 +56,7 @@ class DatasetConfig(Settings):
             raise ValueError(
                 f"must name a dataset, not a folder; write {{name: posed_folder, options: {{root: {name}}}}}"
             )
-        return name
+        return absolute(name)
 
 
 class BackendConfig(Part):

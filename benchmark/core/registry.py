@@ -14,7 +14,7 @@ from dataclasses import dataclass
 from importlib.metadata import entry_points
 from typing import Any
 
-from semstab.core.code import Code, may_run
+from semstab.core.code import Code, is_code, may_run
 from semstab.errors import ConfigError, MissingDependencyError, nearest, summarize_error
 
 BY_RULE = "+"
@@ -89,7 +89,7 @@ class Registry:
         return f"{', '.join(absent)}: not installed; {entry.install or 'install it'}" if absent else ""
 
     def load(self, name: str) -> Any:
-        """Import the class behind a name.
+        """Import the class behind a name, or a user's class by FILE.py:NAME or package.module:NAME.
 
         Raises:
             ConfigError: If the name is not known, or is that of a user's code and of a built-in class.
@@ -100,6 +100,8 @@ class Registry:
             if name in self.builtin:
                 raise ConfigError(f"{text}: a built-in {self.kind} is called '{name}'; give the class another name")
             return Code.load(text, self.kind).target
+        if is_code(name):
+            return Code.load(name, self.kind).target
         entry = self.entry(name)
         module, _, attribute = entry.target.partition(":")
         try:

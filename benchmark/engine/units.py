@@ -365,12 +365,13 @@ def _check_count(variation: Variation, task: Task) -> None:
 def identity(config: Config, task: Task) -> str:
     """Return the hash of the settings that a unit's numbers depend on in addition to its input."""
     mapping, filtering = task.mapping, task.scene.filtering(task.model)
-    rule = config.backends[0].options.get("rule")
+    rule, reader = config.backends[0].options.get("rule"), config.dataset.name
     content: dict[str, Any] = {
         "unit": dataclasses.asdict(task.units[0]),
         "options": config.backends[0].options,
         **({"rule": Code.load(rule, "rule").digest} if isinstance(rule, str) and is_code(rule) else {}),
         **({} if config.backends[0].code is None else {"code": Code.load(config.backends[0].code, "backend").digest}),
+        **({"reader": Code.load(reader, "dataset").digest} if is_code(reader) else {}),
         "frames": [*task.indices],
         "taxonomy": [mapping.target.name, mapping.target.classes, mapping.source.ids, mapping.rows],
     }

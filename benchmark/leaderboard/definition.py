@@ -25,7 +25,7 @@ from semstab.config import (
 from semstab.configure import load_config, predicted_config, shipped_benchmarks
 from semstab.core.prefetch import prefetch
 from semstab.data.labels import LabelSpace
-from semstab.datasets import GROUND_TRUTH, REGISTRY, Dataset, Scene, open_dataset
+from semstab.datasets import GROUND_TRUTH, Scene, open_dataset, reader
 from semstab.errors import ConfigError, DataError
 from semstab.leaderboard.geometry import Spots, few_rows, geometry_file, load_geometry, spots_of
 from semstab.pixels.preparation import leave_out
@@ -147,8 +147,7 @@ class Benchmark(Settings):
     @property
     def is_sparse(self) -> bool:
         """Return whether its images have depth at the points of a LiDAR alone."""
-        reader: type[Dataset] = REGISTRY.load(self.dataset.name)
-        return reader.depth_is_sparse
+        return reader(self.dataset.name).depth_is_sparse
 
     def changed(self, config: Config) -> list[str]:
         """Return the settings of a run that are not those of the definition."""

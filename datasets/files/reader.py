@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Generic, Protocol, TypeVar
 
 import numpy as np
+from pydantic import BaseModel
 
 from semstab.config import nearest
 from semstab.core.files import cache_folder
@@ -27,7 +28,7 @@ from semstab.errors import ConfigError, DataError
 DEEPEST = 3
 """Levels of folders below root that are searched for scenes."""
 
-Options = TypeVar("Options", bound=FileOptions)
+OwnOptions = TypeVar("OwnOptions", bound=FileOptions)
 
 
 class WithRoot(Protocol):
@@ -82,7 +83,7 @@ class ScenesBelow(Dataset, Generic[AnyOptions]):
         """Return whether a folder is a scene of this format."""
 
 
-class FileDataset(ScenesBelow[Options]):
+class FileDataset(ScenesBelow[OwnOptions]):
     """Scenes of files below a root. A reader recognises a scene's folder, and lists its frames.
 
     Attributes:
@@ -93,6 +94,8 @@ class FileDataset(ScenesBelow[Options]):
         DataError: If there is no scene.
     """
 
+    Options: type[BaseModel] = FileOptions
+    contents = "depth, poses and a camera"
     labels_like_depth = False
     settings_file: str | None = None
 

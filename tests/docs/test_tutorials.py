@@ -6,7 +6,6 @@ import re
 import runpy
 import shlex
 import shutil
-import tomllib
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -16,9 +15,7 @@ from command_line import bench
 from test_readers_odm import write_georeference, write_project
 
 from semstab import load_result
-from semstab.core.registry import Entry
 from semstab.data.measures import measures
-from semstab.datasets import REGISTRY
 from semstab.testing import BackendConformance
 
 DOCS = Path(__file__).parents[2] / "docs"
@@ -81,18 +78,12 @@ def test_every_block_of_a_tutorial_works_as_it_stands(name, prepare, left, tmp_p
 
 
 def test_each_extension_is_a_file_that_runs(tmp_path, monkeypatch) -> None:
-    """The reader's package is told to this process, as an installation would tell it."""
     monkeypatch.chdir(tmp_path)
-    monkeypatch.syspath_prepend(tmp_path)
     text = (DOCS / "tutorials/extend.md").read_text(encoding="utf-8")
     model, rule, measure, reader = python_blocks("tutorials/extend.md")
     assert all(len([line for line in code.splitlines() if line]) <= 10 for code in (model, rule, measure, reader))
     for name, code in {"net": model, "capped": rule, "walk": reader}.items():
         (tmp_path / f"{name}.py").write_text(code, encoding="utf-8")
-    (project,) = re.findall(r"```toml\n(.*?)```", text, re.DOTALL)
-    added = tomllib.loads(project)["project"]["entry-points"]["semstab.datasets"]
-    plugins = REGISTRY._plugins | {name: Entry(target, "a package") for name, target in added.items()}
-    monkeypatch.setattr(REGISTRY, "_plugins", plugins)
     exec(compile(python_blocks("tutorials/own-sequence.md")[0], "own-sequence.md", "exec"), {})
     for line in "".join(text for kind, text in BLOCKS.findall(text) if kind == "console").splitlines():
         command, *words = shlex.split(line)
