@@ -46,13 +46,15 @@ POINTS = 500
 """Points of each frame."""
 
 
-def with_continuity(verdict: Verdict, neighbours: Neighbours, chain: Chain) -> Verdict:
+def with_continuity(verdict: Verdict, neighbours: Neighbours, chain: Chain, *, explained: bool = False) -> Verdict:
     """Return the verdict, with lost tracking, poses that jump, and notes on frames that do not fit the others.
 
     Args:
         verdict: The verdict of other checks, of which one that names a mend is left alone.
         neighbours: The frames of the scene.
         chain: Frames in order, with those at striking steps of the camera.
+        explained: Whether something that holds for all frames explains the error, such as a wrong focal length; errors
+            then differ along the sequence, and no shift of the poses is looked for.
     """
     if verdict.mend:
         return verdict
@@ -65,7 +67,7 @@ def with_continuity(verdict: Verdict, neighbours: Neighbours, chain: Chain) -> V
     verdict = verdict.remarking(*neighbours.said_of_misfits(chain, misfits))
     if (text := neighbours.said_of_jumps(chain)) is not None:
         return verdict.refuted(text)
-    if (shift := chain.without(positions).shift()) is None:
+    if explained or (shift := chain.without(positions).shift()) is None:
         return verdict
     text, (_, error, usual) = neighbours.said_of_shift(*shift), shift
     if error >= STRIKING_SHIFT * usual:
@@ -194,7 +196,7 @@ class Neighbours:
         return self._jump(
             pair,
             f"depth reprojects with {error:.2%} error between frames before it and from it on, with {usual:.2%} between"
-            " others as far apart: they are shifted or turned against each other",
+            " others as far apart: they are shifted or turned against each other, if the intrinsics are right",
         )
 
     def _jump(self, pair: Pair, why: str, mend: str = "correct the poses") -> str:

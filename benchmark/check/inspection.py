@@ -137,7 +137,7 @@ class Inspection:
         if self.scene.surface is not None:
             return assess_surface(match_images(self.scene, sample.views, sample.pairs), len(sample.views))
         how = self.reading(options)
-        verdict = assess(sample, how, thorough=thorough)
+        verdict = assessed = assess(sample, how, thorough=thorough)
         if (mistaken := with_mistakes(verdict, sample)) != verdict:
             return mistaken
         timed = with_lateness(verdict, self.scene, sample, how)
@@ -147,6 +147,7 @@ class Inspection:
             verdict = with_intrinsics(verdict, sample, how)
         else:
             verdict = mounted
+        explained = verdict != assessed
         verdict = with_precision(verdict, sample)
         if self.scene.made and not thorough:
             return verdict  # rendering its frames takes longer than fusing them
@@ -157,7 +158,7 @@ class Inspection:
         neighbours = Neighbours(self.scene, self.indices, source, how.convention, known)
         chain = neighbours.chain({*neighbours.spread(how.size, thorough=thorough), *neighbours.striking()})
         self.chained = neighbours, chain
-        return with_continuity(verdict, neighbours, chain)
+        return with_continuity(verdict, neighbours, chain, explained=explained)
 
     def depth(self) -> Depth:
         """Return the depth of all frames that were read."""

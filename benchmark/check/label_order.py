@@ -32,11 +32,18 @@ SAME_ORDER = 0.8
 
 @dataclass(frozen=True)
 class Turn:
-    """A frame from which on maps are otherwise: of their fits as given and otherwise the better one changes there."""
+    """A frame from which on maps are otherwise: of their fits as given and otherwise the better one changes there.
+
+    Attributes:
+        at: Position of the first frame that is otherwise.
+        before, after: Fits of the frames before it, and from it on.
+        fit: Mean fit of all frames, those from it on otherwise.
+    """
 
     at: int
     before: Contrast
     after: Contrast
+    fit: float
 
     @classmethod
     def of(cls, rows: Sequence[tuple[int, float, float]]) -> Turn:
@@ -45,7 +52,9 @@ class Turn:
         gain = np.nan_to_num(np.subtract(other, given))
         sums = [gain[k:].sum() - gain[:k].sum() for k in range(len(gain), -1, -1)]
         at = len(gain) - int(np.argmax(sums))  # the last one of several
-        return cls(at, Contrast.of(other[:at], given[:at]), Contrast.of(given[at:], other[at:]))
+        fits = np.concatenate([given[:at], other[at:]])
+        fit = float(np.nanmean(fits)) if np.isfinite(fits).any() else np.nan
+        return cls(at, Contrast.of(other[:at], given[:at]), Contrast.of(given[at:], other[at:]), fit)
 
     @property
     def is_one(self) -> bool:
@@ -53,14 +62,17 @@ class Turn:
         return self.before.fits_better and self.after.fits_better
 
 
-def from_a_frame_on(scene: Scene, model: str, runs: Sequence[Run]) -> str | None:
-    """Return the finding where maps fit as they are up to a frame, and otherwise from it on."""
+def from_a_frame_on(scene: Scene, model: str, runs: Sequence[Run], everywhere: float) -> str | None:
+    """Return the finding where maps fit as they are up to a frame, and otherwise from it on.
+
+    They have to fit better than under any hypothesis that holds for all frames, whose best mean fit is `everywhere`.
+    """
     for tried in zip(*(run.tried for run in runs), strict=True):
         rows = [row for (_, other), run in zip(tried, runs, strict=True) for row in run.by_frame(other)]
         if len(rows) < 2 * LEAST_TOLD:
             continue
         turn, hypothesis = Turn.of(rows), tried[0][0]
-        if turn.is_one:
+        if turn.is_one and not everywhere >= turn.fit:
             index = _located(scene, model, hypothesis, rows[turn.at - 1][0], rows[turn.at][0])
             before, after = turn.before, turn.after
             says, mend = hypothesis.name, hypothesis.mend

@@ -195,7 +195,8 @@ def _findings(
     if (same := _identical(runs)) is not None:
         return _Findings(LabelFindings(model, (f"labels of {model} {same}",), remarks), clear=True)
     comparisons = compare(runs)
-    if (turned := from_a_frame_on(scene, model, runs)) is not None:
+    everywhere = max((each.edges.other for each in comparisons if each.is_better), default=math.nan)
+    if (turned := from_a_frame_on(scene, model, runs, everywhere)) is not None:
         return _Findings(LabelFindings(model, (f"labels of {model} {turned}",), remarks), doubted=True)
     better = sorted((each for each in comparisons if each.is_better), key=lambda each: -each.edges.other)
     wrong = tuple(f"labels of {model} {counted(each, runs)}" for each in better[:1])
