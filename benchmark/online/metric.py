@@ -431,8 +431,8 @@ def _joined(a: SpotObservations, b: SpotObservations) -> SpotObservations:
     views = Views.joined([a.views, b.views])
     views = dataclasses.replace(views, frame=np.arange(len(views)))
     joined = SpotObservations.stacked([a, later])
-    point, drawn = np.concatenate([a.point, b.point]), np.concatenate([a.drawn, b.drawn])
+    point, cell_hash = np.concatenate([a.point, b.point]), np.concatenate([a.drawn, b.drawn])
     return dataclasses.replace(
-        joined, point=point, drawn=drawn, views=views, share=share, spacing=max(a.spacing, b.spacing),
+        joined, point=point, drawn=cell_hash, views=views, share=share, spacing=max(a.spacing, b.spacing),
         frames=a.frames + b.frames,
     )  # fmt: skip
