@@ -119,18 +119,18 @@ def is_builtin(name: str) -> bool:
 
 def _load(name: str) -> Any:
     """Return the class of a backend, or of the one that runs rules for it."""
-    own, by, _ = name.partition(BY_RULE)
-    cls = REGISTRY.load(own)
+    base_name, by, _ = name.partition(BY_RULE)
+    cls = REGISTRY.load(base_name)
     if not by or "rule" in _options(cls):
         return cls
     from semstab.backends.from_observations import RULED
 
-    if own not in RULED:
+    if base_name not in RULED:
         raise ConfigError(
-            f"backend '{own}' has no rules but the mean; {' and '.join(RULED)} have, and subclasses of"
+            f"backend '{base_name}' has no rules but the mean; {' and '.join(RULED)} have, and subclasses of"
             " semstab.backends.from_observations.FromObservations"
         )
-    return RULED[own]
+    return RULED[base_name]
 
 
 def check_options(name: str, *, voxel_size: float, num_classes: int, **options: Any) -> None:
@@ -193,9 +193,9 @@ def _with_rule(name: str, options: dict[str, Any]) -> tuple[str, dict[str, Any]]
 def _class(name: str, options: Mapping[str, Any]) -> Any:
     """Return the class of that name; raises ConfigError if it has no such options."""
     cls = _load(name)
-    known = _options(cls)
-    if unknown := sorted(set(options) - set(known) | set(options) & set(GIVEN)):
-        listed = f"it takes {', '.join(known)}" if known else "it takes none"
+    available = _options(cls)
+    if unknown := sorted(set(options) - set(available) | set(options) & set(GIVEN)):
+        listed = f"it takes {', '.join(available)}" if available else "it takes none"
         raise ConfigError(f"backend '{name}' has no option '{unknown[0]}'; {listed}")
     try:
         inspect.signature(cls).bind(voxel_size=1.0, num_classes=2, **options)

@@ -99,42 +99,46 @@ class FromObservations(ABC):
         started = time.perf_counter()
         check_depth(frame)
         check_frame(frame, self.num_classes)
-        seen = self._checked(self.observe(frame), frame)
-        return self.add(frame, seen, started, time.perf_counter())
+        observations = self._checked(self.observe(frame), frame)
+        return self.add(frame, observations, started, time.perf_counter())
 
     def add(self, frame: Frame, seen: Observations, started: float, observed: float = math.nan) -> FrameReport:
         """Fuse what a frame observes, each voxel once, and report it; the seconds are those of `perf_counter`."""
-        known = len(self._row)
+        num_voxels = len(self._row)
         voxels = np.ascontiguousarray(seen.index, dtype=np.int64).view("V24").ravel().tolist()
         rows = np.fromiter(map(self._row.__getitem__, voxels), dtype=np.int64, count=len(voxels))
         try:
             return self._update(frame, seen, rows, started, observed)
         except BaseException:
             for voxel in voxels:
-                if self._row.get(voxel, -1) >= known:
+                if self._row.get(voxel, -1) >= num_voxels:
                     del self._row[voxel]
-            self._row.default_factory = itertools.count(known).__next__
+            self._row.default_factory = itertools.count(num_voxels).__next__
             raise
 
-    def _update(self, frame: Frame, seen: Observations, rows: Int64, started: float, observed: float) -> FrameReport:
+    def _update(
+        self, frame: Frame, observations: Observations, rows: Int64, started: float, observed: float
+    ) -> FrameReport:
         self._make_room()
         columns = self._columns
-        before, op, at = self._state[rows], columns["op"][rows], frame.index
-        distance = np.linalg.norm((seen.index + 0.5) * self.voxel_size - frame.T_wc[:3, 3], axis=1)
-        age = np.where(op > 0, np.maximum(at - columns["last_frame"][rows], 0), 0)
-        after = self._rule(before, Seen(seen.s_bar, seen.pixels, op, age, distance, frame))
-        e_before, e_after, again = self._rule.reads(before), self._rule.reads(after), op > 0
+        before, op, frame_index = self._state[rows], columns["op"][rows], frame.index
+        distance = np.linalg.norm((observations.index + 0.5) * self.voxel_size - frame.T_wc[:3, 3], axis=1)
+        age = np.where(op > 0, np.maximum(frame_index - columns["last_frame"][rows], 0), 0)
+        after = self._rule(before, Seen(observations.s_bar, observations.pixels, op, age, distance, frame))
+        e_before, e_after, is_repeated = self._rule.reads(before), self._rule.reads(after), op > 0
         self._state[rows] = after
-        columns["drift_sum"][rows[again]] += js_divergence(normalise(e_after[again]), normalise(e_before[again]))
+        columns["drift_sum"][rows[is_repeated]] += js_divergence(
+            normalise(e_after[is_repeated]), normalise(e_before[is_repeated])
+        )
         for name, among in (("first_frame", np.minimum), ("last_frame", np.maximum)):
-            columns[name][rows] = np.where(again, among(columns[name][rows], at), at)
+            columns[name][rows] = np.where(is_repeated, among(columns[name][rows], frame_index), frame_index)
         columns["op"][rows] += 1
-        columns["pixels"][rows] += seen.pixels
-        columns["self_sum"][rows] += (seen.s_bar**2).sum(axis=1)
-        columns["frame_entropy_sum"][rows] += entropy_bits(seen.s_bar)
-        change, changed = Change.between(e_before, e_after, op + 1, seen.pixels)
-        self._changes = Changes(seen.index, *changed)
-        return self._total.add(at, change, started, observed)
+        columns["pixels"][rows] += observations.pixels
+        columns["self_sum"][rows] += (observations.s_bar**2).sum(axis=1)
+        columns["frame_entropy_sum"][rows] += entropy_bits(observations.s_bar)
+        change, changed = Change.between(e_before, e_after, op + 1, observations.pixels)
+        self._changes = Changes(observations.index, *changed)
+        return self._total.add(frame_index, change, started, observed)
 
     def table(self) -> VoxelTable:
         """Return the map so far; by another rule than the mean its evidence sums to a `weight` of its own."""
@@ -142,10 +146,10 @@ class FromObservations(ABC):
         order = np.lexsort(index.T[::-1])
         columns: dict[str, Any] = {name: column[order] for name, column in self._columns.items()}
         state = self._state
-        evidence = Evidence.read(len(order), self.num_classes, lambda some: self._rule.reads(state[order[some]]))
+        evidence = Evidence.read(len(order), self.num_classes, lambda part: self._rule.reads(state[order[part]]))
         if self._rule.name != MEAN:
             chunks = row_chunks(len(order), self.num_classes)
-            columns["weight"] = np.concatenate([self._rule.reads(state[order[some]]).sum(axis=1) for some in chunks])
+            columns["weight"] = np.concatenate([self._rule.reads(state[order[chunk]]).sum(axis=1) for chunk in chunks])
         return VoxelTable(**index_columns(index[order]), **columns, evidence=evidence, voxel_size=self.voxel_size)
 
     def events(self) -> Events | None:
@@ -163,18 +167,18 @@ class FromObservations(ABC):
             for column in self._columns.values():
                 column.resize(room, refcheck=False)
 
-    def _checked(self, given: Given, frame: Frame) -> Observations:
+    def _checked(self, returned: Given, frame: Frame) -> Observations:
         """Return the observations that `observe` made, as arrays.
 
         Raises:
             DataError: If they are none: what is wrong.
         """
-        if isinstance(given, Observations):
-            return given
+        if isinstance(returned, Observations):
+            return returned
         where = f"{type(self).__name__}.observe, frame {frame.index}"
-        if not (isinstance(given, tuple) and len(given) == 3):
-            raise DataError(f"{where}: it returned a {type(given).__name__}; return voxel indices, evidence, pixels")
-        index, evidence, pixels = (np.asarray(each) for each in given)
+        if not (isinstance(returned, tuple) and len(returned) == 3):
+            raise DataError(f"{where}: it returned a {type(returned).__name__}; return voxel indices, evidence, pixels")
+        index, evidence, pixels = (np.asarray(array) for array in returned)
         n = len(pixels) if pixels.ndim else 0
         if (index.shape, evidence.shape, pixels.shape) != ((n, 3), (n, self.num_classes), (n,)):
             raise DataError(
@@ -228,14 +232,18 @@ class NumbaRules(_OfExtent):
 
     def observe(self, frame: Frame) -> Observations:
         """Return the observations of a frame, by partitions of the hash."""
-        seen = self._pixels.observe(frame)
-        sums = _dense(seen, self.num_classes) if isinstance(seen, Observed) else seen.rows()
-        return Observations(self._pixels.index_of(seen.key), sums / seen.pixels[:, None], seen.pixels.copy())
+        observations = self._pixels.observe(frame)
+        sums = _dense(observations, self.num_classes) if isinstance(observations, Observed) else observations.rows()
+        return Observations(
+            self._pixels.index_of(observations.key), sums / observations.pixels[:, None], observations.pixels.copy()
+        )
 
 
-def _dense(seen: Observed, K: int) -> Float64:
-    sums, some = np.zeros((len(seen.key), K)), seen.weight > 0  # the others are room that was left
-    sums[np.repeat(np.arange(len(sums)), np.diff(seen.start))[some], seen.label[some]] = seen.weight[some]
+def _dense(observations: Observed, K: int) -> Float64:
+    sums, filled = np.zeros((len(observations.key), K)), observations.weight > 0  # the others are room that was left
+    sums[np.repeat(np.arange(len(sums)), np.diff(observations.start))[filled], observations.label[filled]] = (
+        observations.weight[filled]
+    )
     return sums
 
 

@@ -60,10 +60,10 @@ class History:
 
     def append(self, seen: Observed, row: Int64, frame: int) -> None:
         """Store a copy of the observations of the map's rows that outlives the next frame."""
-        some, n = seen.weight > 0, len(seen.key)
-        entries = np.add.reduceat(some, seen.start[:-1], dtype=np.uint16) if n else np.zeros(0, np.uint16)
+        filled, n = seen.weight > 0, len(seen.key)
+        entries = np.add.reduceat(filled, seen.start[:-1], dtype=np.uint16) if n else np.zeros(0, np.uint16)
         rows, pixels = row.astype(np.int32), seen.pixels.astype(np.int32)
-        self._seen.append((frame, rows, pixels, entries, seen.label[some], seen.weight[some]))
+        self._seen.append((frame, rows, pixels, entries, seen.label[filled], seen.weight[filled]))
 
     def events(self, order: Int32, index: dict[str, Any]) -> Events:
         """Return the observations in order of integration within a voxel; voxels are the map's rows in that order."""
@@ -80,8 +80,8 @@ class History:
         starts = np.empty(len(voxels) + 1, np.int64)
         starts[-1] = entry[-1]
         label, weight = np.empty(entry[-1], np.uint16), np.empty(entry[-1])
-        for seen in self._seen:
-            place_observations(rank, *seen, slot, entry, frame, pixels, starts, label, weight)
+        for stored in self._seen:
+            place_observations(rank, *stored, slot, entry, frame, pixels, starts, label, weight)
         evidence = Evidence(starts, label, weight, self.num_classes)
         return Events(**index, voxel=voxels, frame=frame, evidence=evidence, pixels=pixels, voxel_size=self.voxel_size)
 
@@ -170,42 +170,44 @@ class NumbaHash:
         check_depth(frame)
         if frame.scores is not None:
             check_frame(frame, self.num_classes)
-        seen = self._pixels.observe(frame)
+        observations = self._pixels.observe(frame)
         observed = time.perf_counter()
-        change, row = self._add(seen, frame.index)
+        change, row = self._add(observations, frame.index)
         if self._history is not None:
-            entries = seen.sparse() if isinstance(seen, ObservedScores) else seen
+            entries = observations.sparse() if isinstance(observations, ObservedScores) else observations
             self._history.append(entries, row, frame.index)
         return self._total.add(frame.index, change, started, observed)
 
-    def _add(self, seen: Observed | ObservedScores, frame: int) -> tuple[Change, Int64]:
+    def _add(self, observations: Observed | ObservedScores, frame: int) -> tuple[Change, Int64]:
         """Add a frame's observations; return the change and the rows of its voxels."""
-        n, voxels = len(seen.key), len(self)
-        self._make_slots(most_slots(self._used, seen.bounds))
+        n, voxels = len(observations.key), len(self)
+        self._make_slots(most_slots(self._used, observations.bounds))
         row, slot = np.empty(n, np.int64), np.empty(n, np.int64)
-        base = look_up(seen.key, seen.bounds, self._slots, self._used, row, slot)
+        base = look_up(observations.key, observations.bounds, self._slots, self._used, row, slot)
         new = int(base[-1])
         _grow(self._records, voxels + new)
         sums = np.zeros((PARTITIONS, 4))
         changed = BeliefChange.room(n)
-        self._last = seen.key, changed
+        self._last = observations.key, changed
         report = sums, *changed
-        if isinstance(seen, ObservedScores):
-            dense_base = self._make_dense(seen, row, base)
+        if isinstance(observations, ObservedScores):
+            dense_base = self._make_dense(observations, row, base)
             update_dense(
-                seen.key, seen.pixels, seen.row, seen.sums, seen.bounds, frame, row, slot, voxels, base,
-                dense_base, self._slots, self._records, self._nodes, self._dense, *report,
+                observations.key, observations.pixels, observations.row, observations.sums, observations.bounds,
+                frame, row, slot, voxels, base, dense_base, self._slots, self._records, self._nodes, self._dense,
+                *report,
             )  # fmt: skip
         else:
-            self._nodes_used = make_nodes(self._ranges, seen.bounds, seen.start, self._nodes_used)
+            self._nodes_used = make_nodes(self._ranges, observations.bounds, observations.start, self._nodes_used)
             _grow(self._nodes, self._nodes_used)
             update(
-                seen.key, seen.pixels, seen.start, seen.label, seen.weight, seen.bounds, frame, row, slot, voxels, base,
+                observations.key, observations.pixels, observations.start, observations.label, observations.weight,
+                observations.bounds, frame, row, slot, voxels, base,
                 self._slots, self._records, self._nodes, self._dense, self._ranges, *report,
             )  # fmt: skip
         vss, entropy, _, recurrent = sums.sum(axis=0)
         drift = sums[:, 2].sum()
-        return Change.of((seen.pixels.sum(), n, new, drift, vss, entropy, recurrent)), row
+        return Change.of((observations.pixels.sum(), n, new, drift, vss, entropy, recurrent)), row
 
     def changes(self) -> Changes | None:
         """Return the changes by the last frame."""
@@ -272,11 +274,11 @@ class NumbaHash:
                 enter(self._records[: len(self)], slots)
             self._slots = slots
 
-    def _make_dense(self, seen: ObservedScores, row: Int64, base: Int64) -> Int64:
+    def _make_dense(self, observations: ObservedScores, row: Int64, base: Int64) -> Int64:
         """Return the room for a dense row for each of the frame's voxels; where those of each partition begin."""
         if self._dense_used < len(self):  # else only the frame's new voxels have none
             without = (row < 0) | (self._records["next"][np.maximum(row, 0)] > DENSE)
-            base = np.concatenate([[0], np.cumsum(without)])[seen.bounds]
+            base = np.concatenate([[0], np.cumsum(without)])[observations.bounds]
         base = self._dense_used + base
         self._dense_used = int(base[-1])
         used, stride = self._dense_used, self._dense.shape[1]
@@ -295,5 +297,5 @@ def _grow(rows: npt.NDArray[Any], needed: int) -> None:
 def _announce_compiling() -> None:
     """Say, once a process, that the first frame compiles: where numba has not cached the code."""
     if not is_cached(update):
-        then = "the result is cached" if update.stats.cache_path else "no folder can be written to cache the result"
-        logging.getLogger("semstab").warning("backend numba: compiling, once (half a minute); %s", then)
+        outcome = "the result is cached" if update.stats.cache_path else "no folder can be written to cache the result"
+        logging.getLogger("semstab").warning("backend numba: compiling, once (half a minute); %s", outcome)

@@ -64,10 +64,12 @@ class NumpyHistory:
         """Append the frame's observations to the history; return them, and the rows of their voxels."""
         check_depth(frame)
         check_frame(frame, self.num_classes)
-        seen = self._observe(frame)
-        rows = self._rows(seen)
-        self._history.append(_Seen(rows.astype(np.int32), frame.index, Evidence.of(seen.s_bar), seen.pixels))
-        return rows, seen
+        observations = self._observe(frame)
+        rows = self._rows(observations)
+        self._history.append(
+            _Seen(rows.astype(np.int32), frame.index, Evidence.of(observations.s_bar), observations.pixels)
+        )
+        return rows, observations
 
     def table(self) -> VoxelTable:
         """Return the map so far, from the history."""
@@ -80,10 +82,12 @@ class NumpyHistory:
         rank = np.empty_like(order)
         rank[order] = np.arange(len(order))
         nothing = np.zeros(0, dtype=np.int64)
-        voxel = np.concatenate([nothing, *(rank[seen.rows] for seen in self._history)])
-        frame = np.concatenate([nothing, *(np.full(len(seen.rows), seen.frame) for seen in self._history)])
-        pixels = np.concatenate([nothing, *(seen.pixels for seen in self._history)])
-        s_bar = Evidence.joined([Evidence.of(np.zeros((0, self.num_classes))), *(seen.s_bar for seen in self._history)])
+        voxel = np.concatenate([nothing, *(rank[stored.rows] for stored in self._history)])
+        frame = np.concatenate([nothing, *(np.full(len(stored.rows), stored.frame) for stored in self._history)])
+        pixels = np.concatenate([nothing, *(stored.pixels for stored in self._history)])
+        s_bar = Evidence.joined(
+            [Evidence.of(np.zeros((0, self.num_classes))), *(stored.s_bar for stored in self._history)]
+        )
         by_voxel = np.argsort(voxel, kind="stable")  # stable: keeps the order of integration within a voxel
         return Events(
             **index_columns(voxels[order]),
@@ -100,9 +104,9 @@ class NumpyHistory:
         pixels = valid if self.within is None else valid & falling_into(self.within, frame, self.voxel_size)
         return observe(frame, self.voxel_size, self.num_classes, pixels)
 
-    def _rows(self, seen: Observations) -> Int64:
+    def _rows(self, observations: Observations) -> Int64:
         """Return the rows of the frame's voxels, new ones added."""
-        voxels = np.ascontiguousarray(seen.index, dtype=np.int64).view("V24").ravel().tolist()
+        voxels = np.ascontiguousarray(observations.index, dtype=np.int64).view("V24").ravel().tolist()
         return np.fromiter(map(self._row.__getitem__, voxels), dtype=np.int64, count=len(voxels))
 
 
@@ -129,14 +133,14 @@ class NumpyReference(NumpyHistory):
     def integrate(self, frame: Frame) -> FrameReport:
         """Append the frame's observations to the history, and add them to the evidence so far."""
         started = time.perf_counter()
-        rows, seen = self.append(frame)
+        rows, observations = self.append(frame)
         self._make_room()
         before = self._evidence[rows]
-        after = before + seen.s_bar
+        after = before + observations.s_bar
         self._evidence[rows] = after
         self._op[rows] += 1
-        change, changed = Change.between(before, after, self._op[rows], seen.pixels)
-        self._changes = Changes(seen.index, *changed)
+        change, changed = Change.between(before, after, self._op[rows], observations.pixels)
+        self._changes = Changes(observations.index, *changed)
         return self._total.add(frame.index, change, started)
 
     def changes(self) -> Changes | None:
@@ -175,9 +179,9 @@ class NumpySample(NumpyHistory):
         not count.
         """
         started = time.perf_counter()
-        _, seen = self.append(frame)
+        _, observations = self.append(frame)
         if self._by_rule is not None:
-            self._by_rule.add(frame, seen, time.perf_counter())
+            self._by_rule.add(frame, observations, time.perf_counter())
         while len(self._row) - self._left > (MOST if self.one_in >= ONE_IN else MOST_OF_ALL):
             self._thin()
         if self._ahead is None:
@@ -203,10 +207,10 @@ class NumpySample(NumpyHistory):
         from semstab.backends.shared.pixel_keys import drawn_of
 
         near = drawn_of(frame, self.voxel_size, ODD, self.one_in)
-        seen = observe(frame, self.voxel_size, self.num_classes, near)
-        held = in_sample(seen.index.T, self.one_in)
-        held = held if self.within is None else held & self.within.holds(seen.index.T)
-        return Observations(seen.index[held], seen.s_bar[held], seen.pixels[held])
+        observations = observe(frame, self.voxel_size, self.num_classes, near)
+        held = in_sample(observations.index.T, self.one_in)
+        held = held if self.within is None else held & self.within.holds(observations.index.T)
+        return Observations(observations.index[held], observations.s_bar[held], observations.pixels[held])
 
 
 def in_sample(index: npt.NDArray[np.integer], one_in: int = ONE_IN) -> Mask:
@@ -214,5 +218,5 @@ def in_sample(index: npt.NDArray[np.integer], one_in: int = ONE_IN) -> Mask:
     mixed = np.zeros(index.shape[1], np.int64)
     for axis, odd in zip(index, ODD, strict=True):
         mixed += axis * odd
-    drawn: Mask = (mixed >> 40) & (one_in - 1) == 0
-    return drawn
+    selected: Mask = (mixed >> 40) & (one_in - 1) == 0
+    return selected

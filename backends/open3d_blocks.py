@@ -111,13 +111,13 @@ class Open3DBlocks(FusionBackend):
         check_depth(frame)
         if frame.scores is not None:
             check_frame(frame, self.num_classes)
-        seen = self._pixels.observe(frame)
-        if isinstance(seen, ObservedScores):
-            seen = seen.sparse()
+        observations = self._pixels.observe(frame)
+        if isinstance(observations, ObservedScores):
+            observations = observations.sparse()
         observed = time.perf_counter()
-        index = self._pixels.index_of(seen.key)
-        rows = self._activate(index) if len(index) else seen.key
-        change, changed = self._update(rows, seen, frame.index)
+        index = self._pixels.index_of(observations.key)
+        rows = self._activate(index) if len(index) else observations.key
+        change, changed = self._update(rows, observations, frame.index)
         self._changes = Changes(index, *changed)
         return self._total.add(frame.index, change, started, observed)
 
@@ -136,7 +136,7 @@ class Open3DBlocks(FusionBackend):
         rows = rows[order]
         columns = [name for name in self.attributes if name not in DENSE]
         values: dict[str, Any] = {name: self._read(name, rows) for name in columns}
-        evidence = Evidence.read(len(rows), self.num_classes, lambda some: self._read("evidence", rows[some]))
+        evidence = Evidence.read(len(rows), self.num_classes, lambda part: self._read("evidence", rows[part]))
         return VoxelTable(**index_columns(index[order]), **values, evidence=evidence, voxel_size=self.voxel_size)
 
     def _new_grid(self, blocks: int) -> VoxelBlockGrid:
@@ -188,12 +188,12 @@ class Open3DBlocks(FusionBackend):
         index: Int64 = keys[block] * r + local
         return index
 
-    def _update(self, rows: Int64, seen: Observed, frame: int) -> tuple[Change, BeliefChange]:
+    def _update(self, rows: Int64, observations: Observed, frame: int) -> tuple[Change, BeliefChange]:
         """Add one observation to each row; return the change of the map, and of each voxel as `Changes` has it."""
         names = tuple(self.attributes)
         values = {name: self._attribute(name).numpy() if self.in_place else self._read(name, rows) for name in names}
         columns = {name: value if name in DENSE else value.reshape(-1) for name, value in values.items()}
-        change = update_rows(rows if self.in_place else np.arange(len(rows)), seen, frame, **columns)
+        change = update_rows(rows if self.in_place else np.arange(len(rows)), observations, frame, **columns)
         if not self.in_place:
             for name in names:
                 self._write(name, rows, values[name])

@@ -132,11 +132,11 @@ class Projector(Aggregator):
         with np.errstate(divide="ignore", invalid="ignore"):
             u = np.floor(K.fx * (x / z) + (K.cx + 0.5))
             v = np.floor(K.fy * (y / z) + (K.cy + 0.5))
-        seen = np.nonzero((z > 0) & (u >= 0) & (u < W) & (v >= 0) & (v < H))
-        pixel = (v[seen] * W + u[seen]).astype(np.int64)
-        sdf = frame.depth.reshape(-1)[pixel] - z[seen]
+        inside = np.nonzero((z > 0) & (u >= 0) & (u < W) & (v >= 0) & (v < H))
+        pixel = (v[inside] * W + u[inside]).astype(np.int64)
+        sdf = frame.depth.reshape(-1)[pixel] - z[inside]
         near = frame.valid.reshape(-1)[pixel] & (np.abs(sdf) <= self.band * self.voxel_size)
-        block, local = (at[near] for at in seen)
+        block, local = (positions[near] for positions in inside)
         return blocks[block] * self.block_resolution + self._local[local], pixel[near]
 
     def _observed(self, frame: Frame, pixel: Int64) -> Observed:

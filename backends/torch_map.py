@@ -140,18 +140,18 @@ class TorchMaps:
     def fuse(self, view: DepthView, predicted: Mapping[str, Labels | Scores], started: float) -> dict[str, FrameReport]:
         """Fuse a view that is on the device, with predictions of some models; timed from `started`."""
         grid = self._grid or self._first_grid(view)
-        seen = associate(view, grid)
-        evidence = {name: self._evidence(seen, image, name, view) for name, image in predicted.items()}
-        rows, voxels = self._look_up(seen, evidence, view, grid)
+        association = associate(view, grid)
+        evidence = {name: self._evidence(association, image, name, view) for name, image in predicted.items()}
+        rows, voxels = self._look_up(association, evidence, view, grid)
         associated = time.perf_counter()
         self.storage.make_room(voxels, f"frame {view.camera.index}")
-        self.storage.add(seen.keys, rows, voxels)
+        self.storage.add(association.keys, rows, voxels)
         self._grid = grid
         self._updates = {
             name: update(self.storage.columns[name], rows, of_name, view.camera.index)
             for name, of_name in evidence.items()
         }
-        self._keys = seen.keys
+        self._keys = association.keys
         sums = torch.stack([of_name.sums for of_name in self._updates.values()]).tolist() if evidence else []
         return {
             name: self._totals[name].add(view.camera.index, Change.of(of_name), started, associated)
@@ -168,11 +168,11 @@ class TorchMaps:
         used = torch.nonzero(self.storage.hash.keys != EMPTY)[:, 0]
         keys, order = torch.sort(self.storage.hash.keys[used])  # packed keys sort like (ix, iy, iz)
         rows = self.storage.hash.rows[used[order]].to(torch.int64)
-        seen = columns.values["op"][rows] > 0
-        keys, rows = keys[seen].cpu(), rows[seen]
+        observed = columns.values["op"][rows] > 0
+        keys, rows = keys[observed].cpu(), rows[observed]
         values: dict[str, Any] = {name: _at_home(columns.values[name], rows) for name in Columns.TYPES}
         values["evidence"] = Evidence.read(
-            len(rows), columns.num_classes, lambda some: _at_home(columns.values["evidence"], rows[some])
+            len(rows), columns.num_classes, lambda part: _at_home(columns.values["evidence"], rows[part])
         )
         index = columns_of_keys(keys.numpy(), self._grid.origin if self._grid else (0, 0, 0))
         return VoxelTable(**index, **values, voxel_size=self.voxel_size)
@@ -192,20 +192,22 @@ class TorchMaps:
             raise ConfigError(f"there is no map of '{name}'; there is {', '.join(self.storage.columns)}")
         return self.storage.columns[name]
 
-    def _evidence(self, seen: Association, predicted: Labels | Scores, name: str, view: DepthView) -> ViewEvidence:
+    def _evidence(
+        self, association: Association, predicted: Labels | Scores, name: str, view: DepthView
+    ) -> ViewEvidence:
         K = self.storage.columns[name].num_classes
         if isinstance(predicted, Labels):
-            return count_labels(seen, predicted, K)
+            return count_labels(association, predicted, K)
         if len(predicted.values) != K:
             kind = "logits" if predicted.softmax else "scores"
             raise DataError(f"{_where(view, kind, name)}: {kind} hold {len(predicted.values)} classes, the map {K}")
-        return sum_scores(seen, predicted, K)
+        return sum_scores(association, predicted, K)
 
     def _look_up(
-        self, seen: Association, evidence: Mapping[str, ViewEvidence], view: DepthView, grid: MapGrid
+        self, association: Association, evidence: Mapping[str, ViewEvidence], view: DepthView, grid: MapGrid
     ) -> tuple[torch.Tensor, int]:
         """Return rows of the view's voxels, new ones included, and the number of voxels then; checks the evidence."""
-        rows = self.storage.hash.find(seen.keys)
+        rows = self.storage.hash.find(association.keys)
         observed = torch.zeros_like(rows, dtype=torch.bool)
         for of_name in evidence.values():
             observed |= of_name.pixels > 0
@@ -223,7 +225,7 @@ class TorchMaps:
                 where = _where(view, "scores", name)
                 raise DataError(f"{where}: scores are negative; give logits as logits, or apply a softmax first")
             if lost:
-                raise out_of_reach(view.frame(seen.voxel == LOST), grid.origin, grid.voxel_size)
+                raise out_of_reach(view.frame(association.voxel == LOST), grid.origin, grid.voxel_size)
         return torch.where(new, row_of_new, rows), self.storage.voxels + int(added)
 
     def _first_grid(self, view: DepthView) -> MapGrid:
@@ -328,11 +330,11 @@ class TorchMap(FusionBackend):
         points = None if frame.points is None else on_device(frame.points, self.device)
         view = DepthView(on_device(frame.depth, self.device), frame, points)
         if frame.labels is not None:
-            seen: Labels | Scores = Labels(on_device(frame.labels, self.device).reshape(-1), frame.ignore_id)
+            prediction: Labels | Scores = Labels(on_device(frame.labels, self.device).reshape(-1), frame.ignore_id)
         else:
             scores = on_device(cast(Image, frame.scores), self.device)
-            seen = Scores(scores.reshape(-1, scores.shape[2]).T, softmax=False)
-        return self.maps.fuse(view, {"": seen}, started)[""]
+            prediction = Scores(scores.reshape(-1, scores.shape[2]).T, softmax=False)
+        return self.maps.fuse(view, {"": prediction}, started)[""]
 
     def integrate_tensors(
         self,

@@ -162,10 +162,10 @@ def count_labels(seen: Association, predicted: Labels, num_classes: int) -> View
     flags = seen.keys.new_tensor([-1, 0, 0])
     for part in parts(len(voxels), chunk_of(sums.device)):
         voxel, label = voxels[part], predicted.ids[part].to(torch.int64)
-        given = (label >= 0) & (label != predicted.ignore) & (voxel != NONE)
-        wrong = (torch.where(given, label, -1).max(), (given & (voxel == LOST)).any(), flags[2])
+        labelled = (label >= 0) & (label != predicted.ignore) & (voxel != NONE)
+        wrong = (torch.where(labelled, label, -1).max(), (labelled & (voxel == LOST)).any(), flags[2])
         flags = torch.maximum(flags, torch.stack([flag.to(torch.int64) for flag in wrong]))
-        cells = (label * n + voxel)[given & (voxel >= 0) & (label < K)]
+        cells = (label * n + voxel)[labelled & (voxel >= 0) & (label < K)]
         sums.index_add_(0, cells, sums.new_ones(()).expand(len(cells)))
     sums = sums.reshape(K, n)
     return ViewEvidence(sums, sums.sum(dim=0), 1.0, flags)
@@ -186,9 +186,9 @@ def sum_scores(seen: Association, predicted: Scores, num_classes: int) -> ViewEv
         wrong = (flags[0], (usable & (voxel == LOST)).any(), below.any())
         flags = torch.maximum(flags, torch.stack([flag.to(torch.int64) for flag in wrong]))
         usable &= voxel != LOST
-        at, units = voxel[usable].to(torch.int64), torch.floor(s[:, usable] * scale + 0.5).to(torch.int64)
-        sums.index_add_(0, (classes * n + at).reshape(-1), units.reshape(-1))
-        pixels.index_add_(0, at, torch.ones_like(at))
+        rows, units = voxel[usable].to(torch.int64), torch.floor(s[:, usable] * scale + 0.5).to(torch.int64)
+        sums.index_add_(0, (classes * n + rows).reshape(-1), units.reshape(-1))
+        pixels.index_add_(0, rows, torch.ones_like(rows))
     return ViewEvidence(sums.reshape(K, n), pixels, scale, flags)
 
 

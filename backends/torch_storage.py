@@ -66,13 +66,13 @@ class VoxelHash:
         """Return rows (n,) int64 of keys (n,), EMPTY for those that the hash does not hold."""
         rows = torch.full_like(keys, EMPTY)
         mask = len(self.keys) - 1
-        at, searched = mix(keys) & mask, torch.arange(len(keys), device=keys.device)
+        slots, searched = mix(keys) & mask, torch.arange(len(keys), device=keys.device)
         while len(searched):
-            held = self.keys[at]
+            held = self.keys[slots]
             hit = held == keys[searched]
-            rows[searched[hit]] = self.rows[at[hit]].to(torch.int64)
+            rows[searched[hit]] = self.rows[slots[hit]].to(torch.int64)
             further = ~hit & (held != EMPTY)
-            at, searched = (at[further] + 1) & mask, searched[further]
+            slots, searched = (slots[further] + 1) & mask, searched[further]
         return rows
 
     def insert(self, keys: torch.Tensor, rows: torch.Tensor, first: int = 0) -> None:
@@ -80,15 +80,15 @@ class VoxelHash:
 
         EMPTY keys are left out, and those whose row is below `first`.
         """
-        wanted = (keys != EMPTY) & (rows >= first)
-        keys, rows, mask = keys[wanted], rows[wanted].to(torch.int32), len(self.keys) - 1
-        at = mix(keys) & mask
+        added = (keys != EMPTY) & (rows >= first)
+        keys, rows, mask = keys[added], rows[added].to(torch.int32), len(self.keys) - 1
+        slots = mix(keys) & mask
         while len(keys):
-            free = self.keys[at] == EMPTY
-            self.keys[at[free]] = keys[free]  # several keys may want a slot: one of them gets it
-            written = free & (self.keys[at] == keys)
-            self.rows[at[written]] = rows[written]
-            at, keys, rows = (at[~written] + 1) & mask, keys[~written], rows[~written]
+            free = self.keys[slots] == EMPTY
+            self.keys[slots[free]] = keys[free]  # several keys may want a slot: one of them gets it
+            written = free & (self.keys[slots] == keys)
+            self.rows[slots[written]] = rows[written]
+            slots, keys, rows = (slots[~written] + 1) & mask, keys[~written], rows[~written]
 
 
 def mix(key: torch.Tensor) -> torch.Tensor:
@@ -197,9 +197,9 @@ class Storage:
     def _bytes_to_grow(self, voxels: int) -> int:
         """Return the most memory taken while it grows: its memory then, and the column or hash that is copied."""
         columns = self.columns.values()
-        then = SLOT_BYTES * slots_for(voxels) + voxels * sum(c.row_bytes for c in columns)
+        grown = SLOT_BYTES * slots_for(voxels) + voxels * sum(c.row_bytes for c in columns)
         copied = max(self.hash.bytes, *(c.values["evidence"].nbytes for c in columns))
-        return then + copied
+        return grown + copied
 
     def _grow(self, voxels: int) -> None:
         for columns in self.columns.values():
@@ -341,8 +341,10 @@ def evidence_of(prediction: TensorPrediction, view: DepthView, num_classes: int,
     layout = "(H, W)" if kind == "labels" else "(K, H, W)"
     fits = image.dtype in INTEGERS if kind == "labels" else image.is_floating_point()
     if not fits or image.ndim != len(layout.split(",")):
-        wanted = "integers" if kind == "labels" else "float"
-        raise DataError(f"{where}: {kind} must be {wanted} {layout}, got {_type(image)} of shape {tuple(image.shape)}")
+        expected = "integers" if kind == "labels" else "float"
+        raise DataError(
+            f"{where}: {kind} must be {expected} {layout}, got {_type(image)} of shape {tuple(image.shape)}"
+        )
     if image.shape[-2:] != view.depth.shape:
         (H, W), (h, w) = view.depth.shape, image.shape[-2:]
         raise DataError(f"{where}: {kind} are {w}x{h} but depth is {W}x{H}; bring them to one size")

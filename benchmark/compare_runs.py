@@ -55,27 +55,27 @@ MOST_NUMBERS = 9
 def charts(comparison: RunComparison) -> dict[str, list[dict[str, str]]]:
     """Return charts of the differences with their intervals, by the name of the table above them."""
     colors = {run.name: k for k, run in enumerate(comparison.runs[1:])}
-    shown, panels, by_class = by_name(HEADLINES), Panels(), Panels()
+    quantities, panels, by_class = by_name(HEADLINES), Panels(), Panels()
     for scope, against in scopes(comparison):
         for row in against.contrasts:
-            if row.measure in shown:
+            if row.measure in quantities:
                 dot = (colors[against.other], against.other, row.difference)
-                panels.setdefault(shown[row.measure].named, {}).setdefault(scope, []).append(dot)
+                panels.setdefault(quantities[row.measure].named, {}).setdefault(scope, []).append(dot)
     for quantity in (quantity for quantity in IN_CLASSES if quantity is not PSA):
-        for own in comparison.overall if any(own.by_class for own in comparison.overall) else ():
-            for row in (*own.contrasts, *own.by_class):
+        for of_run in comparison.overall if any(of_run.by_class for of_run in comparison.overall) else ():
+            for row in (*of_run.contrasts, *of_run.by_class):
                 if row.measure == (MIOU.name if quantity is IOU and not row.of else quantity.name):
                     dots = by_class.setdefault(quantity.named, {}).setdefault(row.of or "all classes", [])
-                    dots.append((colors[own.other], own.other, row.difference))
+                    dots.append((colors[of_run.other], of_run.other, row.difference))
     less = f"less {comparison.base}"
     return {
         name: [
             {"title": title, "chart": dot_chart(rows, f"{title} {less}", (0.0,))}
-            for title, rows in drawn.items()
+            for title, rows in chart_panels.items()
             if any(estimate.value for row in rows.values() for _, _, estimate in row)  # not where nothing differs
         ]
-        for name, drawn in (("comparison", panels), ("comparison_classes", by_class))
-        if drawn
+        for name, chart_panels in (("comparison", panels), ("comparison_classes", by_class))
+        if chart_panels
     }
 
 
@@ -89,7 +89,7 @@ def _changed(comparison: ComparisonData) -> Iterator[tuple[SceneComparison, Agai
 
 def _shown(comparison: ComparisonData) -> Iterator[tuple[SceneComparison, Against, Changes]]:
     """Yield the same without those of which no voxel can be shown, as no two frames see one place in both runs."""
-    return (each for each in _changed(comparison) if len(each[2].shown.table))
+    return (changed for changed in _changed(comparison) if len(changed[2].shown.table))
 
 
 def maps(comparison: ComparisonData, known: Mapping[str, Georeference] = MappingProxyType({})) -> Iterator[Figure]:
@@ -114,20 +114,20 @@ def _draw(
     against: Against,
     georeference: Georeference | None,
 ) -> Canvas:
-    shown = changes.shown
-    panels = [Panel("agreement", ("lost", "gained"), shown.change, *_numbers(scene, against, "agreement"))]
-    if shown.right is not None:
+    visible = changes.shown
+    panels = [Panel("agreement", ("lost", "gained"), visible.change, *_numbers(scene, against, "agreement"))]
+    if visible.right is not None:
         panels.append(
-            Panel("truth", ("wrong now", "right now"), shown.right.astype(float), *_numbers(scene, against, "truth"))
+            Panel("truth", ("wrong now", "right now"), visible.right.astype(float), *_numbers(scene, against, "truth"))
         )
-    return draw_changes(shown.table, up, panels, georeference)
+    return draw_changes(visible.table, up, panels, georeference)
 
 
 def _numbers(scene: str, against: Against, what: str) -> tuple[list[int], list[tuple[float, float, float]], list[str]]:
     """Return the numbers of the areas that a map names, their centres, and where the page tells of them."""
-    shown = _numbered(against, what)
-    links = [f"#{_anchor(scene, against, area)}" for area in shown]
-    return [area.number for area in shown], [area.centre for area in shown], links
+    areas = _numbered(against, what)
+    links = [f"#{_anchor(scene, against, area)}" for area in areas]
+    return [area.number for area in areas], [area.centre for area in areas], links
 
 
 def _numbered(against: Against, what: str) -> list[Area]:
@@ -172,15 +172,15 @@ def compare(
         lock = FolderLock(Path(out))
     try:
         comparison = find(runs, progress, validated(ScopeOption, {"scope": scope}, "compare: ").scope)
-        known = georeferences(runs)
+        by_scene = georeferences(runs)
         if out is not None:
-            write(comparison, out, known)
+            write(comparison, out, by_scene)
     finally:
         if lock is not None:
             lock.release()
             with contextlib.suppress(OSError):
                 lock.path.rmdir()  # where nothing was written
-    return located(comparison.result, known)
+    return located(comparison.result, by_scene)
 
 
 def georeferences(runs: Sequence[str | os.PathLike[str]]) -> Mapping[str, Georeference]:
@@ -197,12 +197,13 @@ def located(result: RunComparison, known: Mapping[str, Georeference]) -> RunComp
         return replace(area, centre=(x, y, z))
 
     def in_scene(scene: SceneComparison) -> SceneComparison:
-        if (own := known.get(scene.scene)) is None:
+        if (georeference := known.get(scene.scene)) is None:
             return scene
         against = tuple(
-            replace(each, areas=tuple(projected(area, own) for area in each.areas)) for each in scene.against
+            replace(run_against, areas=tuple(projected(area, georeference) for area in run_against.areas))
+            for run_against in scene.against
         )
-        return replace(scene, against=against, crs=own.name)
+        return replace(scene, against=against, crs=georeference.name)
 
     return replace(result, scenes=tuple(map(in_scene, result.scenes)))
 
@@ -222,14 +223,14 @@ def write(
 ) -> None:
     """Write the folder, with the georeferences of scenes; nothing of an earlier comparison is left in it."""
     result = located(comparison.result, known)
-    folder, made, drawn = Path(out), tables(result), list(maps(comparison, known))
+    folder, made, figures = Path(out), tables(result), list(maps(comparison, known))
     _require_own(folder)
     write_json(folder / CONTENT, result)
     write_text(folder / PAGE, markdown(result, made))
     save_tables(made, folder)
-    keep_only([path for figure in drawn for path in figure.save(folder / "figures")], folder / "figures")
+    keep_only([path for figure in figures for path in figure.save(folder / "figures")], folder / "figures")
     _write_columns(comparison, folder)
-    write_text(folder / REPORT, page(result, made, drawn, folder, _described(comparison, result)))
+    write_text(folder / REPORT, page(result, made, figures, folder, _described(comparison, result)))
     if recorded := dict(_recorded(comparison)):
         from semstab.recording import record_changes
 
@@ -238,10 +239,10 @@ def write(
 
 def markdown(comparison: RunComparison, made: Sequence[Table] | None = None) -> str:
     """Return the comparison for a pull request: sentences, then the tables."""
-    shown = [table for table in (made or tables(comparison)) if table.name != "comparison_all"]
-    names = ", ".join(each.name for each in comparison.runs[1:])
+    printed = [table for table in (made or tables(comparison)) if table.name != "comparison_all"]
+    names = ", ".join(run.name for run in comparison.runs[1:])
     head = [f"## {names} against {comparison.base}", "", *(f"- {relations(s)}" for s in sentences(comparison)), ""]
-    return "\n".join([*head, *map(to_markdown, shown)])
+    return "\n".join([*head, *map(to_markdown, printed)])
 
 
 def page(
@@ -252,15 +253,15 @@ def page(
     areas: Sequence[Mapping[str, Any]] = (),
 ) -> str:
     """Return report.html; areas are those of `_described`."""
-    shown = [table for table in made if table.name != "comparison_all"]
+    printed = [table for table in made if table.name != "comparison_all"]
     return filled(
         "comparison.html.j2",
-        title=f"{', '.join(each.name for each in comparison.runs[1:])} against {comparison.base}",
+        title=f"{', '.join(run.name for run in comparison.runs[1:])} against {comparison.base}",
         runs=comparison.runs,
         scenes=[scene.scene for scene in comparison.scenes],
         reading=[relations(text) for text in sentences(comparison)],
         models=[(run.name, sample(k)) for k, run in enumerate(comparison.runs[1:])],
-        topics=list(_topics(shown, drawn, charts(comparison), folder)),
+        topics=list(_topics(printed, drawn, charts(comparison), folder)),
         areas=areas,
     )
 
@@ -276,29 +277,34 @@ TOPICS = (
 
 
 def _topics(
-    made: Sequence[Table], drawn: Sequence[Figure], made_charts: Mapping[str, list[dict[str, str]]], folder: Path
+    made: Sequence[Table], figures: Sequence[Figure], made_charts: Mapping[str, list[dict[str, str]]], folder: Path
 ) -> Iterator[dict[str, Any]]:
     for key, title, names in TOPICS:
-        named = [table for table in made if table.name in names]
-        shown = [figure for figure in drawn if figure.name.partition("__")[0] in names]
-        if named or shown:
+        topic_tables = [table for table in made if table.name in names]
+        topic_figures = [figure for figure in figures if figure.name.partition("__")[0] in names]
+        if topic_tables or topic_figures:
             dots = [chart for name in names for chart in made_charts.get(name, ())]
-            yield {"id": key, "title": title, "charts": dots, "blocks": list(blocks(named, shown, folder))}
+            yield {
+                "id": key,
+                "title": title,
+                "charts": dots,
+                "blocks": list(blocks(topic_tables, topic_figures, folder)),
+            }
 
 
 def _described(comparison: ComparisonData, result: RunComparison) -> list[dict[str, Any]]:
     """Return the areas of each scene and run as the page lists them, with pictures where the data is at hand."""
-    base, *others = result.runs
+    base, *compared = result.runs
     listed = []
     of_told = {(scene.scene, against.other): (scene, against) for scene in result.scenes for against in scene.against}
-    for own, against, changes in _shown(comparison):
-        scene, told = of_told[own.scene, against.other]
-        other = next(run for run in others if run.name == against.other)
-        areas = [area for what in ("agreement", "truth") for area in _numbered(told, what)]
+    for compared_scene, against, changes in _shown(comparison):
+        scene, located_against = of_told[compared_scene.scene, against.other]
+        other = next(run for run in compared if run.name == against.other)
+        areas = [area for what in ("agreement", "truth") for area in _numbered(located_against, what)]
         points = {k: own_points for k, area in enumerate(areas) if len(own_points := _points(area, changes))}
         pictures = area_pictures(areas, points, (base, other), scene.scene)
         rows = [
-            _area(area, scene.crs, pictures.get(k)) | {"id": _anchor(scene.scene, told, area)}
+            _area(area, scene.crs, pictures.get(k)) | {"id": _anchor(scene.scene, located_against, area)}
             for k, area in enumerate(areas)
         ]
         if rows:
@@ -342,8 +348,8 @@ def _write_columns(comparison: ComparisonData, folder: Path) -> None:
 def _recorded(comparison: ComparisonData) -> Iterator[tuple[tuple[str, str], tuple[Any, ...]]]:
     for scene, against, changes in _shown(comparison):
         areas = [(area.what, f"{area.number} {area.of}", area.centre) for area in against.areas]
-        title, shown = heading(comparison.result, scene.scene, against), changes.shown
-        yield (scene.scene, against.other), (title, shown.table, shown.change, shown.right, areas)
+        title, visible = heading(comparison.result, scene.scene, against), changes.shown
+        yield (scene.scene, against.other), (title, visible.table, visible.change, visible.right, areas)
 
 
 def _require_own(folder: Path) -> None:

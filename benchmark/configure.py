@@ -74,12 +74,12 @@ def _named_in(content: Any, field: str = "") -> Iterator[tuple[str, str]]:
     """Yield each field of settings that may name code, and its name."""
     items: Any = enumerate(content) if isinstance(content, list) else getattr(content, "items", tuple)()
     for key, value in items:
-        at = f"{field}.{key}" if field else str(key)
-        of_backends = at in ("backends", "check") or (field == "backends" and isinstance(content, list))
-        of_dataset = re.search(r"(^|\.)dataset(\.name)?$", at) is not None
+        field_path = f"{field}.{key}" if field else str(key)
+        of_backends = field_path in ("backends", "check") or (field == "backends" and isinstance(content, list))
+        of_dataset = re.search(r"(^|\.)dataset(\.name)?$", field_path) is not None
         if isinstance(value, str) and (of_backends or of_dataset or key in CODE_KEYS):
-            yield at, value
-        yield from _named_in(value, at)
+            yield field_path, value
+        yield from _named_in(value, field_path)
 
 
 def as_config(settings: Config | Mapping[str, Any] | str | Path) -> Config:
@@ -109,8 +109,8 @@ def load_study(study: str | Path, overrides: Mapping[str, Any] | None = None) ->
             f"'{study}' is neither a study that ships nor a .yaml file; {nearest(str(study), shipped_studies())}"
         )
     content = _over(read_yaml(path), overrides or {})
-    own = {"name": path.stem, "check": None}
-    return Config.build(merge(merge(dataset_defaults(content), own), content), str(path))
+    defaults = {"name": path.stem, "check": None}
+    return Config.build(merge(merge(dataset_defaults(content), defaults), content), str(path))
 
 
 def shipped_studies() -> tuple[str, ...]:
@@ -201,7 +201,9 @@ def with_vocabularies(config: Config, files: Sequence[Path]) -> Config:
     options = {"dataset": config.dataset.model_dump(mode="json"), "vocabularies": [str(file) for file in files]}
     models = config.models
     if models is not None:
-        over = [(model, name) for model in models for name, own in vocabularies.items() if own.is_for(model)]
+        over = [
+            (model, name) for model in models for name, vocabulary in vocabularies.items() if vocabulary.is_for(model)
+        ]
         models = [*models, *(f"{model}@{name}" for model, name in over if model != GROUND_TRUTH)]
     dataset = DatasetConfig(name=VOCABULARIES, options=options)
     return config.model_copy(update={"dataset": dataset, "models": models})
@@ -214,11 +216,11 @@ def _of_file(path: str | Path | None) -> dict[str, Any]:
 def _over(content: Mapping[str, Any], overrides: Mapping[str, Any]) -> dict[str, Any]:
     """Return overrides on top of a file, short forms written out; no `scene_frames` at all clear those of the file."""
     long = [dict(content), dict(overrides)]
-    for each in long:
-        if isinstance(dataset := each.get("dataset"), str):
-            each["dataset"] = {"name": dataset}
-        if "frames" in each:
-            each["frames"] = in_full(each["frames"])
+    for settings in long:
+        if isinstance(dataset := settings.get("dataset"), str):
+            settings["dataset"] = {"name": dataset}
+        if "frames" in settings:
+            settings["frames"] = in_full(settings["frames"])
     return merge(*long) | ({"scene_frames": {}} if overrides.get("scene_frames") == {} else {})
 
 

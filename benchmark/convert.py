@@ -239,8 +239,8 @@ class SceneFolder:
                 raise ConfigError(f"{self.path}: the folder exists and holds no conversion; choose another --out")
             return None
         try:
-            there = read_json(manifest)
-            key, scale = there["key"], there["depth_scale"]
+            stored = read_json(manifest)
+            key, scale = stored["key"], stored["depth_scale"]
             form = DepthFormat(None if scale is None else float(scale))
             if form.scale is not None and not 0 < form.scale < np.inf:
                 raise ValueError(f"depth_scale is {scale}")
@@ -319,14 +319,14 @@ def convert_scene(scene: Scene, config: Config, path: Path, depth_error: float, 
     require_posed(scene)
     if scene.of_scans:
         raise DataError(f"{scene.name}: holds scans, and a posed folder holds images; scans are read as they are")
-    known = (*scene.models, *scene.by_name)
-    models = selected(config.models, known, (), "model", scene.name)
+    sources = (*scene.models, *scene.by_name)
+    models = selected(config.models, sources, (), "model", scene.name)
     indices = frame_indices(scene, config, models)
     dataset = config.dataset.model_dump(mode="json")
     folder = SceneFolder(path, {"dataset": dataset, "scene": scene.name, "depth_error": depth_error}, depth_error)
-    if others := folder.frames - set(map(_name, indices)):
+    if surplus := folder.frames - set(map(_name, indices)):
         raise ConfigError(
-            f"{path}: the folder holds frame {min(others)}, which is not selected now; choose another --out"
+            f"{path}: the folder holds frame {min(surplus)}, which is not selected now; choose another --out"
         )
     folders = [folder_name(name) for name in models]
     if repeated := [name for name in models if folders.count(folder_name(name)) > 1]:
@@ -445,9 +445,9 @@ def frame_bar(console: Console) -> Iterator[Callable[[str, int, int], None]]:
 def print_converted(converted: Converted, console: Console) -> None:
     """Print the scene, its frames and folder, renamed label sources, and things that were not converted."""
     before = converted.frames - converted.written
-    there = f", {before} of them finished earlier" if before else ""
+    earlier = f", {before} of them finished earlier" if before else ""
     console.print(
-        f"{converted.scene}: {converted.frames} frames{there}, depth as {converted.depth}: {converted.folder}",
+        f"{converted.scene}: {converted.frames} frames{earlier}, depth as {converted.depth}: {converted.folder}",
         soft_wrap=True,
     )
     for old, new in converted.renamed.items():

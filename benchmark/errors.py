@@ -102,8 +102,8 @@ def sanitize(text: str) -> str:
     head = LONGEST_LINE * 2 // 3
     ends = text[:LONGEST_LINE] + text[LONGEST_LINE:][-LONGEST_LINE:]
     line = shown(ends)
-    whole = len(text) <= 2 * LONGEST_LINE and len(line) <= LONGEST_LINE
-    return line if whole else f"{line[:head]} ... {line[head + 5 - LONGEST_LINE :]}"
+    is_short = len(text) <= 2 * LONGEST_LINE and len(line) <= LONGEST_LINE
+    return line if is_short else f"{line[:head]} ... {line[head + 5 - LONGEST_LINE :]}"
 
 
 def summarize_error(error: BaseException) -> str:

@@ -50,14 +50,16 @@ def filter_study_config(
     config, _ = with_voxel_size(config, scenes)
     shipped = load_study(STUDY).dataset.options["try_filters"]
     grid = ["+".join(str(parse(text)) for text in chain.split("+")) for chain in filters or shipped]
-    grid, left_out = _warpable(grid, scene, frame_indices(scene, config), named=bool(filters))
+    grid, left_out = _warpable(grid, scene, frame_indices(scene, config), requested=bool(filters))
     settings = {**content, "voxel_size": config.voxel_size, "frame_quality": True, "check": None, "name": STUDY}
     study = predicted_config(predictors, None, {**settings, "models": None})
     dataset_config = study.dataset.model_copy(update={"options": {**study.dataset.options, "try_filters": grid}})
     return study.model_copy(update={"dataset": dataset_config}), left_out
 
 
-def _warpable(grid: Sequence[str], scene: Scene, frames: Sequence[int], *, named: bool) -> tuple[list[str], list[str]]:
+def _warpable(
+    grid: Sequence[str], scene: Scene, frames: Sequence[int], *, requested: bool
+) -> tuple[list[str], list[str]]:
     """Return the filters that the scene's depth allows, and a note on the others, which is an error if they are named.
 
     Raises:
@@ -66,10 +68,10 @@ def _warpable(grid: Sequence[str], scene: Scene, frames: Sequence[int], *, named
     warping = [text for text in grid if any(parse(part).kind.warps for part in text.split("+"))]
     if not warping:
         return list(grid), []
-    densities = [density(scene.depth(frames[at])) for at in evenly(len(frames), DENSITY_FRAMES)]
+    densities = [density(scene.depth(frames[position])) for position in evenly(len(frames), DENSITY_FRAMES)]
     reason = too_sparse([parse(part) for text in warping for part in text.split("+")], mean(np.array(densities)))
     if reason is None:
         return list(grid), []
-    if named:
+    if requested:
         raise ConfigError(f"{scene.name}: {reason}")
     return [text for text in grid if text not in warping], [f"{scene.name}: left out, because {reason}"]

@@ -59,9 +59,9 @@ class Task:
 def class_distances(task: Task, config: Config) -> Float64 | None:
     """Return distances (K, K) between the classes of a run, from the settings, else from the model's own names."""
     target = task.mapping.target
-    given = distances_of(target, config.distances)
-    own = task.scene.label_space(task.model)
-    return task.scene.distances(task.model) if given is None and own == target else given
+    distances = distances_of(target, config.distances)
+    label_space = task.scene.label_space(task.model)
+    return task.scene.distances(task.model) if distances is None and label_space == target else distances
 
 
 def open_scenes(config: Config, run_folder: Path | None = None, *, posed: bool = True) -> dict[str, Scene]:
@@ -114,10 +114,10 @@ def tasks_of(scene: Scene, config: Config, others: Sequence[str] = ()) -> Iterat
         mapping = source.mapping_to(target)
         distances_of(target, config.distances)  # a file that cannot be used is named before any frame is read
         predicted = [*dict.fromkeys((*source.classes, *target.classes))]
-        for setting, known in (("classes", target.classes), ("predicted_classes", predicted)):
+        for setting, classes in (("classes", target.classes), ("predicted_classes", predicted)):
             for name in getattr(config.exclude, setting):
-                if name not in known and not (setting == "predicted_classes" and mapping.named([name])):
-                    raise ConfigError(f"{scene.name}: exclude.{setting}: no class '{name}'; {nearest(name, known)}")
+                if name not in classes and not (setting == "predicted_classes" and mapping.named([name])):
+                    raise ConfigError(f"{scene.name}: exclude.{setting}: no class '{name}'; {nearest(name, classes)}")
         fused_by = tuple(backend.name for backend in config.fused_by() if applies(backend, scene.name, model))
         yield Task(
             scene, model, indices, mapping, fused_by, config.perturbation, config.exclude, config.top_k,

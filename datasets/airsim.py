@@ -94,20 +94,23 @@ class AirSim(FileDataset[AirSimOptions]):
         """
         rows, path = self._rows(folder), folder / RECORDING
         camera, kind = self._camera(folder, rows)
-        kinds = [each for of, each in rows[0].files if of == camera]
+        kinds = [image_type for key_camera, image_type in rows[0].files if key_camera == camera]
         for row in rows:
-            if lost := [each for each in kinds if (camera, each) not in row.files]:
+            if lost := [image_type for image_type in kinds if (camera, image_type) not in row.files]:
                 raise DataError(
                     f"{path}: line {row.line} names no image of type {lost[0]} of camera {camera}, as the first does;"
                     " remove the row"
                 )
         numbers = np.array([row.pose for row in rows])
         T_wv = from_quaternions(numbers[:, :3], numbers[:, 3:], path)
-        first = [each for each in (SEGMENTATION, SCENE, kind) if each in kinds]
+        first = [image_type for image_type in (SEGMENTATION, SCENE, kind) if image_type in kinds]
         lens = self._lens(folder, [row.files[camera, kind] for row in rows])
         for row, pose in zip(rows, T_wv @ _mounted(self.options.mount), strict=True):
-            files = {each: inside(folder, folder / "images", row.files[camera, each], str(path)) for each in kinds}
-            name, *others = [files[each].stem for each in first]
+            files = {
+                image_type: inside(folder, folder / "images", row.files[camera, image_type], str(path))
+                for image_type in kinds
+            }
+            name, *aliases = [files[image_type].stem for image_type in first]
             yield FrameSource(
                 name=name,
                 depth=files[kind],
@@ -117,7 +120,7 @@ class AirSim(FileDataset[AirSimOptions]):
                 color=files.get(SCENE),
                 depth_reader=read_recorded_depth,
                 timestamp=row.time,
-                aliases=tuple(others),
+                aliases=tuple(aliases),
             )
 
     def _rows(self, folder: Path) -> list[Row]:
@@ -125,23 +128,25 @@ class AirSim(FileDataset[AirSimOptions]):
         path = folder / RECORDING
         rows = read_recording(path)
         vehicles = list(dict.fromkeys(row.vehicle for row in rows))
-        wanted = self.options.vehicle or vehicles[0]
-        if wanted not in vehicles or (len(vehicles) > 1 and not self.options.vehicle):
+        vehicle = self.options.vehicle or vehicles[0]
+        if vehicle not in vehicles or (len(vehicles) > 1 and not self.options.vehicle):
             raise DataError(f"{path}: holds rows of {', '.join(vehicles[:9])}; set vehicle to one of them")
-        return [row for row in rows if row.vehicle == wanted]
+        return [row for row in rows if row.vehicle == vehicle]
 
     def _camera(self, folder: Path, rows: list[Row]) -> tuple[str, str]:
         """Return the camera that is asked for, or the first with depth, and the type of its depth images."""
-        there = [key for key in rows[0].files if key[1] in DEPTH]
-        wanted = self.options.camera
-        found = [key for key in there if not wanted or key[0] == wanted or key[0].endswith(f"_{wanted}")]
-        if not found:
-            cameras = ", ".join(dict.fromkeys(camera for camera, _ in there)) or "none"
+        with_depth = [key for key in rows[0].files if key[1] in DEPTH]
+        camera_name = self.options.camera
+        matches = [
+            key for key in with_depth if not camera_name or key[0] == camera_name or key[0].endswith(f"_{camera_name}")
+        ]
+        if not matches:
+            cameras = ", ".join(dict.fromkeys(camera for camera, _ in with_depth)) or "none"
             raise DataError(
-                f"{folder / RECORDING}: the first row names no depth image (type 1 or 2) of camera {wanted or 'any'};"
-                f" with depth: {cameras}; record ImageType 1 with PixelsAsFloat, or set camera"
+                f"{folder / RECORDING}: the first row names no depth image (type 1 or 2) of camera"
+                f" {camera_name or 'any'}; with depth: {cameras}; record ImageType 1 with PixelsAsFloat, or set camera"
             )
-        return min(key for key in found if key[0] == found[0][0])
+        return min(key for key in matches if key[0] == matches[0][0])
 
     def _lens(self, folder: Path, depth: list[str]) -> Camera:
         if self.options.intrinsics is not None:

@@ -60,8 +60,8 @@ class ArkitScenes(FileDataset[ArkitScenesOptions]):
         T[:, :3, 3] = -np.einsum("nji,nj->ni", turns, rows[:, 4:])
         cameras = files_named(folder / "lowres_wide_intrinsics", "", ".pincam")
         images = files_named(folder / "lowres_wide", "", ".png")
-        there = self.depth_files(folder / "lowres_depth", "", ".png", instead=images)
-        names = sorted((name for name in there if name in cameras), key=natural)
+        depth = self.depth_files(folder / "lowres_depth", "", ".png", instead=images)
+        names = sorted((name for name in depth if name in cameras), key=natural)
         if not names:
             raise DataError(f"{folder}: no depth image has intrinsics of its name; download both")
         times = np.array([_seconds(name, folder) for name in names])
@@ -70,7 +70,7 @@ class ArkitScenes(FileDataset[ArkitScenesOptions]):
             width, height, fx, fy, cx, cy = _pinhole(cameras[name])
             confidence = folder / f"confidence/{name}.png"
             yield FrameSource(
-                name=name, depth=there[name], pose=pose, pose_file=path, timestamp=time,
+                name=name, depth=depth[name], pose=pose, pose_file=path, timestamp=time,
                 camera=Camera.stated((fx, fy, cx, cy), (round(width), round(height)), str(cameras[name])),
                 color=folders.one_of(folder / f"lowres_wide/{name}", COLOR_SUFFIXES),
                 confidence=confidence if self.options.least_confidence else None,

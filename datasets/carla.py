@@ -97,9 +97,9 @@ class Carla(FileDataset[CarlaOptions]):
         images, after, color = (
             ("images_rgb", f"_{k}", f"images_rgb/{{name}}_{k}") if kitti else ("rgb", "", "rgb/{name}")
         )
-        seen = images_named(folder / images, "", after)
+        color_images = images_named(folder / images, "", after)
         where = ("images_depth", f"_{20 + k}.png") if kitti else ("depth", ".png")
-        depth = self.depth_files(folder / where[0], "", where[1], instead=seen)
+        depth = self.depth_files(folder / where[0], "", where[1], instead=color_images)
         if kitti:
             pose, (poses, times) = LIDAR_POSES, _kitti_carla(folder, k, list(depth))
         else:
@@ -162,8 +162,8 @@ def _kitti_carla(folder: Path, camera: int, names: list[str]) -> tuple[Float64, 
     times = np.array([by_number[int(name)] for name in names])
     rows = read_table(path, 13, "R(0,0) R(0,1) R(0,2) t(0) ... timestamp")
     near = np.abs(rows[:, 12] - times[:, None]).argmin(axis=1)
-    apart = np.abs(rows[near, 12] - times)
-    if (far := ~(apart <= SAME_TIME)).any():
+    gaps = np.abs(rows[near, 12] - times)
+    if (far := ~(gaps <= SAME_TIME)).any():
         k = int(far.argmax())
         raise DataError(f"{path}: has no pose at {times[k]:g} s, of image {names[k]}; get it again")
     T_cl = TO_OPENCV @ matrix_of(read_table(mount, 12, "R(0,0) R(0,1) R(0,2) t(0) ...")[0])

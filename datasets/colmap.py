@@ -97,8 +97,8 @@ class Colmap(FileDataset[ColmapOptions]):
         frames: list[FrameSource] = []
         for image in images:
             depth_name = self._depth.filled(image=image.name, name=image.frame)
-            wanted = inside(options.root, folder, depth_name, str(path))
-            depth = folders.one_of(wanted, (*DEPTH_SUFFIXES, ".bin")) or wanted
+            depth_path = inside(options.root, folder, depth_name, str(path))
+            depth = folders.one_of(depth_path, (*DEPTH_SUFFIXES, ".bin")) or depth_path
             color = inside(options.root, folder, f"{options.images}/{image.name}", str(path))
             frames.append(
                 FrameSource(
@@ -112,11 +112,11 @@ class Colmap(FileDataset[ColmapOptions]):
 
     def _found(self, folder: Path) -> list[Path]:
         """Return the folders of the models of a scene that the options leave."""
-        wanted, sparse = self.options.model, folder / MODELS_FOLDER
-        if wanted not in (None, ALL):
-            named = inside(self.options.root, folder, str(wanted), "option model")
-            numbered = sparse / str(wanted) if str(wanted).isdecimal() else named
-            return [path for path in (named, numbered) if has_model(path)][:1]
+        choice, sparse = self.options.model, folder / MODELS_FOLDER
+        if choice not in (None, ALL):
+            by_name = inside(self.options.root, folder, str(choice), "option model")
+            numbered = sparse / str(choice) if str(choice).isdecimal() else by_name
+            return [path for path in (by_name, numbered) if has_model(path)][:1]
         if has_model(sparse):
             return [sparse]
         models = [sparse / name for name in subfolders(sparse) if name.isdecimal() and has_model(sparse / name)]
@@ -131,11 +131,11 @@ class Colmap(FileDataset[ColmapOptions]):
         models = self._found(folder)
         if len(models) == 1:
             return models[0]
-        said = "; ".join(f"{model.name}: {_summary(model)}" for model in models[:MOST_LISTED])
+        summaries = "; ".join(f"{model.name}: {_summary(model)}" for model in models[:MOST_LISTED])
         more = f"; {len(models) - MOST_LISTED} more" if len(models) > MOST_LISTED else ""
         raise DataError(
-            f"{folder / MODELS_FOLDER}: {len(models)} models, which share no coordinates ({said}{more}); choose one"
-            " with model: NUMBER (--option model=NUMBER), or model: all for a scene each"
+            f"{folder / MODELS_FOLDER}: {len(models)} models, which share no coordinates ({summaries}{more}); choose"
+            " one with model: NUMBER (--option model=NUMBER), or model: all for a scene each"
         )
 
 

@@ -43,7 +43,7 @@ def read_nvm(path: Path, size_of: SizeOf) -> list[Shot]:
         cameras = [_next(lines, path, "a camera") for _ in range(count)]
     words = [_nvm_camera(line, path) for line in cameras]
     rows = np.array(
-        [[to_number(word, path, line) for word in own[1:]] for (line, _), own in zip(cameras, words, strict=True)]
+        [[to_number(word, path, line) for word in fields[1:]] for (line, _), fields in zip(cameras, words, strict=True)]
     )
     if len(bent := np.flatnonzero(rows[:, 8])):
         raise DataError(
@@ -51,10 +51,10 @@ def read_nvm(path: Path, size_of: SizeOf) -> list[Shot]:
         )
     centres = from_quaternions(rows[:, 5:8], rows[:, [2, 3, 4, 1]], path)
     shots = []
-    for (line, _), own, row, T in zip(cameras, words, rows, centres, strict=True):
+    for (line, _), fields, row, T in zip(cameras, words, rows, centres, strict=True):
         R = T[:3, :3].copy()
         T[:3, 3] = -R @ T[:3, 3]
-        name = _bare(own[0])
+        name = _bare(fields[0])
         shots.append(Shot(name, T, _pinhole(row[0], size_of(name), f"{path}: line {line}"), None))
     return _all_named(shots, path)
 

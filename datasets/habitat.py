@@ -114,7 +114,7 @@ def read_info(path: Path) -> tuple[UInt16, LabelSpace]:
     classes, labels = content.get("classes"), content.get("id_to_label")
     if not (isinstance(classes, list) and classes and isinstance(labels, list) and labels):
         raise DataError(f"{path}: has no lists 'classes' and 'id_to_label'; take that of Replica's habitat/ folder")
-    names = {_id(each.get("id"), path): str(each.get("name")) for each in classes if isinstance(each, dict)}
+    names = {_id(row.get("id"), path): str(row.get("name")) for row in classes if isinstance(row, dict)}
     try:
         space = LabelSpace(f"classes of {path.parent.name}", tuple(names.values()), tuple(names))
     except ConfigError as error:
@@ -124,10 +124,10 @@ def read_info(path: Path) -> tuple[UInt16, LabelSpace]:
     ids = np.full(1 << 16, NO_ID, np.uint16)
     ids[IGNORE_16BIT] = IGNORE_16BIT
     for instance, label in enumerate(labels):
-        known = label if isinstance(label, int) and label > 0 else None
-        if known is not None and known not in names:
-            raise DataError(f"{path}: instance {instance} of 'id_to_label' has class {known}, which 'classes' lacks")
-        ids[instance] = IGNORE_16BIT if known is None else known
+        class_id = label if isinstance(label, int) and label > 0 else None
+        if class_id is not None and class_id not in names:
+            raise DataError(f"{path}: instance {instance} of 'id_to_label' has class {class_id}, which 'classes' lacks")
+        ids[instance] = IGNORE_16BIT if class_id is None else class_id
     return ids, space
 
 

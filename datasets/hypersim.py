@@ -80,11 +80,11 @@ class Hypersim(FileDataset[HypersimOptions]):
         """
         name = self._camera(folder)
         where, images = folder / f"_detail/{name}", folder / f"images/scene_{name}_final_preview"
-        seen = files_named(images, "frame.", ".color.jpg")
+        previews = files_named(images, "frame.", ".color.jpg")
         depth = self.depth_files(
-            folder / f"images/scene_{name}_geometry_hdf5", "frame.", ".depth_meters.hdf5", instead=seen
+            folder / f"images/scene_{name}_geometry_hdf5", "frame.", ".depth_meters.hdf5", instead=previews
         )
-        rows = [_number(each, folder) for each in depth]
+        rows = [_number(stem, folder) for stem in depth]
         camera, turn = self._pinhole(folder)
         poses = _poses(where, rows) @ turn
         color = f"{images.relative_to(folder)}/frame.{{name}}.color"
@@ -93,10 +93,10 @@ class Hypersim(FileDataset[HypersimOptions]):
 
     def _camera(self, folder: Path) -> str | None:
         """Return the camera of the options, else the first camera with poses and depth, else None."""
-        there = (
+        candidates = (
             [self.options.camera] if self.options.camera else subfolders(folder / "_detail") if folder.is_dir() else []
         )
-        for name in there:
+        for name in candidates:
             poses = (folder / f"_detail/{name}/camera_keyframe_positions.hdf5").is_file()
             if poses and self.has_depth(folder / f"images/scene_{name}_geometry_hdf5"):
                 return name
@@ -106,8 +106,8 @@ class Hypersim(FileDataset[HypersimOptions]):
         """Return the camera, and the pose (4, 4) of its axes in those of the poses, both OpenGL."""
         if self.options.intrinsics is not None:
             return Camera(Intrinsics(*self.options.intrinsics)), np.eye(4)
-        own, above = self.options.camera_parameters, (folder, *folder.absolute().parents[:3])
-        path = own or next((each / CAMERAS for each in above if (each / CAMERAS).is_file()), None)
+        stated, above = self.options.camera_parameters, (folder, *folder.absolute().parents[:3])
+        path = stated or next((parent / CAMERAS for parent in above if (parent / CAMERAS).is_file()), None)
         if path is None:
             raise DataError(
                 f"{folder}: {CAMERAS} is not there or above; get it from ml-hypersim, contrib/mikeroberts3000, or set"

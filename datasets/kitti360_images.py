@@ -60,17 +60,17 @@ class Kitti360Images(FileDataset[Kitti360ImagesOptions]):
 
     def find_scenes(self, root: Path) -> Iterable[SceneEntry]:
         """Return the drives at or below the root, each in the folder of the dataset; raises what `find_scenes` does."""
-        found = find_scenes(root, self.is_scene, self.contents)
-        drives = [entry.folder.absolute() for entry in found]
+        entries = find_scenes(root, self.is_scene, self.contents)
+        drives = [entry.folder.absolute() for entry in entries]
         return [SceneEntry(drive.name, drive.parents[1], drive.name) for drive in drives]
 
     def settled(self, folder: Path) -> Kitti360ImagesOptions:
         """Return the options with the ground truth and label maps of the drive, and poses that are camera to world."""
         truth = f"data_2d_semantics/train/{{scene}}/{self.options.camera}/semantic/{{name}}.png"
-        own = {"ground_truth": self.options.ground_truth or truth, "pose_convention": "camera_to_world"}
+        changes = {"ground_truth": self.options.ground_truth or truth, "pose_convention": "camera_to_world"}
         if self.options.labels is None and self.options.labels_root is None:
-            own["labels"] = f"{RAW}/{{scene}}/labels/{{model}}/{{name}}"
-        return self.options.model_copy(update=own)
+            changes["labels"] = f"{RAW}/{{scene}}/labels/{{model}}/{{name}}"
+        return self.options.model_copy(update=changes)
 
     def truth(self, folder: Path) -> Truth:
         """Return the classes of the ground truth."""
@@ -101,8 +101,8 @@ class Kitti360Images(FileDataset[Kitti360ImagesOptions]):
         T_ic = camera_in_imu(calibration, self.options.camera) @ rigid_inverse(R, str(calibration / "perspective.txt"))
         T_cl = rigid_inverse(T_ic, str(calibration)) @ lidar_in_imu(calibration)
         lost, colors = np.full((4, 4), np.nan), Folders()
-        found = self.depth_files(scans / "velodyne_points/data", "", ".bin", instead=images_named(images))
-        for name, points in found.items():
+        point_files = self.depth_files(scans / "velodyne_points/data", "", ".bin", instead=images_named(images))
+        for name, points in point_files.items():
             if not name.isdecimal():
                 raise DataError(f"{points}: the name is no number of a frame; rename or remove the file")
             color = colors.one_of(images / name, COLOR_SUFFIXES) or images / f"{name}.png"

@@ -114,9 +114,9 @@ def read_chunk(path: Path, wanted: int | None = None) -> tuple[list[Shot], str |
         if sensor not in read:
             read[sensor] = _lens(lenses[sensor], f"{path}: sensor {sensor}")
         scale, rigid = _product(world, components.get(camera.get("component_id"), (1.0, np.eye(4))))
-        own = np.array(_numbers(camera.find("transform"), 16, where)).reshape(4, 4)
-        pose = rigid @ own
-        pose[:3, 3] = scale * rigid[:3, :3] @ own[:3, 3] + rigid[:3, 3]
+        camera_pose = np.array(_numbers(camera.find("transform"), 16, where)).reshape(4, 4)
+        pose = rigid @ camera_pose
+        pose[:3, 3] = scale * rigid[:3, :3] @ camera_pose[:3, 3] + rigid[:3, 3]
         shots.append(Shot(name, pose, *read[sensor]))
     return shots, chunk.findtext("reference")
 
@@ -168,7 +168,10 @@ def _lens(sensor: Element, where: str) -> tuple[Camera, Lens | None]:
     the first one.
     """
     calibrations = sensor.findall("calibration")
-    calibration = next((own for own in calibrations if own.get("class") == "adjusted"), next(iter(calibrations), None))
+    calibration = next(
+        (candidate for candidate in calibrations if candidate.get("class") == "adjusted"),
+        next(iter(calibrations), None),
+    )
     if calibration is None:
         raise DataError(f"{where}: has no calibration; align the photographs, and export the cameras again")
     kind = calibration.get("type") or sensor.get("type") or "frame"

@@ -152,8 +152,8 @@ class NuScenes(ScanDataset[NuScenesOptions]):
         keys = [row for row in _rows(path) if row.get("is_key_frame")]
         rows = [row for row in keys if _text(row, "calibrated_sensor_token", path) in mounted]
         rows.sort(key=lambda row: number(row, "timestamp", str(path)))
-        wanted = {_text(row, "ego_pose_token", path) for row in rows}
-        moved = _poses(tables / "ego_pose.json", wanted)
+        ego_tokens = {_text(row, "ego_pose_token", path) for row in rows}
+        moved = _poses(tables / "ego_pose.json", ego_tokens)
         lists = dict[str, list[ScanSource]]()
         for row in rows:
             token, sample, ego = (_text(row, key, path) for key in ("token", "sample_token", "ego_pose_token"))
@@ -172,12 +172,12 @@ class NuScenes(ScanDataset[NuScenesOptions]):
         """Return the poses of the chosen LiDAR on the vehicle, by token."""
         path, sensors = tables / "calibrated_sensor.json", tables / "sensor.json"
         channels = {_text(row, "token", sensors): _text(row, "channel", sensors) for row in _rows(sensors)}
-        own = {token for token, channel in channels.items() if channel == self.options.channel}
-        wanted = {_text(row, "token", path) for row in _rows(path) if _text(row, "sensor_token", path) in own}
-        if not wanted:
-            known = ", ".join(sorted(set(channels.values())))[:200]
-            raise ConfigError(f"{sensors}: there is no channel '{self.options.channel}', only {known}")
-        return _poses(path, wanted)
+        sensor_tokens = {token for token, channel in channels.items() if channel == self.options.channel}
+        tokens = {_text(row, "token", path) for row in _rows(path) if _text(row, "sensor_token", path) in sensor_tokens}
+        if not tokens:
+            names = ", ".join(sorted(set(channels.values())))[:200]
+            raise ConfigError(f"{sensors}: there is no channel '{self.options.channel}', only {names}")
+        return _poses(path, tokens)
 
 
 def _rows(path: Path) -> list[dict[str, Any]]:
@@ -195,9 +195,9 @@ def _text(row: Mapping[str, Any], key: str, path: Path) -> str:
     return value
 
 
-def _poses(path: Path, wanted: set[str]) -> dict[str, Float64]:
+def _poses(path: Path, tokens: set[str]) -> dict[str, Float64]:
     """Return poses (4, 4) of the wanted rows by token: a translation, and a quaternion w x y z."""
-    rows = [row for row in _rows(path) if _text(row, "token", path) in wanted]
+    rows = [row for row in _rows(path) if _text(row, "token", path) in tokens]
     moved = np.array([_vector(row, "translation", 3, path) for row in rows]).reshape(-1, 3)
     turned = np.array([_vector(row, "rotation", 4, path) for row in rows]).reshape(-1, 4)
     poses = from_quaternions(moved, turned[:, [1, 2, 3, 0]], path)

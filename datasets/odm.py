@@ -129,8 +129,8 @@ def find_depth(project: Project, kind: Kind, template: str) -> Path | None:
     if kind == "opensfm":
         return _npz_maps(project) if project.undistorted else None
     path = project.folder / DSM if kind == "dsm" else (project.folder / template).parent
-    there = path.is_file() if kind == "dsm" else "{" not in str(path) and path.is_dir()
-    return path if there else None
+    exists = path.is_file() if kind == "dsm" else "{" not in str(path) and path.is_dir()
+    return path if exists else None
 
 
 def depth_files(project: Project, kind: Kind | None, names: Mapping[str, str], template: Template) -> dict[str, Path]:
@@ -152,15 +152,15 @@ def depth_files(project: Project, kind: Kind | None, names: Mapping[str, str], t
             for shot in names
         }
         return {shot: next(filter(folders.has, paths), paths[0]) for shot, paths in candidates.items()}
-    wanted = {shot: project.folder / template.filled(name=name) for shot, name in names.items()}
-    return {shot: folders.one_of(path, DEPTH_SUFFIXES) or path for shot, path in wanted.items()}
+    expected = {shot: project.folder / template.filled(name=name) for shot, name in names.items()}
+    return {shot: folders.one_of(path, DEPTH_SUFFIXES) or path for shot, path in expected.items()}
 
 
 def _npz_maps(project: Project) -> Path | None:
     """Return the folder of OpenSfM's depth maps, or None without depth maps."""
     folders = (project.opensfm / name for name in NPZ_MAPS)
-    there = (maps for maps in folders if any(True for suffix in NPZ_SUFFIXES for _ in maps.glob(f"*{suffix}")))
-    return next(there, None)
+    with_maps = (maps for maps in folders if any(True for suffix in NPZ_SUFFIXES for _ in maps.glob(f"*{suffix}")))
+    return next(with_maps, None)
 
 
 def _mve_files(views: Path, names: Mapping[str, str]) -> dict[str, Path]:
@@ -175,19 +175,19 @@ def _mve_files(views: Path, names: Mapping[str, str]) -> dict[str, Path]:
     numbers: set[str] = set()
     for view in sorted(views.glob("view_*.mve")):
         number = view.stem.removeprefix("view_")
-        said = _view_name(view / "meta.ini") or number
-        by_name[bare_name(said)] = view / "depth-L0.mvei"
-        if said.isdigit() and int(said) == int(number or 0):
-            numbers.add(said)
-    wanted = {shot: bare_name(name) for shot, name in names.items()}
-    if not by_name.keys() & set(wanted.values()):
+        view_name = _view_name(view / "meta.ini") or number
+        by_name[bare_name(view_name)] = view / "depth-L0.mvei"
+        if view_name.isdigit() and int(view_name) == int(number or 0):
+            numbers.add(view_name)
+    bare_names = {shot: bare_name(name) for shot, name in names.items()}
+    if not by_name.keys() & set(bare_names.values()):
         if by_name.keys() - numbers:
             raise DataError(
                 f"{views}: the views are called {', '.join(sorted(by_name)[:3])} in their meta.ini, which no shot of"
-                f" the reconstruction is ({', '.join(sorted(wanted.values())[:3])}); take depth_from: mesh"
+                f" the reconstruction is ({', '.join(sorted(bare_names.values())[:3])}); take depth_from: mesh"
             )
         return {shot: views / f"view_{k:04d}.mve/depth-L0.mvei" for k, shot in enumerate(names)}
-    return {shot: by_name.get(name, views / f"{name}.mve/depth-L0.mvei") for shot, name in wanted.items()}
+    return {shot: by_name.get(name, views / f"{name}.mve/depth-L0.mvei") for shot, name in bare_names.items()}
 
 
 def _view_name(path: Path) -> str | None:
@@ -195,8 +195,8 @@ def _view_name(path: Path) -> str | None:
     lines = [text for _, text in records(path)] if path.is_file() else []
     start = lines.index("[view]") + 1 if "[view]" in lines else len(lines)
     part = itertools.takewhile(lambda line: not line.startswith("["), lines[start:])
-    said = (line.partition("=") for line in part)
-    return next((value.strip() for key, _, value in said if key.strip() == "name" and value.strip()), None)
+    settings = (line.partition("=") for line in part)
+    return next((value.strip() for key, _, value in settings if key.strip() == "name" and value.strip()), None)
 
 
 class OdmOptions(PosedImageOptions):
@@ -338,12 +338,12 @@ class Odm(FileDataset[OdmOptions]):
         if project.undistorted:
             path = project.opensfm / DISTORTED
             originals = self._reconstruction(path) if path.is_file() else []
-            there = dict(zip(frame_names(shot.name for shot in originals), originals, strict=True))
-            if lost := next((name for name in shots if name not in there), None):
+            shots_by_name = dict(zip(frame_names(shot.name for shot in originals), originals, strict=True))
+            if lost := next((name for name in shots if name not in shots_by_name), None):
                 raise DataError(
                     f"{path}: does not give the distortion of the photograph {lost}, which labels_on: original needs"
                 )
-            shots = there
+            shots = shots_by_name
         return {name: shot.lens for name, shot in shots.items()}
 
     def _images(self, project: Project) -> list[Path]:
@@ -367,16 +367,16 @@ class Odm(FileDataset[OdmOptions]):
 
     def _exported(self, project: Project) -> list[Shot]:
         """Read a project's reconstruction.nvm or bundle, and the sizes of its images."""
-        path, wanted, images, contents = project.poses, self.options.reconstruction, self._images(project), Folders()
+        path, chosen, images, contents = project.poses, self.options.reconstruction, self._images(project), Folders()
         bundles = find_bundles(project.opensfm) if path.suffix == ".out" else []
-        if len(bundles) > 1 and wanted is None:
+        if len(bundles) > 1 and chosen is None:
             raise DataError(
                 f"{path}: one of {len(bundles)} reconstructions, which share no coordinates; choose one with"
                 " reconstruction: NUMBER"
             )
-        if (wanted or 0) >= max(len(bundles), 1):
+        if (chosen or 0) >= max(len(bundles), 1):
             raise DataError(
-                f"{path}: there is no reconstruction {wanted}; it has {max(len(bundles), 1)}, counted from 0"
+                f"{path}: there is no reconstruction {chosen}; it has {max(len(bundles), 1)}, counted from 0"
             )
 
         def size_of(name: str) -> tuple[int, int]:

@@ -41,10 +41,10 @@ def read_reconstruction(path: Path, wanted: int | None = None) -> list[Shot]:
             model.
     """
     reconstructions = read_content(path, MAX_BYTES)
-    if not isinstance(reconstructions, list) or {type(one) for one in reconstructions} != {dict}:
+    if not isinstance(reconstructions, list) or {type(entry) for entry in reconstructions} != {dict}:
         raise DataError(f"{path}: expected a list of reconstructions; run the reconstruction again")
     if len(reconstructions) > 1 and wanted is None:
-        names = "; ".join(f"{k}: {_summary(one)}" for k, one in enumerate(reconstructions[:5]))
+        names = "; ".join(f"{k}: {_summary(entry)}" for k, entry in enumerate(reconstructions[:5]))
         more = f"; {len(reconstructions) - 5} more" if len(reconstructions) > 5 else ""
         raise DataError(
             f"{path}: {len(reconstructions)} reconstructions, which share no coordinates ({names}{more}); choose one"

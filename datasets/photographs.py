@@ -153,10 +153,10 @@ class Photographs(FileDataset[Options], Generic[Options]):
         options = self.options
         if options.surface is not None or (folder / self._depth.text).parent.is_dir():
             return options
-        there = sorted(path for path in folder.glob("*") if path.suffix.lower() in SURFACES)
-        meshes = [path for path in there if path.suffix.lower() not in SEEN_FROM_ABOVE]
+        surfaces = sorted(path for path in folder.glob("*") if path.suffix.lower() in SURFACES)
+        meshes = [path for path in surfaces if path.suffix.lower() not in SEEN_FROM_ABOVE]
         if len(meshes) != 1:
-            listed = f" (here are {', '.join(path.name for path in there[:5])})" if there else ""
+            listed = f" (here are {', '.join(path.name for path in surfaces[:5])})" if surfaces else ""
             raise DataError(
                 f"{folder}: has no depth images; set surface to the mesh, cloud or height model that was"
                 f" exported: --option surface=FILE{listed}"

@@ -69,11 +69,11 @@ def read_cameras(path: Path) -> list[Shot]:
     if start is None:
         raise DataError(f"{path}: holds no photograph, a line of 'NAME WIDTH HEIGHT'; export the parameters again")
     shots = []
-    for at in range(start, len(lines), 1 + len(BLOCK)):
-        number, head = lines[at]
+    for position in range(start, len(lines), 1 + len(BLOCK)):
+        number, head = lines[position]
         if not _is_head(head):
             raise DataError(f"{path}, line {number}: expected 'NAME WIDTH HEIGHT'; export the parameters again")
-        shots.append(_shot(path, number, head, lines[at + 1 : at + 1 + len(BLOCK)]))
+        shots.append(_shot(path, number, head, lines[position + 1 : position + 1 + len(BLOCK)]))
     return shots
 
 

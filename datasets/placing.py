@@ -89,18 +89,20 @@ class _Known:
     def apart(self, cameras: Mapping[str, Float64]) -> float | None:
         """Return the median distance of cameras (2,) to these positions in metres, or None without a common camera."""
         if self.named:
-            both = [name for name in cameras if name in self.named]
-            return float(np.median([np.hypot(*(cameras[name] - self.named[name])) for name in both])) if both else None
-        ours, known = _on_earth(np.array([*cameras.values()]).reshape(-1, 2)), _on_earth(self.unnamed)
-        if not len(known) or not len(ours):
+            common = [name for name in cameras if name in self.named]
+            return (
+                float(np.median([np.hypot(*(cameras[name] - self.named[name])) for name in common])) if common else None
+            )
+        cameras_xy, known_xy = _on_earth(np.array([*cameras.values()]).reshape(-1, 2)), _on_earth(self.unnamed)
+        if not len(known_xy) or not len(cameras_xy):
             return None
-        if max(len(ours), len(known)) > MOST_MATCHED:
-            return float(np.hypot(*(np.median(ours, axis=0) - np.median(known, axis=0))))
+        if max(len(cameras_xy), len(known_xy)) > MOST_MATCHED:
+            return float(np.hypot(*(np.median(cameras_xy, axis=0) - np.median(known_xy, axis=0))))
         from scipy.optimize import linear_sum_assignment
         from scipy.spatial.distance import cdist
 
         # of all assignments the squares of distances are least for the true one, however far all are shifted
-        squares = cdist(ours, known, "sqeuclidean")
+        squares = cdist(cameras_xy, known_xy, "sqeuclidean")
         return float(np.sqrt(np.median(squares[linear_sum_assignment(squares)])))
 
 
@@ -125,32 +127,32 @@ def placement_of(folder: Path, opensfm: Path, shots: Mapping[str, Poses], find: 
     if not candidates:
         return None
     centres = np.array([-T[:3, :3].T @ T[:3, 3] for T in shots.values()])
-    known = _known(folder, opensfm, list(shots), find, candidates[0].georeference.crs)
-    first, projected = candidates[0], [each.georeference.projected(centres)[:, :2] for each in candidates]
-    apart = [None if known is None else known.apart(dict(zip(shots, at, strict=True))) for at in projected]
-    if known is None or apart[0] is None:
+    positions = _known(folder, opensfm, list(shots), find, candidates[0].georeference.crs)
+    first, projected = candidates[0], [candidate.georeference.projected(centres)[:, :2] for candidate in candidates]
+    gaps = [None if positions is None else positions.apart(dict(zip(shots, xy, strict=True))) for xy in projected]
+    if positions is None or gaps[0] is None:
         words = f"{first.words}; no known position to compare the cameras with"
         return Placement(first.georeference, words, first.mesh_origin)
-    distances = [np.inf if each is None else each for each in apart]
+    distances = [np.inf if gap is None else gap for gap in gaps]
     best = int(np.argmin(distances))
-    slack = 0.0 if not sure else EXACT_SLACK if known.exact else SLACK + distances[best] / 2
+    slack = 0.0 if not sure else EXACT_SLACK if positions.exact else SLACK + distances[best] / 2
     chosen = best if distances[0] > distances[best] + slack else 0
     if chosen and sure:
         logger.warning(
             "%s: the cameras lie %.3g m (median) from %s by its files (%s), but %.3g m by %s, which is used; is"
             " a file left from another version of ODM?",
-            folder, distances[0], known.source, first.words, distances[chosen], candidates[chosen].words,
+            folder, distances[0], positions.source, first.words, distances[chosen], candidates[chosen].words,
         )  # fmt: skip
     taken, off = candidates[chosen], distances[chosen]
-    limit = EXACT_LIMIT if known.exact else GPS_LIMIT
+    limit = EXACT_LIMIT if positions.exact else GPS_LIMIT
     if off > limit:
-        explained = "of the same cameras" if known.exact else f"more than the {GPS_LIMIT:g} m that GPS explains"
+        explained = "of the same cameras" if positions.exact else f"more than the {GPS_LIMIT:g} m that GPS explains"
         logger.warning(
             "%s: the cameras lie %.3g m (median, horizontal) from %s, %s: the poses are not in the assumed frame"
             " (%s), and the map is as far off; restore opensfm/%s and %s of this run, or give crs, offset, linear",
-            folder, off, known.source, explained, taken.words, MATRIX, REFERENCE,
+            folder, off, positions.source, explained, taken.words, MATRIX, REFERENCE,
         )  # fmt: skip
-    words = f"{taken.words}; cameras {off:.2f} m (median, horizontal) from {known.source}"
+    words = f"{taken.words}; cameras {off:.2f} m (median, horizontal) from {positions.source}"
     return Placement(taken.georeference, words, taken.mesh_origin)
 
 
@@ -310,17 +312,17 @@ def _known(folder: Path, opensfm: Path, names: list[str], find: Positions, crs: 
 
     def projected(positions: Mapping[str, tuple[float, float]]) -> dict[str, Float64]:
         points = {name: np.array(projection(lon, lat)) for name, (lon, lat) in positions.items()}
-        return {name: at for name, at in points.items() if np.isfinite(at).all()}
+        return {name: point for name, point in points.items() if np.isfinite(point).all()}
 
-    wanted, coords, none = set(names), folder / COORDS, np.zeros((0, 2))
+    requested, coords, none = set(names), folder / COORDS, np.zeros((0, 2))
     sources: tuple[tuple[str, Callable[[], Iterator[tuple[str, float, float]]], bool], ...] = (
         (SHOTS, lambda: _of_shots(folder / SHOTS if coords.is_file() else None, find.bare), True),
         ("the GPS of the images (opensfm/exif)", lambda: _of_opensfm(opensfm / "exif", find.bare), False),
         ("the GPS of the images", lambda: _of_photographs(names, find.photograph), False),
     )
     for source, positions_of, exact in sources:
-        if named := projected({name: (lon, lat) for name, lon, lat in positions_of() if name in wanted}):
-            return _Known(source, named, none, exact)
+        if by_name := projected({name: (lon, lat) for name, lon, lat in positions_of() if name in requested}):
+            return _Known(source, by_name, none, exact)
     if coords.is_file():
         east, north, positions = _read_coords(coords)
         return _Known(f"the positions in {COORDS}", {}, positions[:, :2] + (east, north))
@@ -355,8 +357,8 @@ def _of_photographs(names: list[str], photograph: Callable[[str], Path | None]) 
     """Yield the same of the photographs' EXIF data; those without it, and unreadable ones, are passed over."""
     for name in _spread(names):
         path = photograph(name)
-        if path is not None and (at := _exif_position(path)) is not None:
-            yield name, *at
+        if path is not None and (position := _exif_position(path)) is not None:
+            yield name, *position
 
 
 def _spread(items: list[Any]) -> list[Any]:

@@ -133,8 +133,8 @@ class PointsFolder(ScanDataset[PointsOptions]):
         if not path.is_file():
             stored, lost = files_by_stem(folder / "pose", (".txt",)), np.full((4, 4), np.nan)
             paths = {name: folder / "pose" / stored.get(name, f"{name}.txt") for name in names}
-            given = {name: read_pose(path) if name in stored else lost for name, path in paths.items()}
-            return [(as_poses(given[name][None], convention, paths[name])[0], paths[name]) for name in names]
+            poses = {name: read_pose(path) if name in stored else lost for name, path in paths.items()}
+            return [(as_poses(poses[name][None], convention, paths[name])[0], paths[name]) for name in names]
         rows = read_table(path, 12, "r11 r12 r13 t1 ... of each scan").reshape(-1, 3, 4)
         if len(rows) != len(names):
             raise DataError(f"{path}: has {len(rows)} poses, but there are {len(names)} clouds; they must be as many")
@@ -148,7 +148,7 @@ def _ends(files: dict[str, str], suffix: str) -> bool:
 def _class_property(names: Sequence[str]) -> str | None:
     """Return which of a PLY file's properties is that of classes, by its name."""
     bare = {name.lower().removeprefix("scalar_"): name for name in names}
-    return next((bare[known] for known in PROPERTIES if known in bare), None)
+    return next((bare[word] for word in PROPERTIES if word in bare), None)
 
 
 def _of_ply(path: Path, data: bytes) -> npt.NDArray[np.void]:

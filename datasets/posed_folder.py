@@ -105,10 +105,10 @@ class PosedFolder(FileDataset[PosedOptions]):
         """
         settings = _scene_settings(folder / SETTINGS_FILE)
         options = {key: getattr(self.options, key) for key in PosedSettings.model_fields}
-        given = {key: value for key, value in options.items() if value not in (None, (), {})}
-        if "taxonomy" in given or "classes" in given:  # one of the two is enough to replace either
-            given = {"taxonomy": None, "classes": None} | given
-        return self.options.model_copy(update=dict(settings) | given)
+        stated = {key: value for key, value in options.items() if value not in (None, (), {})}
+        if "taxonomy" in stated or "classes" in stated:  # one of the two is enough to replace either
+            stated = {"taxonomy": None, "classes": None} | stated
+        return self.options.model_copy(update=dict(settings) | stated)
 
 
 def _camera(folder: Path) -> Camera:

@@ -78,8 +78,8 @@ class RealityCapture(Photographs[RealityCaptureOptions]):
                 sizes[lens] = self.options.image_size
             if lens not in sizes:
                 image = find_image(images, name, contents, str(path))
-                wanted = inside(images[0], images[0], name or "image", str(path))
-                sizes[lens] = color_size(wanted if image is None else image)
+                stated = inside(images[0], images[0], name or "image", str(path))
+                sizes[lens] = color_size(stated if image is None else image)
             shots.append(_shot(name, values, sizes[lens], f"{path}, line {number}"))
         if self.options.crs is None:
             return Reconstruction(path, shots)

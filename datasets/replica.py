@@ -76,8 +76,10 @@ class Replica(FileDataset[ReplicaOptions]):
         )
 
     def _export(self, folder: Path) -> Export | None:
-        there = (e for e in EXPORTS if (folder / e.trajectory).is_file() and self.has_depth((folder / e.depth).parent))
-        return next(there, None)
+        exports = (
+            e for e in EXPORTS if (folder / e.trajectory).is_file() and self.has_depth((folder / e.depth).parent)
+        )
+        return next(exports, None)
 
     def _camera(self, folder: Path, export: Export) -> tuple[Camera, float]:
         """Return the camera and the depth scale: of the options, of cam_params.json, or the export's usual ones."""

@@ -47,8 +47,8 @@ class ScanNet(FileDataset[ScanNetOptions]):
 
     def is_scene(self, folder: Path) -> bool:
         """Return whether depth/, pose/ and the intrinsics of the depth are there; with a surface, the latter two."""
-        there = self.has_depth(folder / "depth") and (folder / "pose").is_dir()
-        return there and _matrix_file(folder, self.options.intrinsics).is_file()
+        complete = self.has_depth(folder / "depth") and (folder / "pose").is_dir()
+        return complete and _matrix_file(folder, self.options.intrinsics).is_file()
 
     def frames(self, folder: Path) -> Iterable[FrameSource]:
         """Return a frame for each depth image."""

@@ -359,7 +359,9 @@ def select_frames(
         needs = ("depth", "pose", *(("labels",) if sources else ()), *(("colour",) if color else ()))
         paths = [path for paths in missing.values() for path in paths]
         photographs = any(path.lower().endswith(PHOTOGRAPHS) for path in paths)
-        images = photographs or (color and any(len(own) > len(scene.missing(k, sources)) for k, own in missing.items()))
+        images = photographs or (
+            color and any(len(lacking) > len(scene.missing(k, sources)) for k, lacking in missing.items())
+        )
         _tell_missing(scene, paths, len(complete), len(chosen), needs, images=images)
     lost = {index for index in complete if not scene.tracked(index)}
     if lost:
@@ -379,12 +381,12 @@ def _tell_missing(
     where = str(scene.folder or scene.name)
     if not scene.skips_incomplete:
         skip = "set incomplete: skip (--option incomplete=skip) to leave such frames out"
-        then = ["add them"]
+        remedies = ["add them"]
         if images and scene.images_elsewhere:
-            then.append("name their folder (--option images=FOLDER)")
+            remedies.append("name their folder (--option images=FOLDER)")
         if complete:
-            then.append(skip)
-        raise DataError(f"{where}: {listed(paths, where)}; {', or '.join(then)}")
+            remedies.append(skip)
+        raise DataError(f"{where}: {listed(paths, where)}; {', or '.join(remedies)}")
     if not complete:
         raise DataError(
             f"{where}: no selected frame has {', '.join(needs[:-1])} and {needs[-1]} ({listed(paths, where)})"

@@ -120,7 +120,7 @@ def _classes(frame: FrameSource, path: Path, read: Read, *, K: Intrinsics, T_cl:
     stored, count = ids_of(path, read(path)), len(floats_of(frame.depth, data, 4))
     if len(stored) != count:
         raise DataError(f"{path}: has {len(stored)} labels, but {frame.depth.name} has {count} points; get both again")
-    seen = _seen(frame.depth, frame.color, lambda _: data, K, T_cl)
-    ids = np.full(seen.shape, IGNORE_16BIT, np.uint16)
-    ids[seen.v, seen.u] = stored[seen.points]
+    visible = _seen(frame.depth, frame.color, lambda _: data, K, T_cl)
+    ids = np.full(visible.shape, IGNORE_16BIT, np.uint16)
+    ids[visible.v, visible.u] = stored[visible.points]
     return ids

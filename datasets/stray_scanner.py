@@ -62,13 +62,13 @@ class StrayScanner(FileDataset[StrayScannerOptions]):
         shared = Camera(usual, self.options.image_size)
         for (line, words), row, pose in zip(lines, numbers, poses, strict=True):
             name = words[1].zfill(6)
-            where, own = f"{path}: line {line}", (row[9], row[10], row[11], row[12]) if len(row) > 9 else None
+            where, intrinsics = f"{path}: line {line}", (row[9], row[10], row[11], row[12]) if len(row) > 9 else None
             depth, confidence = (folder / f"{kind}/{name}" for kind in ("depth", "confidence"))
             image = folder / self.options.images.replace("{name}", name)
             yield FrameSource(
                 name=name, depth=folders.one_of(depth, DEPTH_SUFFIXES) or depth.with_name(f"{name}.png"),
                 pose=pose, pose_file=path, timestamp=row[0],
-                camera=shared if own is None else Camera.stated(own, self.options.image_size, where),
+                camera=shared if intrinsics is None else Camera.stated(intrinsics, self.options.image_size, where),
                 color=folders.one_of(image, COLOR_SUFFIXES),
                 confidence=confidence.with_name(f"{name}.png") if self.options.least_confidence else None,
                 least_confidence=self.options.least_confidence,

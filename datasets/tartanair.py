@@ -89,6 +89,6 @@ class TartanAir(FileDataset[TartanAirOptions]):
 
     def _camera(self, folder: Path) -> str | None:
         """Return the camera of the options, else the first camera of a folder, else None."""
-        wanted = (self.options.camera,) if self.options.camera else VERSIONS
-        there = (side for side in wanted if (folder / f"pose_{side}.txt").is_file())
-        return next((side for side in there if self.has_depth(folder / f"depth_{side}")), None)
+        sides = (self.options.camera,) if self.options.camera else VERSIONS
+        with_poses = (side for side in sides if (folder / f"pose_{side}.txt").is_file())
+        return next((side for side in with_poses if self.has_depth(folder / f"depth_{side}")), None)

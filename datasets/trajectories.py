@@ -39,15 +39,15 @@ def poses_by_name(path: Path, names: Sequence[str], max_difference: float) -> tu
     turns = rows[:, [5, 6, 7, 4]] if scalar_first else rows[:, 4:8]
     times, order = np.unique(times, return_index=True)
     poses = from_quaternions(rows[order, 1:4], turns[order], path)
-    wanted = _times_of(names, path)
-    found = at_times(times, poses, wanted, max_difference, "interpolate")
-    if len(names) and not np.isfinite(found).all(axis=(1, 2)).any():
+    frame_times = _times_of(names, path)
+    frame_poses = at_times(times, poses, frame_times, max_difference, "interpolate")
+    if len(names) and not np.isfinite(frame_poses).all(axis=(1, 2)).any():
         raise DataError(
             f"{path}: no pose is within {max_difference:g} s of a frame: poses are from {times[0]:.6f} to"
-            f" {times[-1]:.6f} s, the names of frames from {wanted.min():.6f} to {wanted.max():.6f} s; name frames by"
-            " their time stamps, or set max_difference"
+            f" {times[-1]:.6f} s, the names of frames from {frame_times.min():.6f} to {frame_times.max():.6f} s; name"
+            " frames by their time stamps, or set max_difference"
         )
-    return found, wanted
+    return frame_poses, frame_times
 
 
 def _rows(path: Path) -> tuple[Float64, bool]:

@@ -103,13 +103,13 @@ class Tum(FileDataset[TumOptions]):
 
     def _camera(self, folder: Path) -> Camera:
         """Return the stated intrinsics, else those of the sequence's name."""
-        known = next((numbers for key, numbers in CAMERAS.items() if key in folder.resolve().name), None)
-        if known is None and self.options.intrinsics is None:
+        usual = next((numbers for key, numbers in CAMERAS.items() if key in folder.resolve().name), None)
+        if usual is None and self.options.intrinsics is None:
             raise DataError(
                 f"{folder}: the intrinsics are not known, as the folder's name has none of {', '.join(CAMERAS)}; set"
                 " intrinsics: [fx, fy, cx, cy] (--option 'intrinsics=[fx, fy, cx, cy]')"
             )
-        return camera_of(self.options.intrinsics, known or CAMERAS["freiburg1"], IMAGE_SIZE)
+        return camera_of(self.options.intrinsics, usual or CAMERAS["freiburg1"], IMAGE_SIZE)
 
     def _list(self, folder: Path) -> str:
         cast = self.options.surface is not None and not (folder / "depth.txt").is_file()
@@ -134,17 +134,18 @@ class Tum(FileDataset[TumOptions]):
 UNITS = {1e3: "milliseconds", 1e6: "microseconds", 1e9: "nanoseconds"}
 
 
-def _require_overlap(path: Path, times: Float64, wanted: Float64) -> None:
+def _require_overlap(path: Path, times: Float64, image_times: Float64) -> None:
     """Raise DataError where the trajectory and the images have no time in common, with the reason that shows."""
-    if times[0] <= wanted[-1] and wanted[0] <= times[-1]:
+    if times[0] <= image_times[-1] and image_times[0] <= times[-1]:
         return
     for unit, name in UNITS.items():
         for factor, where in ((1 / unit, path.name), (unit, "the lists of images")):
-            if abs(times[0] * factor - wanted[0]) < 0.1 * min(times[0] * factor, wanted[0]):
+            if abs(times[0] * factor - image_times[0]) < 0.1 * min(times[0] * factor, image_times[0]):
                 raise DataError(f"{path}: time stamps of {where} look like {name}; write seconds")
     raise DataError(
-        f"{path}: poses are from {times[0]:.6f} to {times[-1]:.6f} s, images from {wanted[0]:.6f} to {wanted[-1]:.6f}"
-        f" s: they have no time in common; if the clocks differ, set time_offset (about {times[0] - wanted[0]:.6g})"
+        f"{path}: poses are from {times[0]:.6f} to {times[-1]:.6f} s, images from {image_times[0]:.6f} to"
+        f" {image_times[-1]:.6f} s: they have no time in common; if the clocks differ, set time_offset (about"
+        f" {times[0] - image_times[0]:.6g})"
     )
 
 

@@ -75,9 +75,9 @@ class UavScenes(Photographs[UavScenesOptions]):
         content = read_json(path)
         if not isinstance(content, list):
             raise DataError(f"{path}: expected a list of cameras, got a {type(content).__name__}; download it again")
-        there = {image.name for own in self.image_folders(folder) for image in own.glob("*.*")}
+        image_names = {image.name for image_folder in self.image_folders(folder) for image in image_folder.glob("*.*")}
         shots = [_shot(camera, f"{path}, camera {k}") for k, camera in enumerate(content)]
-        return Reconstruction(path, [shot for shot in shots if shot.name in there] if there else shots)
+        return Reconstruction(path, [shot for shot in shots if shot.name in image_names] if image_names else shots)
 
     def image_folders(self, folder: Path) -> Sequence[Path]:
         """Return the folders of a flight's photographs, interval5_CAM first."""
@@ -99,8 +99,8 @@ class UavScenes(Photographs[UavScenesOptions]):
     ) -> FileScene:
         """Return the scene, with the ground truth that lies in a folder of its own."""
         truth = _truth_of(entry.folder)
-        own = {} if truth is None or options.ground_truth is not None else {GROUND_TRUTH: truth}
-        return FileScene(entry, frames, options, surface=surface, label_folders=own)
+        label_folders = {} if truth is None or options.ground_truth is not None else {GROUND_TRUTH: truth}
+        return FileScene(entry, frames, options, surface=surface, label_folders=label_folders)
 
 
 def _named(entry: SceneEntry) -> SceneEntry:

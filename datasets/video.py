@@ -103,8 +103,8 @@ class Video(Dataset):
             raise ConfigError(f"{self.options.root}: scene '{name}' is not there; {nearest(name, self.scenes)}")
         entry, images = self._found[name]
         if images.is_dir():
-            named = sorted(files_by_stem(images, COLOR_SUFFIXES).items(), key=lambda item: natural(item[0]))
-            return VideoScene(entry, [VideoFrame(stem, images / file) for stem, file in named], self.options)
+            image_files = sorted(files_by_stem(images, COLOR_SUFFIXES).items(), key=lambda item: natural(item[0]))
+            return VideoScene(entry, [VideoFrame(stem, images / file) for stem, file in image_files], self.options)
         film = Film(images)
         return VideoScene(entry, [VideoFrame(f"{k:06d}") for k in range(len(film))], self.options, film)
 
@@ -139,8 +139,8 @@ def find_videos(root: Path) -> Iterable[tuple[SceneEntry, Path]]:
 
 def _images_of(folder: Path) -> Path | None:
     """Return the folder with a scene's images: the folder itself, or one of `IMAGE_FOLDERS`; None without images."""
-    there = {*subfolders(folder)}
-    for images in (folder, *(folder / name for name in IMAGE_FOLDERS if name in there)):
+    subfolder_names = {*subfolders(folder)}
+    for images in (folder, *(folder / name for name in IMAGE_FOLDERS if name in subfolder_names)):
         if len(files_by_stem(images, COLOR_SUFFIXES)) >= LEAST:
             return images
     return None
@@ -194,8 +194,8 @@ class Film:
             if not self._next <= index < self._next + NEAR:
                 self._capture.set(cv2.CAP_PROP_POS_FRAMES, index)
                 self._next = index
-            there = all(self._capture.grab() for _ in range(index - self._next))
-            done, image = self._capture.read() if there else (False, None)
+            reached = all(self._capture.grab() for _ in range(index - self._next))
+            done, image = self._capture.read() if reached else (False, None)
             self._next = index + 1 if done else -NEAR  # the next read seeks again
         if not done or image is None:
             raise DataError(

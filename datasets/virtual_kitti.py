@@ -46,8 +46,8 @@ class VirtualKitti(FileDataset[VirtualKittiOptions]):
 
     def is_scene(self, folder: Path) -> bool:
         """Return whether depth of the camera and both tables are there; with a surface, the latter."""
-        there = all((folder / name).is_file() for name in ("extrinsic.txt", "intrinsic.txt"))
-        return there and self.has_depth(folder / "frames/depth" / self.options.camera)
+        has_tables = all((folder / name).is_file() for name in ("extrinsic.txt", "intrinsic.txt"))
+        return has_tables and self.has_depth(folder / "frames/depth" / self.options.camera)
 
     def settled(self, folder: Path) -> VirtualKittiOptions:
         """Return the options with the ground truth of the camera."""
@@ -72,12 +72,12 @@ class VirtualKitti(FileDataset[VirtualKittiOptions]):
         number = int(camera[-1])
         T_cw = _rows(folder / "extrinsic.txt", "frame cameraID r1,1 r1,2 r1,3 t1 ... 1", 16, number, numbers)
         K = _rows(folder / "intrinsic.txt", "frame cameraID K[0,0] K[1,1] K[0,2] K[1,2]", 4, number, numbers)
-        each = Camera(Intrinsics(1, 1, 0, 0))  # until that of the frame is known
+        placeholder = Camera(Intrinsics(1, 1, 0, 0))  # until that of the frame is known
         color, poses = f"frames/rgb/{camera}/rgb_{{name}}", T_cw.reshape(-1, 4, 4)
-        found = frames_of(folder, depth, each, pose="extrinsic.txt", color=color, poses=poses)
-        for frame, own in zip(found, K, strict=True):
+        sources = frames_of(folder, depth, placeholder, pose="extrinsic.txt", color=color, poses=poses)
+        for frame, intrinsics in zip(sources, K, strict=True):
             try:
-                yield replace(frame, camera=Camera(Intrinsics(*own.tolist())))
+                yield replace(frame, camera=Camera(Intrinsics(*intrinsics.tolist())))
             except DataError as error:
                 raise DataError(f"{folder / 'intrinsic.txt'}: frame {frame.name}: {error}") from error
 

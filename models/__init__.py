@@ -195,7 +195,7 @@ def content_digest(path: Path) -> str:
     if path.is_file():
         files = [path, *(path.parent / name for name in external_data(path))]
     else:
-        files = sorted(each for each in path.rglob("*") if each.is_file())
+        files = sorted(entry for entry in path.rglob("*") if entry.is_file())
     for file in files:
         digest.update(b"" if file == path else os.path.relpath(file, path).encode() + b"\0")
         with file.open("rb") as opened:
@@ -228,7 +228,7 @@ def external_data(path: Path) -> list[str]:
 def _tensors(graph: Any) -> Iterator[Any]:
     """Yield the stored tensors of an ONNX graph and of the graphs inside its nodes."""
     yield from graph.initializer
-    for attribute in (each for node in graph.node for each in node.attribute):
+    for attribute in (entry for node in graph.node for entry in node.attribute):
         yield from (attribute.t, *attribute.tensors)
         for inner in (attribute.g, *attribute.graphs):
             yield from _tensors(inner)

@@ -181,8 +181,8 @@ def _download(options: ModelOptions) -> Path:
         about = huggingface_hub.HfApi().model_info(name, revision=revision, timeout=HUB_TIMEOUT)
         files = [sibling.rfilename for sibling in about.siblings or ()]
         weights = next((pattern for pattern in WEIGHTS if any(Path(file).match(pattern) for file in files)), WEIGHTS[0])
-        wanted = ["*.json", "*.txt", weights]
-        folder = Path(huggingface_hub.snapshot_download(name, revision=about.sha, allow_patterns=wanted))
+        patterns = ["*.json", "*.txt", weights]
+        folder = Path(huggingface_hub.snapshot_download(name, revision=about.sha, allow_patterns=patterns))
     except GatedRepoError as error:
         raise DataError(
             f"model '{name}': its owner asks for consent; give it on the hub, then 'hf auth login'"
@@ -246,8 +246,8 @@ def load_processor(checkpoint: Checkpoint, processing: Processing, **settings: A
         raise MissingDependencyError(
             "processor: torchvision is not installed; leave it out, or pip install 'semstab[torchvision]'"
         )
-    own = checkpoint.preprocessing()
-    kind = own.get("image_processor_type") or own.get("feature_extractor_type")
+    preprocessing = checkpoint.preprocessing()
+    kind = preprocessing.get("image_processor_type") or preprocessing.get("feature_extractor_type")
     if processing == "pil" and kind == "SegformerFeatureExtractor":
         processor = checkpoint.load(SegformerImageProcessorPil, **settings)
     else:

@@ -73,13 +73,13 @@ class ColourClusters(Model):
             ConfigError: If they have fewer pixels than clusters.
         """
         rng = np.random.default_rng(self.options.seed)
-        drawn = []
+        samples = []
         for image in images:
             pixels = pixel_features(image, self.options.scale).reshape(-1, 4)
             if len(pixels) > self.options.samples:
                 pixels = pixels[np.sort(rng.choice(len(pixels), self.options.samples, replace=False))]
-            drawn.append(pixels)
-        return ColourClusters(self.options, _codebook(np.concatenate(drawn), self.options))
+            samples.append(pixels)
+        return ColourClusters(self.options, _codebook(np.concatenate(samples), self.options))
 
     def predict(self, images: Sequence[Image], *, scores: bool = False) -> list[Prediction]:
         """See `Model`.

@@ -57,14 +57,14 @@ def own_maker(text: str) -> tuple[type[BaseModel], Callable[[Any], Model]]:
     cls: Any = code.target
     if not (isinstance(cls, type) and Model in cls.__mro__):
         return OwnOptions, lambda options: OwnModel(code, options)
-    own = getattr(cls, "Options", None)
-    if isinstance(own, type) and issubclass(own, BaseModel):
-        return own, lambda options: OfCode(guarded(text, lambda: cls(options)), code, {})
+    options_class = getattr(cls, "Options", None)
+    if isinstance(options_class, type) and issubclass(options_class, BaseModel):
+        return options_class, lambda options: OfCode(guarded(text, lambda: cls(options)), code, {})
 
     def make(options: OwnOptions) -> Model:
-        given = options.of_labels | options.of_speed(code)
-        code.accepts(given)
-        model = OfCode(guarded(text, lambda: cls(**given)), code, options.of_labels)
+        arguments = options.of_labels | options.of_speed(code)
+        code.accepts(arguments)
+        model = OfCode(guarded(text, lambda: cls(**arguments)), code, options.of_labels)
         options.limit_torch(code)
         return model
 
@@ -130,8 +130,8 @@ class OwnModel(Model):
         Raises:
             DataError: For an answer that is neither labels nor scores.
         """
-        shown = zip(images, geometry, strict=True) if self.wants_geometry else zip(images, strict=True)
-        return [self._predict(image, frame, scores) for image, *frame in shown]
+        inputs = zip(images, geometry, strict=True) if self.wants_geometry else zip(images, strict=True)
+        return [self._predict(image, frame, scores) for image, *frame in inputs]
 
     def identity(self) -> dict[str, Any]:
         """Return its file, its options, its classes."""
@@ -163,14 +163,14 @@ class OwnModel(Model):
     def _split(self, answer: Any, shape: tuple[int, ...]) -> tuple[Any, npt.NDArray[Any]]:
         """Return labels or scores, and the features of an answer; all labels are 0 if it has features alone."""
         alone = self.label_space == OF_FEATURES
-        given = answer if isinstance(answer, Mapping) else {"features": answer} if alone else {}
-        features = given.get("features")
-        labels = given.get("scores", given.get("labels"))
+        answers = answer if isinstance(answer, Mapping) else {"features": answer} if alone else {}
+        features = answers.get("features")
+        labels = answers.get("scores", answers.get("labels"))
         if features is None or (labels is None) != alone:
-            wanted = "features" if alone else "features and labels, or features and scores"
+            expected = "features" if alone else "features and labels, or features and scores"
             raise DataError(
-                f"{self._code.text}: gave {reprlib.repr(sorted(given)) if given else type(answer).__name__}; with"
-                f" gives_features = True let it give a dict with {wanted}"
+                f"{self._code.text}: gave {reprlib.repr(sorted(answers)) if answers else type(answer).__name__}; with"
+                f" gives_features = True let it give a dict with {expected}"
             )
         return np.zeros(shape, np.uint8) if alone else labels, _array(features)
 

@@ -71,7 +71,7 @@ class OnnxFile:
             raise DataError(
                 f"{path}: ONNX Runtime cannot load it ({summarize_error(error)}); is it an ONNX file?"
             ) from error
-        (self._input,) = _only(path, [each.name for each in self._session.get_inputs()])
+        (self._input,) = _only(path, [tensor.name for tensor in self._session.get_inputs()])
         about = self._session.get_inputs()[0]
         if about.type not in ONNX_TYPES:
             raise ConfigError(f"{path}: its input is a {about.type}; a network of images takes {', '.join(ONNX_TYPES)}")
@@ -126,7 +126,10 @@ class TorchFile:
     def _script(self, path: Path) -> Any:
         jit: Any = self._torch.jit
         module = jit.load(path, map_location=self._device).eval()
-        _only(path, [each.name for each in module.forward.schema.arguments[1:] if not each.has_default_value()])
+        _only(
+            path,
+            [argument.name for argument in module.forward.schema.arguments[1:] if not argument.has_default_value()],
+        )
         return module
 
     def _exported(self, path: Path) -> Any:
@@ -159,16 +162,18 @@ class TfliteFile:
                 f"{path}: LiteRT cannot load it ({summarize_error(error)[:80]}); is it a TFLite file?"
             ) from error
         inputs = self._interpreter.get_input_details()
-        _only(path, [each["name"] for each in inputs])
+        _only(path, [tensor["name"] for tensor in inputs])
         (self._input,) = inputs
         self._outputs = self._interpreter.get_output_details()
-        own = np.dtype(self._input["dtype"])
-        if own not in (np.float32, np.float16, np.uint8, np.int8):
-            raise ConfigError(f"{path}: its input is {own}; a network of images takes float32, float16, uint8 or int8")
-        self._scale, self._zero = (float(each) for each in self._input["quantization"])
-        if own == np.int8 and not self._scale:
+        dtype = np.dtype(self._input["dtype"])
+        if dtype not in (np.float32, np.float16, np.uint8, np.int8):
+            raise ConfigError(
+                f"{path}: its input is {dtype}; a network of images takes float32, float16, uint8 or int8"
+            )
+        self._scale, self._zero = (float(value) for value in self._input["quantization"])
+        if dtype == np.int8 and not self._scale:
             raise ConfigError(f"{path}: its input is int8 without a scale; convert it with one")
-        self.dtype: npt.DTypeLike = np.float32 if self._scale else own
+        self.dtype: npt.DTypeLike = np.float32 if self._scale else dtype
         signature = self._input.get("shape_signature", self._input["shape"])
         self.shape: tuple[int | None, ...] = tuple(None if side < 0 else int(side) for side in signature)
 
@@ -180,7 +185,7 @@ class TfliteFile:
             run.allocate_tensors()
         run.set_tensor(index, self._quantised(pixels) if self._scale else pixels)
         run.invoke()
-        return [_real(run.get_tensor(each["index"]), *each["quantization"]) for each in self._outputs]
+        return [_real(run.get_tensor(tensor["index"]), *tensor["quantization"]) for tensor in self._outputs]
 
     def _quantised(self, pixels: Array) -> Array:
         """Return q of real values scale (q - zero)."""

@@ -121,12 +121,12 @@ class UniversalHead:
         if self._task is not None:
             settings["task_inputs"] = ["semantic"] * len(images)
         inputs = self._processor(**settings)
-        given = {"pixel_values": inputs["pixel_values"].to(self._model.device, self._model.dtype)}
+        arguments = {"pixel_values": inputs["pixel_values"].to(self._model.device, self._model.dtype)}
         if self._task is not None:
-            given["task_inputs"] = self._task.expand(len(images), -1)
+            arguments["task_inputs"] = self._task.expand(len(images), -1)
         if "pixel_mask" in inputs:
-            given["pixel_mask"] = inputs["pixel_mask"].to(self._model.device)
-        output = self._model(**given)
+            arguments["pixel_mask"] = inputs["pixel_mask"].to(self._model.device)
+        output = self._model(**arguments)
         sums = [
             class_sums(classes, masks, self._masks)
             for classes, masks in zip(output.class_queries_logits, output.masks_queries_logits, strict=True)
@@ -135,7 +135,7 @@ class UniversalHead:
             return _merged(sums, inputs, images)
         if self._windows and self._processor.do_pad:  # transformers would stretch the padding over the image, too
             height, width = self._processor(**settings, do_pad=False)["pixel_values"].shape[-2:]
-            return [each[:, :height, :width] for each in sums]
+            return [class_maps[:, :height, :width] for class_maps in sums]
         return sums
 
 
@@ -168,7 +168,7 @@ class PromptedHead:
         pixels = self._processor(**settings)["pixel_values"].to(self._model.device, self._model.dtype)
         K, more = len(self._prompts), {"conditional_embeddings": self._prompts, "interpolate_pos_encoding": True}
         logits = [self._model(pixel_values=image.expand(K, -1, -1, -1), **more).logits for image in pixels]
-        return [each.reshape(K, *each.shape[-2:]) for each in logits]
+        return [logit.reshape(K, *logit.shape[-2:]) for logit in logits]
 
 
 Head = SemanticHead | UniversalHead | PromptedHead
@@ -188,8 +188,8 @@ def load_head(checkpoint: Checkpoint, options: SegmenterOptions, kind: str) -> H
         return UniversalHead(checkpoint, options, kind)
     if kind == "clipseg":
         return PromptedHead(checkpoint, options, kind)
-    known = ", ".join((*SEMANTIC, *UniversalHead.KINDS, "clipseg"))
-    raise DataError(f"{checkpoint.folder}: a '{kind}' model does not segment into classes; name one of: {known}")
+    kinds = ", ".join((*SEMANTIC, *UniversalHead.KINDS, "clipseg"))
+    raise DataError(f"{checkpoint.folder}: a '{kind}' model does not segment into classes; name one of: {kinds}")
 
 
 def class_sums(classes: torch.Tensor, masks: torch.Tensor, size: tuple[int, int] | None) -> torch.Tensor:
@@ -217,9 +217,9 @@ def working_size(image: tuple[int, ...], shorter: int) -> tuple[int, int]:
 
 def _square(kind: str, config: Any, processor: Any, options: SegmenterOptions) -> tuple[int, int]:
     """Return the side of the square that the model sees; an image is squeezed into it, which is reported."""
-    wanted, made_for = options.image_size, getattr(config, "image_size", None) or _shorter_side(processor)
-    side = made_for if wanted is None else wanted if isinstance(wanted, int) else wanted[0]
-    if isinstance(wanted, tuple) and wanted[0] != wanted[1]:
+    stated, made_for = options.image_size, getattr(config, "image_size", None) or _shorter_side(processor)
+    side = made_for if stated is None else stated if isinstance(stated, int) else stated[0]
+    if isinstance(stated, tuple) and stated[0] != stated[1]:
         raise ConfigError(f"image_size: a '{kind}' model sees squares; give one number, {made_for} for example")
     if getattr(processor, "keep_aspect_ratio", None):
         processor.keep_aspect_ratio = False
@@ -239,12 +239,12 @@ def _merged(sums: Sequence[torch.Tensor], inputs: Any, images: Sequence[Image]) 
     merged = []
     for k, image in enumerate(images):
         tall = image.shape[0] > image.shape[1]
-        own = [(start, end, sums[n]) for n, (which, start, end) in enumerate(offsets) if which == k]
-        K, h, w = own[0][2].shape
-        length = max(end for _, end, _ in own)
+        windows = [(start, end, sums[n]) for n, (which, start, end) in enumerate(offsets) if which == k]
+        K, h, w = windows[0][2].shape
+        length = max(end for _, end, _ in windows)
         total = torch.zeros(K, *((length, w) if tall else (h, length)))
         count = torch.zeros(total.shape[1:])
-        for start, end, window in own:
+        for start, end, window in windows:
             area = (slice(start, end), slice(None)) if tall else (slice(None), slice(start, end))
             total[:, *area] += window.cpu()
             count[area] += 1

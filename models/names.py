@@ -44,13 +44,15 @@ class Vocabulary:
 
     def matches(self, space: LabelSpace) -> bool:
         """Return whether a model's classes come from this vocabulary."""
-        own = {name_key(part) for name in space.classes for part in _names(name)}
-        return {name_key(name) for name in self.recognised_by} <= own
+        keys = {name_key(part) for name in space.classes for part in _names(name)}
+        return {name_key(name) for name in self.recognised_by} <= keys
 
     def target_of(self, name: str, leniency: Leniency) -> str | None:
         """Return the class of UAVid with this name, or None if the name is not a class of UAVid."""
         tables = (self.strict, self.lenient) if leniency == "lenient" else (self.strict,)
-        targets = {name_key(each): target for table in tables for target, names in table.items() for each in names}
+        targets = {
+            name_key(synonym): target for table in tables for target, names in table.items() for synonym in names
+        }
         return next((targets[key] for key in map(name_key, _names(name)) if key in targets), None)
 
 
@@ -70,10 +72,10 @@ def class_mapping(source: LabelSpace, target: LabelSpace, leniency: Leniency = "
     ConfigError and names the class; lenient leaves the class out, and warns if most classes are left out.
     """
     vocabulary = next((entry for entry in vocabularies().values() if entry.matches(source)), None)
-    known, rows, lost = target.row_of, [], []
+    rows_by_name, rows, lost = target.row_of, [], []
     for name in source.classes:
         candidates = _candidates(name, vocabulary, leniency)
-        row = next((known[key] for key in map(name_key, candidates) if key in known), None)
+        row = next((rows_by_name[key] for key in map(name_key, candidates) if key in rows_by_name), None)
         if row is None:
             lost.append(name)
         rows.append(None if row == LEFT_OUT else row)
@@ -121,14 +123,15 @@ class InTaxonomy(Wrapped):
     ) -> list[Prediction]:
         """See `Model`."""
         predictions = []
-        for each in self.ask(images, scores, geometry):
-            labels, mapped = self._mapping.labels(each.labels, "prediction"), None
-            if each.scores is not None:
+        for prediction in self.ask(images, scores, geometry):
+            labels, mapped = self._mapping.labels(prediction.labels, "prediction"), None
+            if prediction.scores is not None:
                 mapped = np.array(
-                    self._mapping.scores(each.scores.astype(np.float32, copy=False), "prediction"), dtype=np.float32
+                    self._mapping.scores(prediction.scores.astype(np.float32, copy=False), "prediction"),
+                    dtype=np.float32,
                 )
                 mapped[labels == ignore_id(labels)] = 0
-            predictions.append(Prediction(labels, mapped, each.features))
+            predictions.append(Prediction(labels, mapped, prediction.features))
         return predictions
 
     def stream(self, image: Image) -> Streamed:

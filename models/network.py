@@ -98,15 +98,15 @@ class Network(Model):
         return {"file": self._digest, **settings, "layout": self._layout, "classes": list(self.label_space.classes)}
 
     def _seen_size(self) -> tuple[int, int] | None:
-        wanted, shape = self._options.size, self._network.shape
-        wanted = (wanted, wanted) if isinstance(wanted, int) else wanted
-        seen = shape[2:4] if self._layout == "nchw" else shape[1:3]
-        if len(seen) != 2 or seen[0] is None or seen[1] is None:
-            return wanted
-        own = (seen[0], seen[1])
-        if wanted not in (None, own):
-            raise ConfigError(f"{self._path}: sees images of {own[0]}x{own[1]} only; leave size out")
-        return own
+        stated, shape = self._options.size, self._network.shape
+        stated = (stated, stated) if isinstance(stated, int) else stated
+        fixed_sides = shape[2:4] if self._layout == "nchw" else shape[1:3]
+        if len(fixed_sides) != 2 or fixed_sides[0] is None or fixed_sides[1] is None:
+            return stated
+        fixed = (fixed_sides[0], fixed_sides[1])
+        if stated not in (None, fixed):
+            raise ConfigError(f"{self._path}: sees images of {fixed[0]}x{fixed[1]} only; leave size out")
+        return fixed
 
     def _prediction(self, image: Image, scores: bool) -> Prediction:
         if scores:
@@ -147,13 +147,13 @@ class Network(Model):
         options, raw = self._options, np.dtype(self._network.dtype) == np.uint8
         step = self._network.multiple
         size = self._size or (-(-image.shape[0] // step) * step, -(-image.shape[1] // step) * step)
-        seen = resized(image, size, "pillow" if raw else options.resize)
-        seen = seen if options.channels == "rgb" else seen[..., ::-1]
+        resized_image = resized(image, size, "pillow" if raw else options.resize)
+        resized_image = resized_image if options.channels == "rgb" else resized_image[..., ::-1]
         if raw:
-            values: Array = seen
+            values: Array = resized_image
         else:
-            mean, std = (np.array(each, np.float32) for each in (options.mean, options.std))
-            values = (seen.astype(np.float32) / np.float32(options.scale) - mean) / std
+            mean, std = (np.array(constant, np.float32) for constant in (options.mean, options.std))
+            values = (resized_image.astype(np.float32) / np.float32(options.scale) - mean) / std
         laid = values[None] if self._layout == "nhwc" else values.transpose(2, 0, 1)[None]
         return np.ascontiguousarray(laid, dtype=self._network.dtype)
 
@@ -235,8 +235,8 @@ def shares(maps: Float32, shape: tuple[int, ...], best: Float32 | None) -> Itera
     """
 
     def weight(k: int) -> Float32:
-        own = upsampled(maps[k], shape)
-        return own if best is None else np.exp(own - best)
+        logits = upsampled(maps[k], shape)
+        return logits if best is None else np.exp(logits - best)
 
     total = weight(0)
     for k in range(1, len(maps)):

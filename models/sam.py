@@ -106,8 +106,8 @@ class SamOptions(ImageModelOptions):
 
     def identity(self) -> dict[str, Any]:
         """Return the options that the regions depend on, without those that a subclass adds."""
-        own = set(SamOptions.model_fields) - {"cache", "points_per_batch"}
-        return {name: value for name, value in super().identity().items() if name in own}
+        names = set(SamOptions.model_fields) - {"cache", "points_per_batch"}
+        return {name: value for name, value in super().identity().items() if name in names}
 
 
 @dataclass(frozen=True, eq=False)

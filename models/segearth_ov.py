@@ -368,11 +368,14 @@ class SegEarthOV(Model):
     def window_logits(self, window: torch.Tensor) -> torch.Tensor:
         """Return (queries, h, w) cosines of a window (3, h, w)."""
         pixels, area = padded(window[None], int(self._model.vision_model.config.patch_size))
-        whole, patches = dense_features(self._model, pixels)
+        global_feature, patches = dense_features(self._model, pixels)
         if self._upsampler is not None:
             patches = self._upsampler(patches, pixels)
         cosine = torch.einsum("qd,dhw->qhw", self.queries, nn.functional.normalize(patches[0], dim=0))
-        cosine = cosine + self.options.bias * (self.queries @ nn.functional.normalize(whole[0], dim=0))[:, None, None]
+        cosine = (
+            cosine
+            + self.options.bias * (self.queries @ nn.functional.normalize(global_feature[0], dim=0))[:, None, None]
+        )
         return bilinear(cosine, pixels.shape[-2:])[:, *area]
 
     @torch.inference_mode()
@@ -383,8 +386,8 @@ class SegEarthOV(Model):
             sentences = [template.format(name) for template in prompts.templates]
             tokens = tokenizer(sentences, padding=True, truncation=True, return_tensors="pt").to(self._model.device)
             output = self._model.get_text_features(**tokens)
-            each = nn.functional.normalize(getattr(output, "pooler_output", output), dim=-1)
-            features.append(nn.functional.normalize(each.mean(dim=0), dim=-1))
+            sentence_features = nn.functional.normalize(getattr(output, "pooler_output", output), dim=-1)
+            features.append(nn.functional.normalize(sentence_features.mean(dim=0), dim=-1))
         return torch.stack(features)
 
 

@@ -45,13 +45,13 @@ class Segmenter(Model):
         """See `Model`."""
         predictions = []
         for maps in self.head.maps(images):
-            each = self._streamed(maps, images[0].shape[:2])
+            streamed = self._streamed(maps, images[0].shape[:2])
             all_scores = None
             if scores:
-                all_scores = np.empty((*each.labels.shape, len(maps)), dtype=np.float32)
-                for k, values in enumerate(each.maps()):
+                all_scores = np.empty((*streamed.labels.shape, len(maps)), dtype=np.float32)
+                for k, values in enumerate(streamed.maps()):
                     all_scores[..., k] = values
-            predictions.append(Prediction(each.labels, all_scores))
+            predictions.append(Prediction(streamed.labels, all_scores))
         return predictions
 
     @torch.inference_mode()

@@ -62,20 +62,20 @@ class _Module:
         device, weights = checked_device(options.device), _weights(path)
         if options.threads is not None:
             torch.set_num_threads(options.threads)
-        named = f"{options.architecture} with encoder {options.encoder}"
+        network = f"{options.architecture} with encoder {options.encoder}"
         try:
             module: Any = segmentation_models_pytorch.create_model(
                 options.architecture, encoder_name=options.encoder, encoder_weights=None, classes=classes
             )
         except Exception as error:  # KeyError, ValueError, RuntimeError of timm
             raise ConfigError(
-                f"model 'smp': there is no {named} ({summarize_error(error)[:120]}); correct architecture or encoder"
+                f"model 'smp': there is no {network} ({summarize_error(error)[:120]}); correct architecture or encoder"
             ) from error
         try:
             module.load_state_dict(weights)
         except RuntimeError as error:
             raise DataError(
-                f"{path}: holds no weights of {named} for {classes} classes ({summarize_error(error)[:160]}); correct"
+                f"{path}: holds no weights of {network} for {classes} classes ({summarize_error(error)[:160]}); correct"
                 " architecture, encoder or classes"
             ) from error
         self.multiple = int(getattr(getattr(module, "encoder", None), "output_stride", MULTIPLE))
@@ -109,10 +109,10 @@ def _weights(path: Path) -> Mapping[str, torch.Tensor]:
         ) from error
     for key in ("state_dict", "model_state_dict", "model"):
         content = content.get(key, content) if isinstance(content, Mapping) else content
-    if not isinstance(content, Mapping) or not all(isinstance(each, torch.Tensor) for each in content.values()):
+    if not isinstance(content, Mapping) or not all(isinstance(tensor, torch.Tensor) for tensor in content.values()):
         raise DataError(f"{path}: holds no weights by name; write it by torch.save(net.state_dict(), FILE)")
     weights: Mapping[str, torch.Tensor] = content
     for prefix in PREFIXES:
         if weights and all(name.startswith(prefix) for name in weights):
-            weights = {name.removeprefix(prefix): each for name, each in weights.items()}
+            weights = {name.removeprefix(prefix): tensor for name, tensor in weights.items()}
     return weights

@@ -27,8 +27,8 @@ def text_embeddings(checkpoint: str, names: Sequence[str], templates: Sequence[s
         DataError: If the model has no text features, and what loading a checkpoint raises.
     """
     options = ModelOptions(checkpoint=checkpoint)
-    found = Checkpoint.find(options)
-    model, tokenizer = found.load_model(AutoModel, options), found.load(AutoTokenizer)
+    files = Checkpoint.find(options)
+    model, tokenizer = files.load_model(AutoModel, options), files.load(AutoTokenizer)
     if not hasattr(model, "get_text_features"):
         raise DataError(f"{checkpoint}: a {type(model).__name__} has no text features; choose CLIP, SigLIP or the like")
     embeddings = []
@@ -36,6 +36,6 @@ def text_embeddings(checkpoint: str, names: Sequence[str], templates: Sequence[s
         sentences = [template.replace("{}", name) for template in templates]
         tokens = tokenizer(sentences, padding=True, truncation=True, return_tensors="pt")
         output = model.get_text_features(**tokens)
-        each = nn.functional.normalize(getattr(output, "pooler_output", output), dim=-1)
-        embeddings.append(nn.functional.normalize(each.mean(dim=0), dim=-1))
+        sentence_features = nn.functional.normalize(getattr(output, "pooler_output", output), dim=-1)
+        embeddings.append(nn.functional.normalize(sentence_features.mean(dim=0), dim=-1))
     return np.asarray(torch.stack(embeddings).float().numpy(), np.float32)

@@ -161,9 +161,9 @@ class Checked(Wrapped):
         if labels.shape != shape:
             raise self._wrong(f"gave labels of shape {labels.shape} for an image of {shape}; give one label a pixel")
         if self.label_space is not None:
-            known = np.zeros(1 << 8 * labels.itemsize, dtype=np.bool_)
-            known[[id_ for id_ in (*self.label_space.ids, ignore_id(labels)) if id_ < len(known)]] = True
-            if not (fine := known[labels]).all():
+            valid = np.zeros(1 << 8 * labels.itemsize, dtype=np.bool_)
+            valid[[id_ for id_ in (*self.label_space.ids, ignore_id(labels)) if id_ < len(valid)]] = True
+            if not (fine := valid[labels]).all():
                 raise self._wrong(
                     f"gave the id {labels[~fine][0]}, which is not an id of its {len(self.label_space)} classes"
                 )
@@ -179,8 +179,8 @@ class Checked(Wrapped):
 
     def _check_features(self, features: Any, shape: tuple[int, ...]) -> None:
         if (features is not None) != self.gives_features:
-            said = "gives_features = True" if features is None else "no gives_features = True"
-            raise self._wrong(f"says {said}, and gave {_kind(features)} as features; let both agree")
+            statement = "gives_features = True" if features is None else "no gives_features = True"
+            raise self._wrong(f"says {statement}, and gave {_kind(features)} as features; let both agree")
         if features is None:
             return
         try:

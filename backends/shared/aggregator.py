@@ -46,8 +46,8 @@ class Aggregator:
         self.voxel_size = voxel_size
         self.num_classes = num_classes
         self.within = within
-        known = None if within is None else within.origin
-        self.origin: Int64 | None = None if known is None else np.array(known, dtype=np.int64)
+        stated_origin = None if within is None else within.origin
+        self.origin: Int64 | None = None if stated_origin is None else np.array(stated_origin, dtype=np.int64)
         self._voxels = FIRST_VOXELS
         self._space = WorkSpace()
 
@@ -58,18 +58,18 @@ class Aggregator:
             DataError: For a label outside the classes, or a voxel out of reach of the packed keys.
         """
         origin = self._origin_at(frame) if self.origin is None else self.origin
-        seen: Observed | ObservedScores | None
+        observations: Observed | ObservedScores | None
         if frame.labels is not None:
-            seen = self._labels(frame, origin) or self._far_labels(frame, origin)
+            observations = self._labels(frame, origin) or self._far_labels(frame, origin)
         else:
-            seen = self._scores(frame, origin)
-            if seen is None:  # a pixel out of reach: does it have a prediction?
+            observations = self._scores(frame, origin)
+            if observations is None:  # a pixel out of reach: does it have a prediction?
                 depth = np.where(frame.valid, frame.depth, np.float32(0))
-                seen = self._scores(dataclasses.replace(frame, depth=depth), origin)
-            if seen is None:
+                observations = self._scores(dataclasses.replace(frame, depth=depth), origin)
+            if observations is None:
                 raise out_of_reach(frame, origin, self.voxel_size)
         self.origin = origin
-        return seen
+        return observations
 
     def index_of(self, key: Int64) -> Int64:
         """Return voxel indices (n, 3) of packed keys."""
@@ -148,7 +148,7 @@ class Aggregator:
         merged = merge_loops.merge_words(word, count, partition, room, *bands, *pairs[0], *pairs[1])
         _, _, bounds, entry_bounds, _, _ = merged
         n, m = int(bounds[-1]), int(entry_bounds[-1])
-        seen = Observed(
+        observations = Observed(
             key=space.room("key", n),
             pixels=space.room("pixels", n),
             start=space.room("start", n + 1),
@@ -157,9 +157,10 @@ class Aggregator:
             bounds=bounds,
         )
         merge_loops.emit_voxels(
-            *pairs[0], *pairs[1], *merged, corner, seen.key, seen.pixels, seen.start, seen.label, seen.weight
+            *pairs[0], *pairs[1], *merged, corner,
+            observations.key, observations.pixels, observations.start, observations.label, observations.weight,
         )  # fmt: skip
-        return seen
+        return observations
 
     def _far_labels(self, frame: Frame, origin: Int64) -> Observed:
         """Return the observations of a frame beyond the reach of words, associated as the reference does it."""
@@ -229,12 +230,12 @@ class Aggregator:
             if entries.min() >= 0:
                 break
             self._voxels *= 4
-        seen = self._merged_scores(key, count, sums, room, entries, spread)
-        some = seen.rows(slice(None, None, max(1, len(seen.key) // SAMPLE)))
-        dense = 2 * np.count_nonzero(some) >= some.size
+        observations = self._merged_scores(key, count, sums, room, entries, spread)
+        sample = observations.rows(slice(None, None, max(1, len(observations.key) // SAMPLE)))
+        dense = 2 * np.count_nonzero(sample) >= sample.size
         if self.within is not None:
-            seen = seen.only(self.within.holds(index_of_keys(seen.key, origin).T))
-        return seen if dense else seen.sparse()
+            observations = observations.only(self.within.holds(index_of_keys(observations.key, origin).T))
+        return observations if dense else observations.sparse()
 
     def _merged_scores(
         self, key: Int64, count: Int32, sums: Float64, room: int, entries: Int64, spread: Int64
@@ -250,8 +251,8 @@ class Aggregator:
         )  # fmt: skip
         bounds, ends = np.concatenate([[0], np.cumsum(voxels)]), edges[:-1] + voxels
         keys, pixels, row = (space.room(name, int(bounds[-1])) for name in ("key", "pixels", "row"))
-        for whole, gaps in zip((keys, pixels, row), merged, strict=True):
-            np.concatenate([gaps[low:high] for low, high in zip(edges, ends, strict=False)], out=whole)
+        for joined, gaps in zip((keys, pixels, row), merged, strict=True):
+            np.concatenate([gaps[low:high] for low, high in zip(edges, ends, strict=False)], out=joined)
         return ObservedScores(keys, pixels, row, sums, bounds, K)
 
 

@@ -99,16 +99,16 @@ def check_depth(frame: Frame) -> None:
 
 def _whole_millimetres(measured: Float32) -> bool:
     """Return whether what is measured is whole numbers, as nothing in metres is, and too large to be near."""
-    known = np.abs(measured[np.isfinite(measured) & (measured != 0)])
-    if known.size < DISTINCT or not np.array_equal(known, np.floor(known)):
+    values = np.abs(measured[np.isfinite(measured) & (measured != 0)])
+    if values.size < DISTINCT or not np.array_equal(values, np.floor(values)):
         return False
-    return bool(np.median(known) >= FAR) and len(np.unique(known)) >= DISTINCT
+    return bool(np.median(values) >= FAR) and len(np.unique(values)) >= DISTINCT
 
 
 def _has_fractions(few: list[float]) -> bool:
     """Return whether enough of a few is measured, and not all of it whole numbers: numpy would take longer."""
-    known = [value for value in few if value != 0 and math.isfinite(value)]
-    return len(known) >= DISTINCT and any(value != math.floor(value) for value in known)
+    values = [value for value in few if value != 0 and math.isfinite(value)]
+    return len(values) >= DISTINCT and any(value != math.floor(value) for value in values)
 
 
 def observe(frame: Frame, voxel_size: float, num_classes: int, pixels: Mask | None = None) -> Observations:
@@ -206,8 +206,8 @@ def unpack(key: Int64, low: Int64, size: tuple[int, ...]) -> Int64:
 def _sums_of_evidence(frame: Frame, num_classes: int, chosen: Mask, voxel: Int64, voxels: int) -> Float64:
     """Return the sums (m, K) of s over the pixels of each voxel (n,): of one-hot labels, or of scores that sum to 1."""
     if frame.labels is not None and frame.scores is None:  # never a vector a pixel: of many classes it takes too much
-        seen = voxel * num_classes + frame.labels[chosen]
-        return np.bincount(seen, minlength=voxels * num_classes).reshape(voxels, num_classes).astype(np.float64)
+        entries = voxel * num_classes + frame.labels[chosen]
+        return np.bincount(entries, minlength=voxels * num_classes).reshape(voxels, num_classes).astype(np.float64)
     assert frame.scores is not None
     s_sum, begin = np.zeros((voxels, num_classes)), 0
     for row, pixels in zip(frame.scores, chosen, strict=True):  # a whole image of them takes four times that of halves
@@ -251,5 +251,5 @@ class Restricted:
 
 def falling_into(within: Extent, frame: Frame, voxel_size: float) -> Mask:
     """Return the pixels (H, W) with depth whose voxels are in the extent."""
-    there: Mask = np.isfinite(frame.depth) & (frame.depth > 0)
-    return pixels_held(frame, there, voxel_size, within.holds)
+    has_depth: Mask = np.isfinite(frame.depth) & (frame.depth > 0)
+    return pixels_held(frame, has_depth, voxel_size, within.holds)

@@ -57,12 +57,12 @@ def plogp_of(context: Any, builder: Any, p: Any) -> Any:
     m = builder.bitcast(builder.sub(bits, builder.shl(e, _all(INTS, MANTISSA_BITS))), DOUBLES)
     step = builder.and_(builder.lshr(above, _all(INTS, MANTISSA_BITS - STEP_BITS)), _all(INTS, STEPS - 1))
     r = _fused(builder, m, _looked_up(context, builder, step, INVERSE), _all(DOUBLES, -1.0))
-    whole = builder.fadd(builder.sitofp(e, DOUBLES), _looked_up(context, builder, step, LOGARITHM))
-    *others, last = _series()
+    approximate = builder.fadd(builder.sitofp(e, DOUBLES), _looked_up(context, builder, step, LOGARITHM))
+    *coefficients, last = _series()
     series = _all(DOUBLES, last)
-    for term in others[::-1]:
+    for term in coefficients[::-1]:
         series = _fused(builder, series, r, _all(DOUBLES, term))
-    return builder.fmul(p, _fused(builder, series, r, whole), flags=["contract"])
+    return builder.fmul(p, _fused(builder, series, r, approximate), flags=["contract"])
 
 
 def _all(vector: Any, value: float) -> Any:
@@ -84,8 +84,8 @@ def _looked_up(context: Any, builder: Any, step: Any, table: list[float]) -> Any
     numbers = cgutils.global_constant(builder, "logarithms", ir.Constant(ir.ArrayType(DOUBLE, STEPS), table))
     values = ir.Constant(DOUBLES, ir.Undefined)
     for lane in range(LANES):
-        at = builder.extract_element(step, INT32(lane))
-        values = builder.insert_element(values, builder.load(builder.gep(numbers, [INT(0), at])), INT32(lane))
+        index = builder.extract_element(step, INT32(lane))
+        values = builder.insert_element(values, builder.load(builder.gep(numbers, [INT(0), index])), INT32(lane))
     return values
 
 
@@ -106,14 +106,16 @@ def observe_eights(_typing: Any, evidence: Any, _sums: Any, _share: Any, _before
     """
 
     def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
-        own, seen = (context.make_array(signature.args[i])(context, builder, arguments[i]) for i in (0, 1))
+        evidence_array, sums_array = (
+            context.make_array(signature.args[i])(context, builder, arguments[i]) for i in (0, 1)
+        )
         share, before, after = (spread(builder, argument, DOUBLES) for argument in arguments[2:])
         number = NUMBERS[signature.args[0].dtype]
         size = context.get_abi_sizeof(context.get_data_type(signature.args[0].dtype))
         totals = [cgutils.alloca_once_value(builder, ZEROS) for _ in range(4)]
         most = cgutils.alloca_once_value(builder, ir.Constant(DOUBLES, [-1.0] * LANES))
         classes = cgutils.alloca_once_value(builder, ir.Constant(INTS, [0] * LANES))
-        (length,) = cgutils.unpack_tuple(builder, own.shape, 1)
+        (length,) = cgutils.unpack_tuple(builder, evidence_array.shape, 1)
 
         def plus(a: Any, b: Any) -> Any:
             return builder.fadd(a, b, flags=["contract"])
@@ -122,9 +124,9 @@ def observe_eights(_typing: Any, evidence: Any, _sums: Any, _share: Any, _before
             return builder.fmul(a, b, flags=["contract"])
 
         with cgutils.for_range_slice(builder, INT(0), length, INT(LANES), intp=INT) as (k, _):
-            pointer = builder.bitcast(builder.gep(seen.data, [k]), DOUBLES.as_pointer())
+            pointer = builder.bitcast(builder.gep(sums_array.data, [k]), DOUBLES.as_pointer())
             s = times(builder.load(pointer, align=8), share)
-            pointer = builder.bitcast(builder.gep(own.data, [k]), ir.VectorType(number, LANES).as_pointer())
+            pointer = builder.bitcast(builder.gep(evidence_array.data, [k]), ir.VectorType(number, LANES).as_pointer())
             was = builder.load(pointer, align=size)
             was = was if number == DOUBLE else builder.fpext(was, DOUBLES)
             p, value = times(was, before), plus(was, s)
@@ -159,12 +161,12 @@ def plogp_eights(_typing: Any, evidence: Any, _before: Any) -> Any:
     """Return the sum of p log2 p over p = before * evidence, an array as `observe_eights` takes it."""
 
     def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
-        own = context.make_array(signature.args[0])(context, builder, arguments[0])
+        evidence_array = context.make_array(signature.args[0])(context, builder, arguments[0])
         before = spread(builder, arguments[1], DOUBLES)
         total = cgutils.alloca_once_value(builder, ZEROS)
-        (length,) = cgutils.unpack_tuple(builder, own.shape, 1)
+        (length,) = cgutils.unpack_tuple(builder, evidence_array.shape, 1)
         with cgutils.for_range_slice(builder, INT(0), length, INT(LANES), intp=INT) as (k, _):
-            pointer = builder.bitcast(builder.gep(own.data, [k]), DOUBLES.as_pointer())
+            pointer = builder.bitcast(builder.gep(evidence_array.data, [k]), DOUBLES.as_pointer())
             p = builder.fmul(builder.load(pointer, align=8), before)
             builder.store(builder.fadd(builder.load(total), plogp_of(context, builder, p)), total)
         return _over_lanes(builder, "fadd", DOUBLE, [DOUBLE(0.0), builder.load(total)], ["reassoc"])

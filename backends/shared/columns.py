@@ -32,7 +32,7 @@ def mask_words(num_classes: int) -> int:
 def _lowest(_typing: Any, _mask: Any) -> Any:
     """Return the position of the lowest bit of an int64 that is not 0."""
     signature = types.int64(types.int64)
-    return signature, lambda _, builder, __, given: builder.cttz(given[0], ir.Constant(ir.IntType(1), 1))
+    return signature, lambda _, builder, __, arguments: builder.cttz(arguments[0], ir.Constant(ir.IntType(1), 1))
 
 
 def update_rows(rows: Int64, seen: Observed, frame: int, **columns: Any) -> tuple[Change, BeliefChange]:

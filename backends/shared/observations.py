@@ -106,8 +106,8 @@ class WorkSpace:
 
 def _in_small_pages(length: int) -> npt.NDArray[np.uint8]:
     """Return bytes that take memory only for the pages written to; numpy would ask for pages of 2 MB if available."""
-    own = {"flags": mmap.MAP_PRIVATE | mmap.MAP_ANONYMOUS} if hasattr(mmap, "MAP_ANONYMOUS") else {}
-    pages = mmap.mmap(-1, length, **own)
+    page_flags = {"flags": mmap.MAP_PRIVATE | mmap.MAP_ANONYMOUS} if hasattr(mmap, "MAP_ANONYMOUS") else {}
+    pages = mmap.mmap(-1, length, **page_flags)
     if hasattr(mmap, "MADV_NOHUGEPAGE"):
         with contextlib.suppress(OSError):  # a kernel without large pages
             pages.madvise(mmap.MADV_NOHUGEPAGE)
@@ -168,22 +168,24 @@ class Change:
             op: (n,) observations including this one.
             pixels: (n,) of the frame.
         """
-        known = op > 1
+        is_repeated = op > 1
         before, after = np.asfortranarray(before), np.asfortranarray(after)  # sums over few classes run along n
-        p_after, p_before, drift = normalise(after), normalise(before.T[:, known].T), np.zeros(len(op))
-        drift[known] = js_divergence(p_after.T[:, known].T, p_before)
+        p_after, p_before, drift = normalise(after), normalise(before.T[:, is_repeated].T), np.zeros(len(op))
+        drift[is_repeated] = js_divergence(p_after.T[:, is_repeated].T, p_before)
         dominant_after = after.argmax(axis=1).astype(np.uint16)
-        dominant_before = np.where(known, before.argmax(axis=1).astype(np.uint16), dominant_after)
+        dominant_before = np.where(is_repeated, before.argmax(axis=1).astype(np.uint16), dominant_after)
         change = cls(
             points=int(pixels.sum()),
             voxels=len(op),
-            new=int(np.count_nonzero(~known)),
+            new=int(np.count_nonzero(~is_repeated)),
             drift=float(drift.sum()),
             vss=float(p_after.max(axis=1).sum() - p_before.max(axis=1).sum()),
             entropy=float(entropy_bits(p_after).sum() - entropy_bits(p_before).sum()),
             recurrent=int(np.count_nonzero(op == RECURRENT)),
         )
-        return change, BeliefChange(np.where(known, drift, np.nan).astype(np.float32), dominant_before, dominant_after)
+        return change, BeliefChange(
+            np.where(is_repeated, drift, np.nan).astype(np.float32), dominant_before, dominant_after
+        )
 
 
 class MapTotal:

@@ -92,12 +92,12 @@ def drawn_of(frame: Frame, size: float, odd: Int64, one_in: int) -> Mask:
     A filter for the numpy reference, which decides on the pixels that are left by itself.
     """
     pose, odds = tuple(map(tuple, frame.T_wc[:3].tolist())), tuple(odd.tolist())
-    drawn = np.empty(frame.shape, np.bool_)
+    mask = np.empty(frame.shape, np.bool_)
     if frame.points is not None:
-        drawn_points(frame.points, frame.valid, pose, size, odds, one_in, drawn)
+        drawn_points(frame.points, frame.valid, pose, size, odds, one_in, mask)
     else:
-        drawn_pixels(frame.depth, frame.valid, *frame.rays, pose, size, odds, one_in, drawn)
-    return drawn
+        drawn_pixels(frame.depth, frame.valid, *frame.rays, pose, size, odds, one_in, mask)
+    return mask
 
 
 @serial
@@ -192,4 +192,4 @@ def ask_for(builder: Any, pointer: Any) -> None:
 @intrinsic
 def bits_of(_typing: Any, _value: Any) -> Any:
     """Return the bits of a double as int64; the bits of non-negative numbers sort like the numbers."""
-    return types.int64(types.float64), lambda _, builder, __, given: builder.bitcast(given[0], ir.IntType(64))
+    return types.int64(types.float64), lambda _, builder, __, arguments: builder.bitcast(arguments[0], ir.IntType(64))

@@ -42,8 +42,8 @@ def scale_eight(_typing: Any, scores: Any, _at: Any, _K: Any, keys: Any, scale: 
     """
 
     def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
-        array, at, K, _, _, u = arguments
-        pixels = [builder.add(at, builder.mul(K, INT(pixel))) for pixel in range(LANES)]
+        array, offset, K, _, _, u = arguments
+        pixels = [builder.add(offset, builder.mul(K, INT(pixel))) for pixel in range(LANES)]
         total = _folded(builder, _sums(context, builder, signature.args[0], array, pixels, K))
         key, scales = (
             builder.bitcast(builder.gep(_data(context, builder, signature, arguments, i), [u]), kind.as_pointer())
@@ -76,9 +76,9 @@ def add_two(
     """
 
     def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
-        array, at, K, _, u, end, _, to, fresh = arguments
+        array, offset, K, _, u, end, _, to, fresh = arguments
         pixels = [u, builder.add(u, INT(1))]
-        offsets = [builder.add(at, builder.mul(K, pixel)) for pixel in pixels]
+        offsets = [builder.add(offset, builder.mul(K, pixel)) for pixel in pixels]
         counted = [builder.icmp_signed("<", pixel, end) for pixel in pixels]
         scales = _data(context, builder, signature, arguments, 3)
         factors = [
@@ -150,8 +150,8 @@ def _by_eights(
     data = builder.bitcast(context.make_array(kind)(context, builder, array).data, number.as_pointer())
     starts = [builder.gep(data, [offset]) for offset in offsets]
     size = context.get_abi_sizeof(context.get_data_type(kind.dtype))
-    whole = builder.and_(K, INT(-LANES))
-    rest = builder.sub(K, whole)
+    full_lanes = builder.and_(K, INT(-LANES))
+    rest = builder.sub(K, full_lanes)
 
     def eight(start: Any, k: Any) -> Any:
         return builder.load(builder.bitcast(builder.gep(start, [k]), vector.as_pointer()), align=size)
@@ -159,19 +159,19 @@ def _by_eights(
     def widened(values: Any) -> Any:
         return values if vector == DOUBLES else builder.fpext(values, DOUBLES)
 
-    with cgutils.for_range_slice(builder, INT(0), whole, INT(LANES), intp=INT) as (k, _):
+    with cgutils.for_range_slice(builder, INT(0), full_lanes, INT(LANES), intp=INT) as (k, _):
         do([widened(eight(start, k)) for start in starts], k)
     with builder.if_then(builder.icmp_signed(">", rest, INT(0))):
         lanes = ir.Constant(INTS, list(range(LANES)))
         inside = builder.icmp_signed("<", lanes, spread(builder, rest, INTS))
         nothing = ir.Constant(vector, [0.0] * LANES)
-        do([widened(builder.select(inside, eight(start, whole), nothing)) for start in starts], whole)
+        do([widened(builder.select(inside, eight(start, full_lanes), nothing)) for start in starts], full_lanes)
 
 
 def spread(builder: Any, value: Any, vector: Any) -> Any:
     """Return a vector of equal values."""
-    one = builder.insert_element(ir.Constant(vector, ir.Undefined), value, INT32(0))
-    return builder.shuffle_vector(one, one, ir.Constant(ir.VectorType(INT32, vector.count), [0] * vector.count))
+    lane = builder.insert_element(ir.Constant(vector, ir.Undefined), value, INT32(0))
+    return builder.shuffle_vector(lane, lane, ir.Constant(ir.VectorType(INT32, vector.count), [0] * vector.count))
 
 
 # Compiled loops from the scores of a frame to the sums of its voxels, by tiles of the image.

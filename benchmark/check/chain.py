@@ -116,27 +116,30 @@ class Chain:
 
     def contradicts(self, pair: Pair, *neighbours: Pair) -> bool:
         """Return whether two frames contradict each other, and their neighbours do not."""
-        if not all(self.fits(*one) for one in neighbours):
+        if not all(self.fits(*neighbour) for neighbour in neighbours):
             return False
-        least = max(CONTRADICTS, *(APART * error for error in (self.usual, *(self.error(*one) for one in neighbours))))
+        least = max(
+            CONTRADICTS,
+            *(APART * error for error in (self.usual, *(self.error(*neighbour) for neighbour in neighbours))),
+        )
         return self.error(*pair) >= least
 
     def without(self, positions: Sequence[int]) -> Chain:
         """Return the chain without these frames."""
-        left = [position for position in self.positions if position not in positions]
+        remaining = [position for position in self.positions if position not in positions]
         links = {pair: link for pair, link in self.links.items() if not {*pair} & {*positions}}
-        return dataclasses.replace(self, positions=left, links=links)
+        return dataclasses.replace(self, positions=remaining, links=links)
 
     def misfits(self) -> list[tuple[int, Pair]]:
         """Return the positions of frames that contradict both neighbours, which fit each other; with these.
 
         Neighbours are the nearest frames on both sides, or the frames next to two such frames.
         """
-        found = dict[int, Pair]()
+        pairs = dict[int, Pair]()
         for a, between, c in self._around():
             if all(self._strange((a, b), (a, c)) and self._strange((b, c), (a, c)) for b in between):
-                found |= {b: found.get(b, (a, c)) for b in between}
-        return sorted(found.items())
+                pairs |= {b: pairs.get(b, (a, c)) for b in between}
+        return sorted(pairs.items())
 
     def _around(self) -> Iterator[tuple[int, Sequence[int], int]]:
         """Yield one or more frames side by side, between the frames before and after them."""
@@ -203,9 +206,9 @@ class Chain:
         return [(b, c) for a, b, c, d in runs if self._departs((a, b), (b, c), (c, d), float(np.median(far or [0.0])))]
 
     def _departs(self, before: Pair, across: Pair, after: Pair, distant: float) -> bool:
-        one, link, other = (self.links[pair] for pair in (before, across, after))
-        goes_on = link.still <= min(GOES_ON * max(one.still, other.still), ALIKE * distant)
-        return link.share < UNSEEN <= SEEN <= min(one.share, other.share) and goes_on
+        link_before, link, link_after = (self.links[pair] for pair in (before, across, after))
+        goes_on = link.still <= min(GOES_ON * max(link_before.still, link_after.still), ALIKE * distant)
+        return link.share < UNSEEN <= SEEN <= min(link_before.share, link_after.share) and goes_on
 
     def _gap(self, a: int, b: int) -> int:
         return bisect.bisect_left(self.positions, b) - bisect.bisect_left(self.positions, a)
@@ -216,14 +219,14 @@ class Chain:
         These have several classes: a network that sees nothing there, but something in between, flickers. Maps of one
         class are named as such.
         """
-        found = dict[int, Pair]()
+        pairs = dict[int, Pair]()
         for a, between, c in self._around():
             if any(self.maps[k].classes < SEVERAL for k in (a, c) if k in self.maps):
                 continue
             limit = self.agreement(a, c) - DISAGREE
             if all(max(self.agreement(a, b), self.agreement(b, c)) < limit for b in between):
-                found |= {b: found.get(b, (a, c)) for b in between if not self.maps[b].single}
-        return sorted(found.items())
+                pairs |= {b: pairs.get(b, (a, c)) for b in between if not self.maps[b].single}
+        return sorted(pairs.items())
 
     def agreement(self, a: int, b: int) -> float:
         """Return the agreement of two frames' labels, or NaN if they were not compared."""
@@ -279,22 +282,24 @@ def chained(views: Iterable[tuple[int, View | None]], configured: Convention) ->
 
 def linked(first: View, second: View, configured: Convention) -> Link:
     """Compare two views: points of each in the other."""
-    sample, one = Sample({0: first, 1: second}, [(0, 1), (1, 0)], configured), np.array([1.0])
-    there, back = (sample.matched(pair, configured, one) for pair in sample.pairs)
-    errors = np.concatenate([there.error[0], back.error[0]])
-    seen = np.isfinite(errors)
-    if seen.sum() < LEAST_SEEN or seen.mean() < LEAST_SHARE:
-        return Link(math.nan, float(seen.mean()), math.nan, False, math.nan, _still(first, second))
-    own, other = np.isfinite(there.error[0]), np.isfinite(back.error[0])
+    sample, factors = Sample({0: first, 1: second}, [(0, 1), (1, 0)], configured), np.array([1.0])
+    matches, back = (sample.matched(pair, configured, factors) for pair in sample.pairs)
+    errors = np.concatenate([matches.error[0], back.error[0]])
+    finite = np.isfinite(errors)
+    if finite.sum() < LEAST_SEEN or finite.mean() < LEAST_SHARE:
+        return Link(math.nan, float(finite.mean()), math.nan, False, math.nan, _still(first, second))
+    finite_first, finite_second = np.isfinite(matches.error[0]), np.isfinite(back.error[0])
     with np.errstate(all="ignore"):
-        logs = np.log(np.concatenate([(there.depth / there.z)[0][own], (back.z / back.depth)[0][other]]))
+        logs = np.log(
+            np.concatenate([(matches.depth / matches.z)[0][finite_first], (back.z / back.depth)[0][finite_second]])
+        )
     ratio = float(np.median(logs))
-    forth = Shared.of(first, there).labels(first.labels, second.labels, first.ignore_id, second.ignore_id)
-    again = Shared.of(second, back).labels(second.labels, first.labels, second.ignore_id, first.ignore_id)
-    labels = np.concatenate([forth, again[::-1]], axis=1)
+    forth = Shared.of(first, matches).labels(first.labels, second.labels, first.ignore_id, second.ignore_id)
+    labels_back = Shared.of(second, back).labels(second.labels, first.labels, second.ignore_id, first.ignore_id)
+    labels = np.concatenate([forth, labels_back[::-1]], axis=1)
     return Link(
         error=float(median_of_seen(errors)),
-        share=float(seen.mean()),
+        share=float(finite.mean()),
         ratio=math.exp(ratio),
         steady=bool(np.median(np.abs(logs - ratio)) < SAME_RATIO),
         agreement=float(np.mean(labels[0] == labels[1])) if labels.shape[1] >= LEAST_SEEN else math.nan,
@@ -309,5 +314,5 @@ def _still(first: View, second: View) -> float:
         return math.nan
     with np.errstate(all="ignore"):
         logs = np.abs(np.log(first.depth[first.v, first.u] / second.depth[first.v, first.u]))
-    told = logs[np.isfinite(logs)]
-    return float(np.median(told)) if len(told) >= LEAST_SEEN else math.nan
+    finite = logs[np.isfinite(logs)]
+    return float(np.median(finite)) if len(finite) >= LEAST_SEEN else math.nan

@@ -214,8 +214,8 @@ class Neighbours:
         lost = lost_tracking(poses, self._configured, self._links)
         if not lost:
             return None
-        same = any(np.allclose(poses[k], origin_of(self._configured), atol=1e-9) for k in lost)
-        what = "the identity as pose" if same else "the pose of a frame before once more"
+        is_identity = any(np.allclose(poses[k], origin_of(self._configured), atol=1e-9) for k in lost)
+        what = "the identity as pose" if is_identity else "the pose of a frame before once more"
         frames = f"frame {self.named(lost[0])} has {what}"
         if len(lost) > 1:
             frames = f"{len(lost)} frames have {what} ({self._list(lost, MOST_LOST)})"
@@ -227,8 +227,10 @@ class Neighbours:
     def _links(self, pairs: Sequence[Pair]) -> list[Link | None]:
         """Return how pairs of frames agree; None for frames without depth or that cannot be read."""
         views = {position: self._view(position) for position in sorted({p for pair in pairs for p in pair})}
-        told = {p: view for p, view in views.items() if view is not None and len(view.u) >= LEAST_SEEN}
-        return [linked(told[a], told[b], self._configured) if a in told and b in told else None for a, b in pairs]
+        usable = {p: view for p, view in views.items() if view is not None and len(view.u) >= LEAST_SEEN}
+        return [
+            linked(usable[a], usable[b], self._configured) if a in usable and b in usable else None for a, b in pairs
+        ]
 
     def said_of_many(self, chain: Chain, misfits: Sequence[int]) -> str:
         """Return the line on frames that do not fit their neighbours, if there are many."""
@@ -240,14 +242,14 @@ class Neighbours:
 
     def said_of_misfits(self, chain: Chain, misfits: Sequence[tuple[int, Pair]]) -> Iterator[str]:
         """Yield a line on frames that do not fit their neighbours."""
-        for position, beside in misfits[:MOST_NAMED]:
-            yield f"{self._misfit(chain, position, beside)}; correct it, or leave the frame out ({LEAVE_OUT})"
+        for position, neighbours in misfits[:MOST_NAMED]:
+            yield f"{self._misfit(chain, position, neighbours)}; correct it, or leave the frame out ({LEAVE_OUT})"
         if len(misfits) > MOST_NAMED:
             more = [position for position, _ in misfits[MOST_NAMED:]]
             yield f"{len(more)} more frames do not fit their neighbours: {self._list(more)}"
 
-    def _misfit(self, chain: Chain, position: int, beside: Pair) -> str:
-        before, after = beside
+    def _misfit(self, chain: Chain, position: int, neighbours: Pair) -> str:
+        before, after = neighbours
         link, without = chain.links[before, position], chain.error(before, after)
         text = (
             f"frame {self.named(position)} does not fit frames {self.named(before)} and {self.named(after)} beside it"

@@ -135,17 +135,17 @@ class Reading:
         if kind == INVERSE:
             return 1 / self.usual_factor(1 / factor)
         now = 1.0 if self.depth_scale is None else self.depth_scale
-        near = min(KNOWN_SCALES, key=lambda known: abs(known * factor / now - 1))
+        near = min(KNOWN_SCALES, key=lambda usual: abs(usual * factor / now - 1))
         return now / (near if abs(near * factor / now - 1) <= SNAP else float(f"{now / factor:.3g}"))
 
     def is_usual(self, scale: float) -> bool:
         """Return whether datasets use this depth scale, or half of them would round to it: 1000, 5000, 6553.5, ..."""
-        return any(abs(known / scale - 1) < USUAL for known in KNOWN_SCALES)
+        return any(abs(usual / scale - 1) < USUAL for usual in KNOWN_SCALES)
 
     def size_after(self, ratio: Ratio) -> list[int]:
         """Return [width, height] of the image of the intrinsics, `ratio` times the configured size."""
-        said = self.said.get("intrinsics_size", self.size)
-        return [round(side * share) for side, share in zip(said, ratio, strict=True)]
+        stated_size = self.said.get("intrinsics_size", self.size)
+        return [round(side * share) for side, share in zip(stated_size, ratio, strict=True)]
 
     def lines(self, convention: Convention) -> tuple[str, ...]:
         """Return the lines of scene.yaml, or the options, with which the files are read by that convention.
@@ -154,14 +154,14 @@ class Reading:
         """
         if self.in_program:
             return tuple(name for name, _ in self._of_program(convention))
-        said = {
+        settings = {
             "pose": ("pose_convention", convention.pose),
             "axes": ("camera_axes", convention.axes),
             "depth": ("depth_kind", convention.depth),
             "factor": self._of_factor(convention),
             "ratio": ("intrinsics_size", f"{self.size_after(convention.ratio)}"),
         }
-        return tuple(self._line(*said[field]) for field in convention.differs_in(self.convention))
+        return tuple(self._line(*settings[field]) for field in convention.differs_in(self.convention))
 
     def _of_program(self, convention: Convention) -> Iterator[tuple[str, str]]:
         """Yield what a program's frames seem to hold instead of what `Frame` asks for, and what to do about it."""
@@ -183,8 +183,8 @@ class Reading:
     def of_poses(self, convention: Convention) -> bool:
         """Return whether a factor on depth is rather one on the poses: depth is metric as it is, and not with it."""
         factor, (least, most) = convention.factor, METRIC
-        known = "metres_per_unit" in self.said and convention.depth == self.convention.depth and not self.in_program
-        if not known or factor == 1 or not least <= self.median <= most:
+        is_metric = "metres_per_unit" in self.said and convention.depth == self.convention.depth and not self.in_program
+        if not is_metric or factor == 1 or not least <= self.median <= most:
             return False
         scale = (self.depth_scale or 1.0) / factor
         unused = any(abs(scale / coarse - 1) < USUAL for coarse in COARSE)
@@ -244,18 +244,18 @@ def reading(
 
     `frame` is one of its own; the shape (H, W, 3) of its colour suggests intrinsics.
     """
-    said = {**options, **scene.settings}
+    settings = {**options, **scene.settings}
     height, width = frame.shape
     depths = frame.depth[(frame.depth > 0) & (frame.depth < np.inf)]
     return Reading(
-        said={name: value for name, value in said.items() if value is not None},
+        said={name: value for name, value in settings.items() if value is not None},
         options=options,
         size=(width, height),
         median=float(np.median(depths)) if len(depths) else math.nan,
         ratios=tuple(_ratios(frame, color_shape)),
         file=None if scene.settings_file is None else str(scene.settings_file),
-        depth_scale=scene.depth_scale or said.get("depth_scale"),
-        names=(*said,),
+        depth_scale=scene.depth_scale or settings.get("depth_scale"),
+        names=(*settings,),
         in_program=scene.in_program,
     )
 
@@ -264,7 +264,7 @@ def _ratios(frame: Frame, color_shape: tuple[int, ...] | None) -> Iterator[Ratio
     """Yield sizes that the intrinsics may be for, relative to the depth image's."""
     height, width = frame.shape
     camera = frame.intrinsics
-    possible = [(one, one) for one in RATIOS]
+    possible = [(share, share) for share in RATIOS]
     if color_shape is not None:
         possible.insert(0, (color_shape[1] / width, color_shape[0] / height))
     possible.append(((2 * camera.cx + 1) / width, (2 * camera.cy + 1) / height))

@@ -51,9 +51,9 @@ BINS = ((1, 1), (2, 2), (3, 8), (9, 27))
 
 def by_distance(pairs: Iterable[Pair]) -> Iterator[tuple[tuple[int, int], list[Pair]]]:
     """Yield the distances between frames that are reported together, with the pairs that lie so far apart, if any."""
-    known = [*pairs]
+    all_pairs = [*pairs]
     for low, high in BINS:
-        if near := [(a, b) for a, b in known if low <= abs(a - b) <= high]:
+        if near := [(a, b) for a, b in all_pairs if low <= abs(a - b) <= high]:
             yield (low, high), near
 
 
@@ -177,17 +177,17 @@ class Coverage:
 
     def __init__(self, sample: Sample) -> None:
         self.sample = sample
-        one = np.array([1.0])
-        self._matches = {pair: sample.matched(pair, sample.configured, one) for pair in sample.pairs}
+        factors = np.array([1.0])
+        self._matches = {pair: sample.matched(pair, sample.configured, factors) for pair in sample.pairs}
         self._seen = {pair: self._same_surface(pair) for pair in sample.pairs}
 
     def overlaps(self) -> list[Overlap]:
         """Return one row a distance between frames."""
-        return [self._overlap(apart, pairs) for apart, pairs in by_distance(self.sample.pairs)]
+        return [self._overlap(distances, pairs) for distances, pairs in by_distance(self.sample.pairs)]
 
     def noise(self) -> Noise:
         """Return how far depth is off, between frames and within one."""
-        offsets = [seen.offset for seen in self._seen.values()]
+        offsets = [surface.offset for surface in self._seen.values()]
         views = self.sample.views.values()
         footprints = [view.depth[view.v, view.u] / view.camera.fx for view in views]
         return Noise(
@@ -226,18 +226,20 @@ class Coverage:
 
     def _same_along(self, voxel_size: float, phase: Float64) -> Mask:
         """Return (n, 3) whether points seen again lie between the same faces of a grid moved by a part of a voxel."""
-        seen = [one for one in self._seen.values() if len(one.first)]
-        if not seen:
+        surfaces = [surface for surface in self._seen.values() if len(surface.first)]
+        if not surfaces:
             return np.zeros((0, 3), dtype=np.bool_)
-        first, second = (np.concatenate([getattr(one, name) for one in seen]) for name in ("first", "second"))
+        first, second = (
+            np.concatenate([getattr(surface, name) for surface in surfaces]) for name in ("first", "second")
+        )
         return np.asarray(np.floor(first / voxel_size + phase) == np.floor(second / voxel_size + phase))
 
-    def _overlap(self, apart: tuple[int, int], pairs: Sequence[Pair]) -> Overlap:
+    def _overlap(self, distances: tuple[int, int], pairs: Sequence[Pair]) -> Overlap:
         matches = [self._matches[pair] for pair in pairs]
         errors = np.concatenate([match.error[0] for match in matches])
         agree = np.concatenate([self._seen[pair].agree for pair in pairs])
         return Overlap(
-            apart=apart,
+            apart=distances,
             pairs=len(pairs),
             in_view=_mean(np.concatenate([match.inside[0] for match in matches])),
             covisible=_mean(np.isfinite(errors)),
@@ -248,12 +250,12 @@ class Coverage:
     def _same_surface(self, pair: Pair) -> Seen:
         a, b = self.sample.views[pair[0]], self.sample.views[pair[1]]
         match = self._matches[pair]
-        same = Shared.of(a, match)
-        first, second = same.labels(a.labels, b.labels, a.ignore_id, b.ignore_id)
+        shared = Shared.of(a, match)
+        first, second = shared.labels(a.labels, b.labels, a.ignore_id, b.ignore_id)
         return Seen(
-            offset=np.abs(match.depth - match.z)[0][same.chosen],
-            first=world_points(a, *same.first),
-            second=world_points(b, *same.second),
+            offset=np.abs(match.depth - match.z)[0][shared.chosen],
+            first=world_points(a, *shared.first),
+            second=world_points(b, *shared.second),
             agree=first == second,
         )
 

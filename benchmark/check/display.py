@@ -50,8 +50,8 @@ def print_check(checked: SceneCheck, console: Console, *, verbose: bool = False)
         say(f"  note: {note}", 4, "yellow")
     tables = _tables(checked)
     wrong_labels = any(labels.problem for labels in checked.labels)
-    wanted = "labels" if wrong_labels else "overlap" if state in ("sound", "imprecise") else "conventions"
-    for name in tables if verbose else [name for name in (wanted,) if name in tables]:
+    explaining = "labels" if wrong_labels else "overlap" if state in ("sound", "imprecise") else "conventions"
+    for name in tables if verbose else [name for name in (explaining,) if name in tables]:
         title, table = tables[name]
         if verbose:
             console.print(f"\n  {title}", highlight=False, markup=False)
@@ -86,9 +86,12 @@ def _tables(checked: SceneCheck) -> dict[str, tuple[str, Table]]:
             title = f"points of {verdict.frames} scans, and the nearest ones of the others, {verdict.pairs} pairs"
         tables["conventions"] = title, _convention_table(checked)
     if checked.persistence:
-        every = f", every {_ordinal(checked.fused_stride)} pixel of each axis" if checked.fused_stride > 1 else ""
+        stride_text = f", every {_ordinal(checked.fused_stride)} pixel of each axis" if checked.fused_stride > 1 else ""
         whose = "all" if checked.fused_frames == checked.selected else f"{checked.fused_frames} evenly spaced"
-        tables["persistence"] = f"observation persistence, {whose} frames fused{every}", _persistence_table(checked)
+        tables["persistence"] = (
+            f"observation persistence, {whose} frames fused{stride_text}",
+            _persistence_table(checked),
+        )
     if checked.labels:
         tables["labels"] = "labels, % of the pixels", _label_table(checked)
     return tables
@@ -107,8 +110,8 @@ def _convention_table(checked: SceneCheck) -> Table:
 
 
 def _overlap_table(checked: SceneCheck) -> Table:
-    of = f" of {checked.labels[0].model}" if len(checked.labels) > 1 else " of gt" if _of_truth(checked) else ""
-    numbers = ("pairs", "in view\n%", "co-visible\n%", "error\n%", f"labels{of}\nagree %")
+    of_model = f" of {checked.labels[0].model}" if len(checked.labels) > 1 else " of gt" if _of_truth(checked) else ""
+    numbers = ("pairs", "in view\n%", "co-visible\n%", "error\n%", f"labels{of_model}\nagree %")
     table = _table(("frames apart",), numbers)
     for row in checked.overlaps:
         shares = (row.in_view, row.covisible)
@@ -148,9 +151,9 @@ def _label_table(checked: SceneCheck) -> Table:
 
 
 def _advice(checked: SceneCheck, *, verbose: bool) -> Iterator[str]:
-    for each in checked.label_findings:
-        if each.open is not None:
-            yield f"labels   {each.model}: {each.open}"
+    for finding in checked.label_findings:
+        if finding.open is not None:
+            yield f"labels   {finding.model}: {finding.open}"
     if verbose and checked.motion is not None:
         (least, most), (from_, to) = checked.motion.shift, checked.motion.turn
         yield (
@@ -164,10 +167,10 @@ def _advice(checked: SceneCheck, *, verbose: bool) -> Iterator[str]:
             f" {checked.selected} frames see a voxel about {times:.2g} times as often"
         )
     if checked.noise is not None and checked.of_scans:
-        between, within, apart = map(_metres, (checked.noise.between, checked.noise.within, checked.noise.footprint))
+        between, within, spacing = map(_metres, (checked.noise.between, checked.noise.within, checked.noise.footprint))
         yield (
             f"noise    points lie {between} from the nearest point of another scan, {within} from the nearest point"
-            f" of their own scan; rays are {apart} apart"
+            f" of their own scan; rays are {spacing} apart"
         )
     elif checked.noise is not None:
         yield (

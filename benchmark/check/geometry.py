@@ -85,34 +85,38 @@ class Assessment:
         return self._as(*(self._without_evidence() or self._unexplained() or self._in_agreement()))
 
     def _without_evidence(self) -> tuple[State, str] | None:
-        mine = self.configured
+        configured = self.configured
         if not any(len(view.u) for view in self.sample.views.values()):
             return "unclear", "no pixel of the sampled frames has valid depth"
-        if not mine.has_evidence:
+        if not configured.has_evidence:
             return "unclear", (
-                f"{mine.share:.1%} of the sampled points ({mine.points}) are seen again by another frame: too few to"
-                " tell whether depth and poses agree"
+                f"{configured.share:.1%} of the sampled points ({configured.points}) are seen again by another frame:"
+                " too few to tell whether depth and poses agree"
             )
         return None
 
     def _unexplained(self) -> tuple[State, str] | None:
-        mine = self.configured
-        if mine.error > HOPELESS_ERROR and mine.share >= HOPELESS_SHARE and mine.points >= HOPELESS_POINTS:
+        configured = self.configured
+        if (
+            configured.error > HOPELESS_ERROR
+            and configured.share >= HOPELESS_SHARE
+            and configured.points >= HOPELESS_POINTS
+        ):
             return "unsound", (
-                f"depth reprojects with {mine.error:.0%} error, and no other convention explains it; do poses, depth"
-                " and intrinsics belong together, frame by frame?"
+                f"depth reprojects with {configured.error:.0%} error, and no other convention explains it; do poses,"
+                " depth and intrinsics belong together, frame by frame?"
             )
-        if mine.error > GOOD:
+        if configured.error > GOOD:
             return "unclear", (
-                f"depth reprojects with {mine.error:.1%} error, and no other convention explains it; are poses and"
-                " depth this imprecise?"
+                f"depth reprojects with {configured.error:.1%} error, and no other convention explains it; are poses"
+                " and depth this imprecise?"
             )
         return None
 
     def _in_agreement(self) -> tuple[State, str]:
-        mine = self.configured
-        text = f"depth reprojects with {mine.error:.2%} median error, {mine.share:.0%} co-visible"
-        if all(self._is_undetermined(fit) for fit in self._single_changes() if _is_of_poses(fit, mine)):
+        configured = self.configured
+        text = f"depth reprojects with {configured.error:.2%} median error, {configured.share:.0%} co-visible"
+        if all(self._is_undetermined(fit) for fit in self._single_changes() if _is_of_poses(fit, configured)):
             return "unclear", f"{text}, but it does so under every other convention of the poses as well"
         return "sound", text
 
@@ -163,23 +167,23 @@ class Assessment:
         """Return the fit with its factor measured, then at a unit that datasets use if near and as good a fit."""
         if fit.convention.factor == 1:
             return fit
-        measured = min([fit, *self._measured_scale(fit)], key=lambda one: one.error)
+        measured = min([fit, *self._measured_scale(fit)], key=lambda candidate: candidate.error)
         factor = self.reading.usual_factor(measured.convention.factor, fit.convention.depth)
-        (known,) = self.sample.fits(fit.convention, np.array([factor]))
-        return measured if measured.clearly_beats(known) else known
+        (rounded,) = self.sample.fits(fit.convention, np.array([factor]))
+        return measured if measured.clearly_beats(rounded) else rounded
 
     def _may_refute(self, fit: Fit) -> bool:
         """Return whether a fit meets those conditions for refuting the configured one that are cheap to check."""
-        mine, factor = self.configured, fit.convention.factor
+        configured, factor = self.configured, fit.convention.factor
         size = max(factor, 1 / factor)
-        if fit is mine or not fit.has_evidence or fit.share < LEAST_OF_OTHER * mine.share:
+        if fit is configured or not fit.has_evidence or fit.share < LEAST_OF_OTHER * configured.share:
             return False
-        if not mine.has_evidence and _one_hypothesis(fit, mine):
+        if not configured.has_evidence and _one_hypothesis(fit, configured):
             return False
         if factor != 1 and not LEAST_SCALE_ERROR <= size <= 1.001 * LARGEST_FACTOR:
             return False
-        limit = GOOD if mine.has_evidence else STRIKING
-        return fit.clearly_beats(mine) and fit.error <= min(limit, self._limit(fit))
+        limit = GOOD if configured.has_evidence else STRIKING
+        return fit.clearly_beats(configured) and fit.error <= min(limit, self._limit(fit))
 
     def _limit(self, fit: Fit) -> float:
         """Return the largest error with which a fit refutes: the less, the more it changes at once."""
@@ -189,20 +193,22 @@ class Assessment:
         if fit.convention.factor != 1 and not self._scale_is_told(fit):
             return False
         won = falls(self.sample.by_pair(fit.convention), self.sample.by_pair())
-        told = self.configured.has_evidence and won.count >= LEAST_PAIRS
-        return won.wins if told else self._stands_out(fit)
+        has_enough = self.configured.has_evidence and won.count >= LEAST_PAIRS
+        return won.wins if has_enough else self._stands_out(fit)
 
     def _scale_is_told(self, fit: Fit) -> bool:
         """Return whether depth ten times as long and as short fits clearly worse: not where the camera hardly moves."""
-        others = self.sample.fits(fit.convention, fit.convention.factor * np.array([0.1, 10]))
-        return all(fit.clearly_beats(other) for other in others)
+        scaled = self.sample.fits(fit.convention, fit.convention.factor * np.array([0.1, 10]))
+        return all(fit.clearly_beats(other) for other in scaled)
 
     def _stands_out(self, fit: Fit) -> bool:
         """Return whether every convention with another motion between the frames fits far worse."""
         near = (other for other in self.fits if other.has_evidence and other.error * CONTRAST < fit.error)
         same_depth = (
-            dataclasses.replace(one, convention=dataclasses.replace(one.convention, depth=fit.convention.depth))
-            for one in near
+            dataclasses.replace(
+                near_fit, convention=dataclasses.replace(near_fit.convention, depth=fit.convention.depth)
+            )
+            for near_fit in near
         )
         return all(_one_hypothesis(fit, other) or self._moves_alike(fit, other) for other in same_depth)
 
@@ -229,11 +235,11 @@ class Assessment:
         return [fit for fit in (*coarse, *fine) if fit.convention != near.convention]
 
     def _refuted(self, best: Fit) -> Verdict:
-        mine, lines = self.configured, self.reading.lines(best.convention)
-        if mine.has_evidence:
-            evidence = f"depth reprojects with {mine.error:.1%} error as configured, but with"
+        configured, lines = self.configured, self.reading.lines(best.convention)
+        if configured.has_evidence:
+            evidence = f"depth reprojects with {configured.error:.1%} error as configured, but with"
         else:
-            evidence = f"{mine.share:.1%} of the points are seen again as configured; depth reprojects with"
+            evidence = f"{configured.share:.1%} of the points are seen again as configured; depth reprojects with"
         text = f"{evidence} {best.error:.2%} error under {', '.join(lines)} ({self.reading.advice(best.convention)})"
         if candidates := [self._name(fit) for fit in self._refuting[1:]][:MOST_CANDIDATES]:
             text += f"; these frames cannot tell it from {' or '.join(candidates)}"
@@ -279,10 +285,10 @@ class Assessment:
 
 
 def _all_fits(sample: Sample, reading: Reading, thorough: bool) -> Iterator[Fit]:
-    one = np.array([1.0])
+    unscaled = np.array([1.0])
     for convention in alternatives(sample.configured, reading.ratios):
         known_camera = convention.ratio == (1.0, 1.0)
-        factors = (FINE if thorough or convention == sample.configured else DECADES) if known_camera else one
+        factors = (FINE if thorough or convention == sample.configured else DECADES) if known_camera else unscaled
         yield from sample.fits(convention, factors)
 
 
@@ -292,9 +298,9 @@ def _one_hypothesis(fit: Fit, other: Fit) -> bool:
     return 1 / SCALE_APART < a.factor / b.factor < SCALE_APART and set(a.differs_in(b)) <= {"factor"}
 
 
-def _is_of_poses(fit: Fit, mine: Fit) -> bool:
+def _is_of_poses(fit: Fit, other: Fit) -> bool:
     """Return whether a fit differs from another one in what the poses mean, or in the unit."""
-    return set(fit.convention.differs_in(mine.convention)) <= {"pose", "axes", "factor"}
+    return set(fit.convention.differs_in(other.convention)) <= {"pose", "axes", "factor"}
 
 
 def shifts_and_turns(sample: Sample) -> tuple[Float64, Float64]:
@@ -329,15 +335,16 @@ def with_mistakes(verdict: Verdict, sample: Sample) -> Verdict:
     if not sample.views or not sample.pairs or not verdict.fits:
         return verdict
     now, best = verdict.fits[0][1], ranked(CAMERAS, sample)[0]
-    others = [other for _, other in verdict.fits if other.has_evidence]
-    if not best.fit.has_evidence or best.fit.error > GOOD or not all(map(best.fit.clearly_beats, others)):
+    evident = [other for _, other in verdict.fits if other.has_evidence]
+    if not best.fit.has_evidence or best.fit.error > GOOD or not all(map(best.fit.clearly_beats, evident)):
         return verdict
     if now.has_evidence and (len(sample.pairs) < LEAST_PAIRS or not best.is_right(sample, now, MISTAKEN)):
         return verdict
-    found, error = best.hypothesis, f"reprojects with {now.error:.1%} error"
+    mistake, error = best.hypothesis, f"reprojects with {now.error:.1%} error"
     agrees = error if now.has_evidence else "hardly reprojects at all"
     text = (
-        f"{found.name}, as it seems: depth {agrees}, but with {best.fit.error:.2%} without this mistake; {found.mend}"
+        f"{mistake.name}, as it seems: depth {agrees}, but with {best.fit.error:.2%} without this mistake;"
+        f" {mistake.mend}"
     )
-    fits = (verdict.fits[0], (f"without {found.name}", best.fit), *verdict.fits[1:])
+    fits = (verdict.fits[0], (f"without {mistake.name}", best.fit), *verdict.fits[1:])
     return dataclasses.replace(verdict.refuted(text), fits=fits)

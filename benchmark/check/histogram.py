@@ -99,5 +99,9 @@ class Tally:
 
 def _counted_from_one(space: LabelSpace, ids: Counter[int]) -> str:
     """Return what explains ids outside of a taxonomy, where they may count from 1 instead of 0."""
-    told = min(space.ids) == 0 and space.ids[0] not in ids and max(ids) == max(space.ids) + 1
-    return "; the ids may count from 1: write them from 0, or name what 0 means as the first class" if told else ""
+    counts_from_one = min(space.ids) == 0 and space.ids[0] not in ids and max(ids) == max(space.ids) + 1
+    return (
+        "; the ids may count from 1: write them from 0, or name what 0 means as the first class"
+        if counts_from_one
+        else ""
+    )

@@ -78,7 +78,9 @@ FIRST_NUMBER_LAST, LAST_NUMBER_FIRST = quaternions((1, 2, 3, 0)), quaternions((3
 
 def views(change: Callable[[View, Convention], View]) -> Callable[[Sample], Sample]:
     """Return the change of a sample whose views change."""
-    return lambda sample: sample.of({at: change(view, sample.configured) for at, view in sample.views.items()})
+    return lambda sample: sample.of(
+        {position: change(view, sample.configured) for position, view in sample.views.items()}
+    )
 
 
 def _mirrored(*axes: int) -> Callable[[Sample], Sample]:
@@ -172,7 +174,7 @@ def scan_poses(change: PoseChange) -> Callable[[ScanSample], ScanSample]:
 def _nearer_to_their_sensors(sample: ScanSample) -> bool:
     """Return whether points lie around the positions of their sensors, and not around the origin."""
     middle, sensor = sample.places
-    from_sensor, from_origin = (np.linalg.norm(middle - at, axis=1) for at in (sensor, np.zeros(3)))
+    from_sensor, from_origin = (np.linalg.norm(middle - origin, axis=1) for origin in (sensor, np.zeros(3)))
     return bool(np.median(from_sensor) < np.median(from_origin))
 
 

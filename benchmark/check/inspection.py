@@ -45,8 +45,8 @@ class Depth:
     @classmethod
     def of(cls, valid: Sequence[float], depths: Sequence[Float32]) -> Depth:
         """Return it from the share and the valid depths of each frame."""
-        every = np.concatenate(depths)
-        p5, p50, p95 = np.percentile(every, (5, 50, 95)).tolist() if len(every) else (np.nan,) * 3
+        all_depths = np.concatenate(depths)
+        p5, p50, p95 = np.percentile(all_depths, (5, 50, 95)).tolist() if len(all_depths) else (np.nan,) * 3
         return cls(float(np.mean(valid)), p5, p50, p95)
 
 
@@ -102,10 +102,10 @@ class Inspection:
     def _take_note(self, frame: Frame) -> None:
         """Remember the farthest pixel of all frames."""
         depth = np.where(frame.depth < np.inf, frame.depth, np.float32(0))  # NaN is not less
-        at = int(depth.argmax())
-        if self.farthest is None or float(depth.flat[at]) > self.farthest[0]:
-            v, u = divmod(at, depth.shape[1])
-            self.farthest = float(depth.flat[at]), dataclasses.replace(frame.every(64), files=frame.files), (u, v)
+        pixel = int(depth.argmax())
+        if self.farthest is None or float(depth.flat[pixel]) > self.farthest[0]:
+            v, u = divmod(pixel, depth.shape[1])
+            self.farthest = float(depth.flat[pixel]), dataclasses.replace(frame.every(64), files=frame.files), (u, v)
 
     def too_far(self, voxel_size: float) -> str | None:
         """Return the farthest pixel where a map of voxels of that size does not reach it."""
@@ -154,8 +154,8 @@ class Inspection:
         if verdict.mend:
             return verdict
         source = labels_of or self.source
-        known = self.views if source == self.source else None
-        neighbours = Neighbours(self.scene, self.indices, source, how.convention, known)
+        views = self.views if source == self.source else None
+        neighbours = Neighbours(self.scene, self.indices, source, how.convention, views)
         chain = neighbours.chain({*neighbours.spread(how.size, thorough=thorough), *neighbours.striking()})
         self.chained = neighbours, chain
         return with_continuity(verdict, neighbours, chain, explained=explained)

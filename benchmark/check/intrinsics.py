@@ -120,7 +120,9 @@ def find_camera(sample: Sample) -> CameraFit | None:
 
     Focal length and principal point are fitted in turn.
     """
-    errors = functools.cache(lambda camera: sample.of({at: camera.of(v) for at, v in sample.views.items()}).by_pair())
+    errors = functools.cache(
+        lambda camera: sample.of({position: camera.of(v) for position, v in sample.views.items()}).by_pair()
+    )
     if len(sample.pairs) < LEAST_PAIRS or not middle(present := errors(Camera())) > MIN_GAIN:
         return None
     best = _simplest(fitted(Camera(), _moves(), errors), errors)
@@ -135,11 +137,11 @@ def find_camera(sample: Sample) -> CameraFit | None:
 
 def _moves() -> Iterator[Callable[[Camera], list[Camera]]]:
     """Yield which focal lengths, then shifts of the principal point, are tried next to the best camera so far."""
-    whole = (("factor", FACTORS), ("right", SHIFTS), ("down", SHIFTS))
-    for name, values in whole:
+    fields = (("factor", FACTORS), ("right", SHIFTS), ("down", SHIFTS))
+    for name, values in fields:
         yield functools.partial(_others, name, values, 0.0)
     for spread in SPREADS:
-        for name, _ in whole:
+        for name, _ in fields:
             yield functools.partial(_others, name, FINE, spread)
 
 
@@ -147,7 +149,7 @@ def _others(name: str, values: Sequence[float], spread: float, best: Camera) -> 
     """Return cameras with these values of a field; with a spread, `values` are steps from the best camera's value."""
     now = getattr(best, name)
     reach = spread * (FACTOR_NEAR * now if name == "factor" else SHIFT_NEAR)
-    return [dataclasses.replace(best, **{name: now + reach * each if spread else each}) for each in values]
+    return [dataclasses.replace(best, **{name: now + reach * value if spread else value}) for value in values]
 
 
 def _simplest(best: Camera, errors: Callable[[Camera], Float64]) -> Camera:
@@ -163,5 +165,7 @@ def _simplest(best: Camera, errors: Callable[[Camera], Float64]) -> Camera:
 
 def _scaled(sample: Sample, factor: float) -> Float64:
     """Return (pairs,) median relative error of depth times `factor`."""
-    longer = {at: dataclasses.replace(v, depth=v.depth * np.float32(factor)) for at, v in sample.views.items()}
+    longer = {
+        position: dataclasses.replace(v, depth=v.depth * np.float32(factor)) for position, v in sample.views.items()
+    }
     return sample.of(longer).by_pair()

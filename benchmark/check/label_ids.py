@@ -84,9 +84,9 @@ class Renamings:
         self.count = len(chain.positions)
         self.first: Int64 = np.array([a for (a, _), _ in linked], dtype=np.int64)
         self.second: Int64 = np.array([b for (_, b), _ in linked], dtype=np.int64)
-        both = np.concatenate([labels for _, labels in linked], axis=1) if linked else np.empty((2, 0), np.int64)
-        self.ids, codes = np.unique(both, return_inverse=True)
-        codes = codes.reshape(both.shape)
+        label_pairs = np.concatenate([labels for _, labels in linked], axis=1) if linked else np.empty((2, 0), np.int64)
+        self.ids, codes = np.unique(label_pairs, return_inverse=True)
+        codes = codes.reshape(label_pairs.shape)
         self._key = codes[0] * len(self.ids) + codes[1]
         self._of = np.repeat(np.arange(len(linked)), [labels.shape[1] for _, labels in linked])
 
@@ -101,23 +101,23 @@ class Renamings:
         near = (first >= at - reach) & (second < at + reach)
         across = self.counts(near & (first < at) & (second >= at))
         before, after = self.counts(near & (second < at)), self.counts(near & (first >= at))
-        seen, later = across.sum(axis=1), across.argmax(axis=1)
-        told = seen >= LEAST_POINTS
-        told &= across.max(axis=1, initial=0) >= MOSTLY * seen
-        stays = told & (later == np.arange(len(later)))
-        moved = told & ~stays & _same(before) & _same(after)[later] & ~stays[later]
+        totals, later = across.sum(axis=1), across.argmax(axis=1)
+        is_decided = totals >= LEAST_POINTS
+        is_decided &= across.max(axis=1, initial=0) >= MOSTLY * totals
+        stays = is_decided & (later == np.arange(len(later)))
+        moved = is_decided & ~stays & _same(before) & _same(after)[later] & ~stays[later]
         targets = later[moved]
         if len(targets) < LEAST_RENAMED or len(set(targets.tolist())) < len(targets):
-            return Renaming(at, (), 0.0, int(told.sum()) >= LEAST_RENAMED)
+            return Renaming(at, (), 0.0, int(is_decided.sum()) >= LEAST_RENAMED)
         pairs = tuple((int(self.ids[i]), int(self.ids[later[i]])) for i in np.flatnonzero(moved))
-        share = float(across[moved, targets].sum() / seen[moved].sum())
+        share = float(across[moved, targets].sum() / totals[moved].sum())
         return Renaming(at, pairs, share, tells=True)
 
 
 def _same(counts: Int64) -> Mask:
     """Return (K,) whether an id mostly stays, or is not seen, among frames on one side."""
-    seen = counts.sum(axis=1)
-    return np.asarray((seen < LEAST_POINTS) | (np.diag(counts) >= MOSTLY * seen))
+    totals = counts.sum(axis=1)
+    return np.asarray((totals < LEAST_POINTS) | (np.diag(counts) >= MOSTLY * totals))
 
 
 def wrong_ids(neighbours: Neighbours, chain: Chain) -> str | None:
@@ -125,42 +125,42 @@ def wrong_ids(neighbours: Neighbours, chain: Chain) -> str | None:
     ids = Renamings(chain)
     if not len(ids.ids):
         return None
-    changes = [change for change in (ids.renaming(at, 1) for at in range(1, ids.count)) if change.tells]
+    changes = [change for change in (ids.renaming(place, 1) for place in range(1, ids.count)) if change.tells]
     rolling = [change for change in changes if change.ids]
     if len(rolling) >= max(LEAST_POINTS // 3, ROLLING * len(changes)):
-        named = neighbours.named(chain.positions[rolling[0].at])
+        frame_name = neighbours.named(chain.positions[rolling[0].at])
         return (
-            f"have other ids from frame to frame, first from frame {named} on ({_listed(rolling[0])}), and so at"
+            f"have other ids from frame to frame, first from frame {frame_name} on ({_listed(rolling[0])}), and so at"
             f" {len(rolling)} of {len(changes)} frames: write class ids of one taxonomy in all frames"
         )
-    found = [each for each in (ids.renaming(at, REACH) for at in range(2, ids.count - 1)) if each.ids]
-    apart = list[Renaming]()
-    for each in sorted(found, key=lambda one: -one.share * len(one.ids)):
-        if all(abs(each.at - other.at) > REACH for other in apart):
-            apart.append(each)
-    if not apart:
+    renamings = [change for change in (ids.renaming(place, REACH) for place in range(2, ids.count - 1)) if change.ids]
+    separate = list[Renaming]()
+    for change in sorted(renamings, key=lambda renaming: -renaming.share * len(renaming.ids)):
+        if all(abs(change.at - other.at) > REACH for other in separate):
+            separate.append(change)
+    if not separate:
         return None
-    first = min(apart, key=lambda each: each.at)
-    again = "" if len(apart) == 1 else f", and again {len(apart) - 1} more times"
+    first = min(separate, key=lambda change: change.at)
+    repeats = "" if len(separate) == 1 else f", and again {len(separate) - 1} more times"
     return (
-        f"have other ids from frame {neighbours.named(chain.positions[first.at])} on{again}: {_listed(first)}"
+        f"have other ids from frame {neighbours.named(chain.positions[first.at])} on{repeats}: {_listed(first)}"
         f" ({first.share:.0%} of the points of these classes): write the ids of one taxonomy in all frames"
     )
 
 
 def _listed(renaming: Renaming) -> str:
-    said = ", ".join(f"{a} becomes {b}" for a, b in renaming.ids[:MOST_NAMED])
-    return f"{said}, ..." if len(renaming.ids) > MOST_NAMED else said
+    listed = ", ".join(f"{a} becomes {b}" for a, b in renaming.ids[:MOST_NAMED])
+    return f"{listed}, ..." if len(renaming.ids) > MOST_NAMED else listed
 
 
 def remarks_on_maps(neighbours: Neighbours, chain: Chain) -> Iterator[str]:
     """Yield lines on maps that are empty, or of one class where those around have several; 'labels of X ...'."""
-    maps, named = chain.maps, neighbours.named
+    maps, frame_name = chain.maps, neighbours.named
     empty = [position for position, content in maps.items() if not content.labelled]
     if empty and len(empty) < len(maps):
         yield (
-            f"have no label at all in {len(empty)} of {len(maps)} frames: {_frames(empty, named)}; predict them again,"
-            " or leave them out (setting frames.list)"
+            f"have no label at all in {len(empty)} of {len(maps)} frames: {_frames(empty, frame_name)}; predict them"
+            " again, or leave them out (setting frames.list)"
         )
     agreements = [link.agreement for link in chain.links.values() if np.isfinite(link.agreement)]
     usual = float(np.median(agreements)) if agreements else math.nan
@@ -172,37 +172,37 @@ def remarks_on_maps(neighbours: Neighbours, chain: Chain) -> Iterator[str]:
     for name, group in itertools.groupby(sorted(lonely, key=lambda k: maps[k].name), lambda k: maps[k].name):
         positions = sorted(group)
         yield (
-            f"have one class, id {name}, in {len(positions)} of {len(maps)} frames ({_frames(positions, named)}), while"
-            f" the maps around have {MANY} or more: are the files right? Predict them again"
+            f"have one class, id {name}, in {len(positions)} of {len(maps)} frames ({_frames(positions, frame_name)}),"
+            f" while the maps around have {MANY} or more: are the files right? Predict them again"
         )
 
 
 def _agreement_with_others(chain: Chain, position: int) -> float:
     """Return the median agreement with maps of several classes, or NaN without a comparison."""
-    known = [
+    agreements = [
         link.agreement
         for pair, link in chain.links.items()
-        if position in pair and not any(chain.maps[one].single for one in pair if one != position)
+        if position in pair and not any(chain.maps[neighbour].single for neighbour in pair if neighbour != position)
     ]
-    told = [agreement for agreement in known if np.isfinite(agreement)]
-    return float(np.median(told)) if told else math.nan
+    finite = [agreement for agreement in agreements if np.isfinite(agreement)]
+    return float(np.median(finite)) if finite else math.nan
 
 
 def _of_one_class(maps: dict[int, MapContent]) -> Iterator[int]:
     """Yield the positions of maps of one class, where the nearest others before and after have several."""
     positions = sorted(maps)
     single = {k for k in positions if maps[k].single}
-    others = np.array([k for k in positions if k not in single])
+    several = np.array([k for k in positions if k not in single])
     for k in sorted(single):
-        at = int(np.searchsorted(others, k))
-        beside = others[max(0, at - 1) : at + 1].tolist()
-        if beside and all(maps[one].classes >= MANY for one in beside):
+        position = int(np.searchsorted(several, k))
+        neighbours = several[max(0, position - 1) : position + 1].tolist()
+        if neighbours and all(maps[neighbour].classes >= MANY for neighbour in neighbours):
             yield k
 
 
-def _frames(positions: Sequence[int], named: Callable[[int], str]) -> str:
-    shown = ", ".join(named(k) for k in positions[: 2 * MOST_NAMED])
-    return f"{shown}, ..." if len(positions) > 2 * MOST_NAMED else shown
+def _frames(positions: Sequence[int], frame_name: Callable[[int], str]) -> str:
+    listed = ", ".join(frame_name(k) for k in positions[: 2 * MOST_NAMED])
+    return f"{listed}, ..." if len(positions) > 2 * MOST_NAMED else listed
 
 
 def id_remarks(maps: Sequence[Ids], ignore: int, space: LabelSpace | None, whole: Sequence[Ids]) -> Iterator[str]:
@@ -241,8 +241,8 @@ def _from_one(used: Sequence[int], space: LabelSpace) -> bool:
 def _is_interpolated(maps: Sequence[Ids], ignore: int) -> bool:
     """Return whether between two classes more than one id apart there mostly is an id between them."""
     low, middle, high = np.concatenate([_borders(labels, ignore) for labels in maps], axis=1)
-    pairs, at, counts = np.unique(np.stack([low, high]), axis=1, return_inverse=True, return_counts=True)
-    hits = np.bincount(at.reshape(-1), weights=(low < middle) & (middle < high), minlength=pairs.shape[1])
+    pairs, inverse, counts = np.unique(np.stack([low, high]), axis=1, return_inverse=True, return_counts=True)
+    hits = np.bincount(inverse.reshape(-1), weights=(low < middle) & (middle < high), minlength=pairs.shape[1])
     shares = (hits / counts)[counts >= BAND_BORDERS]
     return len(shares) >= BAND_PAIRS and float(np.median(shares)) >= BAND_SHARE
 
@@ -251,6 +251,6 @@ def _borders(labels: Ids, ignore: int) -> Int64:
     """Return (3, n) lower id, id between and higher id, where those of pixels two apart differ by 2 or more."""
     H, W = labels.shape
     along = ((labels[:, k : W - 2 + k].ravel(), labels[k : H - 2 + k].ravel()) for k in range(3))
-    first, between, last = (np.concatenate(both).astype(np.int64) for both in along)
-    apart = (np.abs(first - last) >= 2) & (first != ignore) & (last != ignore) & (between != ignore)
-    return np.stack([np.minimum(first, last), between, np.maximum(first, last)])[:, apart]
+    first, between, last = (np.concatenate(directions).astype(np.int64) for directions in along)
+    differ = (np.abs(first - last) >= 2) & (first != ignore) & (last != ignore) & (between != ignore)
+    return np.stack([np.minimum(first, last), between, np.maximum(first, last)])[:, differ]

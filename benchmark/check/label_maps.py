@@ -85,7 +85,7 @@ def read(scene: Scene, index: int, model: str) -> Seen:
             edges.append(image_edges(grey[::stride, ::stride]))
     except DataError:  # no image of the depth's view
         pass
-    return Seen(view, tuple(_smooth(each) for each in edges if each.any()), frame.predicted)
+    return Seen(view, tuple(_smooth(edge_map) for edge_map in edges if edge_map.any()), frame.predicted)
 
 
 def _smooth(edges: Mask) -> Float64:
@@ -119,8 +119,8 @@ def runs_of(scene: Scene, indices: Sequence[int], model: str, count: int) -> lis
     """Return `count` runs of frames in a row, evenly spaced; of selected frames where the ones between lack labels."""
     count = max(1, min(count, len(indices) // IN_A_RUN))
     starts = [indices[position] for position in evenly(max(1, len(indices) - IN_A_RUN + 1), count)]
-    wanted, runs = [[*range(start, start + IN_A_RUN)] for start in starts], []
-    for run in wanted:
+    candidates, runs = [[*range(start, start + IN_A_RUN)] for start in starts], []
+    for run in candidates:
         if all(i < len(scene) and scene.tracked(i) and not scene.missing(i, [model]) for i in run):
             runs.append(run)
     if runs:
@@ -133,15 +133,17 @@ Common = dict[Pair, Shared]
 
 def shared_of(views: Mapping[int, View], pairs: Sequence[Pair]) -> Common:
     """Return what pairs of frames see in common, where that is enough."""
-    sample, one = Sample(dict(views), pairs, Convention()), np.array([1.0])
-    found = {(a, b): Shared.of(views[a], sample.matched((a, b), Convention(), one)) for a, b in pairs}
-    return {pair: shared for pair, shared in found.items() if shared.chosen.sum() >= LEAST_POINTS}
+    sample, factors = Sample(dict(views), pairs, Convention()), np.array([1.0])
+    shared_by_pair = {(a, b): Shared.of(views[a], sample.matched((a, b), Convention(), factors)) for a, b in pairs}
+    return {pair: shared for pair, shared in shared_by_pair.items() if shared.chosen.sum() >= LEAST_POINTS}
 
 
 def agreements(common: Common, maps: Mapping[int, Ids], ignore: int) -> list[float]:
     """Return for each pair of frames the share of common points whose labels agree, or NaN with too few."""
-    both = [shared.labels(maps[a], maps[b], ignore) for (a, b), shared in common.items()]
-    return [float(np.mean(first == second)) if len(first) >= LEAST_POINTS else math.nan for first, second in both]
+    label_pairs = [shared.labels(maps[a], maps[b], ignore) for (a, b), shared in common.items()]
+    return [
+        float(np.mean(first == second)) if len(first) >= LEAST_POINTS else math.nan for first, second in label_pairs
+    ]
 
 
 class Run:
@@ -163,22 +165,22 @@ class Run:
     @functools.cached_property
     def common(self) -> Common:
         """Points that each pair of frames has in common."""
-        views = {k: seen.view for k, seen in enumerate(self.frames)}
+        views = {k: frame.view for k, frame in enumerate(self.frames)}
         return shared_of(views, [*itertools.combinations(views, 2)])
 
     @functools.cached_property
     def tried(self) -> list[tuple[Hypothesis[Run], Run]]:
         """All hypotheses, with the run as each supposes."""
-        return [(each, each.change(self)) for each in MAPS if each.applies(self)]
+        return [(hypothesis, hypothesis.change(self)) for hypothesis in MAPS if hypothesis.applies(self)]
 
     def otherwise(self, step: int, change: Change | None = None) -> Run:
         """Return the run in which each frame has the map of the frame `step` further on, changed."""
         maps = dict[int, tuple[Ids, Float64 | None]]()
-        for k, seen in enumerate(self.frames):
+        for k, frame in enumerate(self.frames):
             if 0 <= k + step < len(self.frames):
-                source, ignore = self.frames[k + step], seen.view.ignore_id
+                source, ignore = self.frames[k + step], frame.view.ignore_id
                 other = source.labels if change is None else change(source.labels, ignore)
-                if other.shape == seen.labels.shape:
+                if other.shape == frame.labels.shape:
                     maps[k] = other, source.edges if change is None else _edges(other, ignore)
         return Run(self.frames, maps)
 
@@ -189,13 +191,15 @@ class Run:
     def by_pair(self, other: Run) -> list[tuple[float, float]]:
         """Return for each pair of frames the share of common points whose labels agree, here and in the other run."""
         common = {pair: shared for pair, shared in self.common.items() if {*pair} <= other.maps.keys()}
-        each = [{k: labels for k, (labels, _) in run.maps.items()} for run in (self, other)]
-        given, others = (agreements(common, maps, self.frames[0].view.ignore_id) for maps in each)
-        return [*zip(given, others, strict=True)]
+        label_maps = [{k: labels for k, (labels, _) in run.maps.items()} for run in (self, other)]
+        agreements_here, agreements_other = (
+            agreements(common, maps, self.frames[0].view.ignore_id) for maps in label_maps
+        )
+        return [*zip(agreements_here, agreements_other, strict=True)]
 
     def moves(self) -> bool:
         """Return whether the camera moves from its first to its last frame."""
-        views = {k: seen.view for k, seen in enumerate(self.frames)}
+        views = {k: frame.view for k, frame in enumerate(self.frames)}
         shifts, turns = shifts_and_turns(Sample(views, [(0, len(views) - 1)], Convention()))
         return bool(shifts.max() > MOVES or turns.max() > TURNS)
 

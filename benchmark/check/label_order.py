@@ -48,13 +48,17 @@ class Turn:
     @classmethod
     def of(cls, rows: Sequence[tuple[int, float, float]]) -> Turn:
         """Find the place at which the sum of the better fits is largest, of index, given and other fit of frames."""
-        _, given, other = np.reshape(rows, (-1, 3)).T
-        gain = np.nan_to_num(np.subtract(other, given))
+        _, fit_given, fit_other = np.reshape(rows, (-1, 3)).T
+        gain = np.nan_to_num(np.subtract(fit_other, fit_given))
         sums = [gain[k:].sum() - gain[:k].sum() for k in range(len(gain), -1, -1)]
-        at = len(gain) - int(np.argmax(sums))  # the last one of several
-        fits = np.concatenate([given[:at], other[at:]])
-        fit = float(np.nanmean(fits)) if np.isfinite(fits).any() else np.nan
-        return cls(at, Contrast.of(other[:at], given[:at]), Contrast.of(given[at:], other[at:]), fit)
+        position = len(gain) - int(np.argmax(sums))  # the last one of several
+        fits = np.concatenate([fit_given[:position], fit_other[position:]])
+        return cls(
+            position,
+            Contrast.of(fit_other[:position], fit_given[:position]),
+            Contrast.of(fit_given[position:], fit_other[position:]),
+            float(np.nanmean(fits)) if np.isfinite(fits).any() else np.nan,
+        )
 
     @property
     def is_one(self) -> bool:
@@ -95,7 +99,10 @@ def _located(scene: Scene, model: str, hypothesis: Hypothesis[Run], last: int, f
 
     while first - last > 2 * IN_A_RUN:
         middle = (last + first) // 2
-        gains = [other - given for _, given, other in rows(range(middle - IN_A_RUN // 2, middle + IN_A_RUN // 2 + 1))]
+        gains = [
+            fit_other - fit_given
+            for _, fit_given, fit_other in rows(range(middle - IN_A_RUN // 2, middle + IN_A_RUN // 2 + 1))
+        ]
         if not np.isfinite(gains).any():
             return first
         first, last = (middle, last) if float(np.nansum(gains)) > 0 else (first, middle)
@@ -120,14 +127,14 @@ def in_another_order(scene: Scene, indices: Sequence[int], model: str, pixels: i
     count = min(MOST_ORDERED, max(IN_A_RUN, pixels // first.whole.size))
     chosen = [indices[k] for k in evenly(len(indices), count)]
     frames = [*readable(scene, chosen, model)]
-    frames = [seen for seen in frames if seen.references and seen.labels.shape == frames[0].labels.shape]
+    frames = [frame for frame in frames if frame.references and frame.labels.shape == frames[0].labels.shape]
     if len(frames) < 2 * IN_A_RUN:
         return None
     n = len(frames)
-    own = np.stack([_coarse(seen.references) for seen in frames])
+    references = np.stack([_coarse(frame.references) for frame in frames])
     none = np.zeros_like(frames[0].references[0])
-    edges = np.stack([_coarse((none if seen.edges is None else seen.edges,)) for seen in frames])
-    fits = own @ edges.T
+    edges = np.stack([_coarse((none if frame.edges is None else frame.edges,)) for frame in frames])
+    fits = references @ edges.T
     order = np.asarray(linear_sum_assignment(-fits)[1])
     moved = order != np.arange(n)
     if moved.mean() < 0.5 or fits[np.arange(n), order].mean() < max(
@@ -135,9 +142,9 @@ def in_another_order(scene: Scene, indices: Sequence[int], model: str, pixels: i
     ):
         return None
     near = [(a, b) for a in range(n) for b in range(a + 1, min(n, a + 4))]
-    common = shared_of({k: seen.view for k, seen in enumerate(frames)}, near)
-    maps = ({k: frames[at].labels for k, at in enumerate(own)} for own in (range(n), order))
-    agreement = Contrast.of(*(agreements(common, each, frames[0].view.ignore_id) for each in maps))
+    common = shared_of({k: frame.view for k, frame in enumerate(frames)}, near)
+    maps = ({k: frames[source].labels for k, source in enumerate(sequence)} for sequence in (range(n), order))
+    agreement = Contrast.of(*(agreements(common, labels, frames[0].view.ignore_id) for labels in maps))
     if not (agreement.is_clear and 1 - agreement.other <= FEWER * (1 - agreement.given)):
         return None
     text = (
@@ -153,13 +160,13 @@ def _order(order: Int64, frames: Sequence[Seen], scene: Scene) -> str:
     steps, counts = np.unique(order - k, return_counts=True)
     if np.mean(np.abs(order + k - (n - 1)) <= 1) >= SAME_ORDER:
         return "are in reversed order: the first frame has the map of the last one"
-    whole = frames[-1].view.index - frames[0].view.index == n - 1
-    if whole and counts.max() >= SAME_ORDER * (n - abs(int(steps[counts.argmax()]))):
+    is_contiguous = frames[-1].view.index - frames[0].view.index == n - 1
+    if is_contiguous and counts.max() >= SAME_ORDER * (n - abs(int(steps[counts.argmax()]))):
         step = int(steps[counts.argmax()])
         return f"are {frames_of(abs(step))} {side_of(step)}"
-    at = int(np.flatnonzero(order != k)[0])
-    of, to = (scene.frame_name(frames[one].view.index) for one in (int(order[at]), at))
-    return f"are in another order than the frames (the map of frame {of} is that of frame {to}, and so on)"
+    position = int(np.flatnonzero(order != k)[0])
+    source, target = (scene.frame_name(frames[k_frame].view.index) for k_frame in (int(order[position]), position))
+    return f"are in another order than the frames (the map of frame {source} is that of frame {target}, and so on)"
 
 
 def _coarse(edges: Sequence[Float64]) -> Float64:
@@ -168,7 +175,7 @@ def _coarse(edges: Sequence[Float64]) -> Float64:
 
     H, W = edges[0].shape
     size = (min(W, ORDER_COLUMNS), max(1, round(H * min(W, ORDER_COLUMNS) / W)))
-    mean = np.mean([cv2.resize(each, size, interpolation=cv2.INTER_AREA) for each in edges], axis=0).ravel()
+    mean = np.mean([cv2.resize(edge_map, size, interpolation=cv2.INTER_AREA) for edge_map in edges], axis=0).ravel()
     mean = mean - mean.mean()
     coarse: Float64 = mean / max(float(np.linalg.norm(mean)), 1e-12)
     return coarse

@@ -106,24 +106,26 @@ class Comparison:
 
 def compare(runs: Sequence[Run]) -> list[Comparison]:
     """Compare every hypothesis with the maps as they are."""
-    each = zip(*(run.tried for run in runs), strict=True)
-    return [_compared(tried[0][0], runs, [other for _, other in tried]) for tried in each]
+    trials = zip(*(run.tried for run in runs), strict=True)
+    return [_compared(tried[0][0], runs, [other for _, other in tried]) for tried in trials]
 
 
 def counted(found: Comparison, runs: Sequence[Run]) -> Comparison:
     """Return the comparison with maps as many frames late, or early, as fit best, where one of these was found."""
     if (step := STEPS.get(found.hypothesis.name)) is None:
         return found
-    others = [shifted(count if step > 0 else -count) for count in range(1, IN_A_RUN)]
-    compared = [_compared(each, runs, [each.change(run) for run in runs]) for each in others]
-    return max(compared, key=lambda one: -math.inf if math.isnan(one.edges.other) else one.edges.other)
+    hypotheses = [shifted(count if step > 0 else -count) for count in range(1, IN_A_RUN)]
+    compared = [_compared(hypothesis, runs, [hypothesis.change(run) for run in runs]) for hypothesis in hypotheses]
+    return max(
+        compared, key=lambda comparison: -math.inf if math.isnan(comparison.edges.other) else comparison.edges.other
+    )
 
 
-def _compared(hypothesis: Hypothesis[Run], runs: Sequence[Run], others: Sequence[Run]) -> Comparison:
-    both = [*zip(runs, others, strict=True)]
-    fits = [row[1:] for run, other in both for row in run.by_frame(other)]
+def _compared(hypothesis: Hypothesis[Run], runs: Sequence[Run], changed_runs: Sequence[Run]) -> Comparison:
+    pairs = [*zip(runs, changed_runs, strict=True)]
+    fits = [row[1:] for run, other in pairs for row in run.by_frame(other)]
     return Comparison(
-        hypothesis, _contrast(fits), _contrast([pair for run, other in both for pair in run.by_pair(other)])
+        hypothesis, _contrast(fits), _contrast([pair for run, other in pairs for pair in run.by_pair(other)])
     )
 
 
@@ -149,17 +151,17 @@ def check_labels(
     where they fit better another way. Then frames are read to find maps in another order. Frames
     that cannot be read are passed over.
     """
-    known = dict[int, Run]()
-    few = _findings(scene, indices, model, space, min(runs, FIRST_RUNS), known)
+    runs_read = dict[int, Run]()
+    few = _findings(scene, indices, model, space, min(runs, FIRST_RUNS), runs_read)
     if few.clear or not (thorough or few.doubted):
         return few.found
-    whole = _findings(scene, indices, model, space, runs, known)
-    if whole.clear or whole.found.wrong:
-        return whole.found
+    all_findings = _findings(scene, indices, model, space, runs, runs_read)
+    if all_findings.clear or all_findings.found.wrong:
+        return all_findings.found
     pixels = ORDER_PIXELS if thorough else QUICK_PIXELS
     if (other := in_another_order(scene, indices, model, pixels)) is None:
-        return whole.found
-    return dataclasses.replace(whole.found, wrong=(f"labels of {model} {other}",), open=None)
+        return all_findings.found
+    return dataclasses.replace(all_findings.found, wrong=(f"labels of {model} {other}",), open=None)
 
 
 @dataclass(frozen=True)
@@ -177,56 +179,59 @@ class _Findings:
 
 
 def _findings(
-    scene: Scene, indices: Sequence[int], model: str, space: LabelSpace | None, count: int, known: dict[int, Run]
+    scene: Scene, indices: Sequence[int], model: str, space: LabelSpace | None, count: int, runs_read: dict[int, Run]
 ) -> _Findings:
-    """Return what some runs show; those that are read are kept in `known`, by their first frames."""
-    wanted = runs_of(scene, indices, model, count)
-    for run in wanted:
-        if run[0] not in known:
-            known[run[0]] = Run([*readable(scene, run, model)])
-    runs = [known[run[0]] for run in wanted if len(known[run[0]].frames) > 1]
-    frames = [seen for run in runs for seen in run.frames]
-    if len(frames) < 2 or any(seen.labels.shape != frames[0].labels.shape for seen in frames):
+    """Return what some runs show; those that are read are kept in `runs_read`, by their first frames."""
+    frame_runs = runs_of(scene, indices, model, count)
+    for run in frame_runs:
+        if run[0] not in runs_read:
+            runs_read[run[0]] = Run([*readable(scene, run, model)])
+    runs = [runs_read[run[0]] for run in frame_runs if len(runs_read[run[0]].frames) > 1]
+    frames = [frame for run in runs for frame in run.frames]
+    if len(frames) < 2 or any(frame.labels.shape != frames[0].labels.shape for frame in frames):
         return _Findings(LabelFindings(model))
     texts = id_remarks(
-        [seen.labels for seen in frames], frames[0].view.ignore_id, space, [run.frames[0].whole for run in runs]
+        [frame.labels for frame in frames], frames[0].view.ignore_id, space, [run.frames[0].whole for run in runs]
     )
     remarks = tuple(f"labels of {model} {text}" for text in texts)
-    if (same := _identical(runs)) is not None:
-        return _Findings(LabelFindings(model, (f"labels of {model} {same}",), remarks), clear=True)
+    if (identical := _identical(runs)) is not None:
+        return _Findings(LabelFindings(model, (f"labels of {model} {identical}",), remarks), clear=True)
     comparisons = compare(runs)
     everywhere = max((each.edges.other for each in comparisons if each.is_better), default=math.nan)
     if (turned := from_a_frame_on(scene, model, runs, everywhere)) is not None:
         return _Findings(LabelFindings(model, (f"labels of {model} {turned}",), remarks), doubted=True)
-    better = sorted((each for each in comparisons if each.is_better), key=lambda each: -each.edges.other)
-    wrong = tuple(f"labels of {model} {counted(each, runs)}" for each in better[:1])
+    better = sorted(
+        (comparison for comparison in comparisons if comparison.is_better),
+        key=lambda comparison: -comparison.edges.other,
+    )
+    wrong = tuple(f"labels of {model} {counted(comparison, runs)}" for comparison in better[:1])
     return _Findings(
         LabelFindings(model, wrong, remarks, None if wrong else _open(comparisons)),
         clear=not better and all(map(_is_right, runs)),
-        doubted=any(each.is_doubt for each in comparisons),
+        doubted=any(comparison.is_doubt for comparison in comparisons),
     )
 
 
 def _is_right(run: Run) -> bool:
     """Return whether maps of a run fit better as they are than in any other way."""
     fits = [_contrast([row[1:] for row in run.by_frame(other)]) for _, other in run.tried]
-    return all(each.other < TELLING * each.given for each in fits)
+    return all(contrast.other < TELLING * contrast.given for contrast in fits)
 
 
 def _identical(runs: Sequence[Run]) -> str | None:
     """Return the finding where all maps are the same, of several classes, though the camera moves."""
-    frames = [seen for run in runs for seen in run.frames]
+    frames = [frame for run in runs for frame in run.frames]
     first = frames[0].labels
     if len(frames) < LEAST_TOLD or len(np.unique(first)) < 2:
         return None
-    if any(not np.array_equal(first, seen.labels) for seen in frames[1:]) or not any(run.moves() for run in runs):
+    if any(not np.array_equal(first, frame.labels) for frame in frames[1:]) or not any(run.moves() for run in runs):
         return None
     return f"are the same map in all {len(frames)} frames that were read, though the camera moves: predict them again"
 
 
 def _open(comparisons: Sequence[Comparison]) -> str | None:
     """Return what the frames cannot tell, in one line."""
-    says = [each.hypothesis.name for each in comparisons if each.is_open]
+    says = [comparison.hypothesis.name for comparison in comparisons if comparison.is_open]
     if len(says) > MOST_OPEN:
         return "their edges lie on those of depth and colour no better than mirrored, turned or of another frame"
     return f"these frames cannot tell whether they {', or '.join(says)}" if says else None
@@ -255,12 +260,12 @@ def label_findings(
         space = None
         with contextlib.suppress(DataError):
             space = scene.label_space(model)
-        found = check_labels(scene, indices, model, space, LABEL_RUNS, thorough=thorough)
+        findings = check_labels(scene, indices, model, space, LABEL_RUNS, thorough=thorough)
         if scene.surface is None:
             with contextlib.suppress(DataError):
                 chained = (known or {}).get(model) or chain_of(scene, indices, model, options or {}, thorough=thorough)
-                found = with_order(found, *chained)
-        yield found
+                findings = with_order(findings, *chained)
+        yield findings
 
 
 def chain_of(

@@ -29,10 +29,10 @@ def find_matches(points, R, t, factors, lens, image, power, rays, u, v, z, depth
             column, row = np.floor(fx * (x / ahead) + cx + 0.5), np.floor(fy * (y / ahead) + cy + 0.5)
             within = ahead > 0 and 0 <= column < W and 0 <= row < H
             u[f, i], v[f, i] = (np.int64(column), np.int64(row)) if within else (0, 0)
-            there = np.float64(image[v[f, i], u[f, i]])
+            image_depth = np.float64(image[v[f, i], u[f, i]])
             if power != 0:
                 a, b = (u[f, i] - rays_cx) / rays_fx, (v[f, i] - rays_cy) / rays_fy
                 length = np.sqrt(a * a + b * b + 1)
-                there = there * length if power > 0 else there / length
-            z[f, i], depth[f, i], inside[f, i] = ahead, there, within
-            error[f, i] = abs(there / ahead - 1) if within and 0 < there < np.inf else np.inf
+                image_depth = image_depth * length if power > 0 else image_depth / length
+            z[f, i], depth[f, i], inside[f, i] = ahead, image_depth, within
+            error[f, i] = abs(image_depth / ahead - 1) if within and 0 < image_depth < np.inf else np.inf

@@ -81,23 +81,25 @@ def lost_tracking(poses: Sequence[Float64], configured: Convention, compare: Com
     links = {run: compare(run.pairs) for run in tried}
     lost = {k for run in tried for k in _lost_of(run, links[run], limit)}
     sure = {_key(poses[k]) for k in lost}
-    alike = [run for run in tried if _key(poses[run.last]) in sure and not _fits(run, links[run], limit)]
-    return sorted(lost | {k for run in alike for k in range(run.first, run.last + 1)})
+    of_same_pose = [run for run in tried if _key(poses[run.last]) in sure and not _fits(run, links[run], limit)]
+    return sorted(lost | {k for run in of_same_pose for k in range(run.first, run.last + 1)})
 
 
 def runs_of_one_pose(poses: Sequence[Float64], configured: Convention) -> list[Run]:
     """Return the runs of frames whose pose is the identity as the files have it, or that of another frame."""
     origin = origin_of(configured)
-    alike = defaultdict[bytes, list[int]](list)
+    frames_by_pose = defaultdict[bytes, list[int]](list)
     for k, pose in enumerate(poses):
         if np.isfinite(pose).all():
-            alike[_key(pose)].append(k)
-    suspects = {k for key, own in alike.items() if len(own) > 1 or key == _key(origin) for k in own}
+            frames_by_pose[_key(pose)].append(k)
+    suspects = {
+        k for key, positions in frames_by_pose.items() if len(positions) > 1 or key == _key(origin) for k in positions
+    }
     free = [k for k in range(len(poses)) if k not in suspects and np.isfinite(poses[k]).all()]
     runs = []
-    for own in alike.values():
-        members = [k for k in own if k in suspects]
-        for _, part in itertools.groupby(enumerate(members), lambda each: each[1] - each[0]):
+    for positions in frames_by_pose.values():
+        members = [k for k in positions if k in suspects]
+        for _, part in itertools.groupby(enumerate(members), lambda item: item[1] - item[0]):
             row = [k for _, k in part]
             before = next((k for k in reversed(free) if k < row[0]), None)
             runs.append(Run(row[0], row[-1], before, next((k for k in free if k > row[-1]), None)))
@@ -131,8 +133,10 @@ def _lost_of(run: Run, links: Sequence[Link | None], limit: float) -> Sequence[i
 
 def _fits(run: Run, links: Sequence[Link | None], limit: float) -> bool:
     """Return whether one of its ends fits the frame next to it."""
-    known = [link for pair, link in zip(run.pairs, links, strict=True) if link is not None and pair not in run.within]
-    return any(link.error < limit for link in known)
+    end_links = [
+        link for pair, link in zip(run.pairs, links, strict=True) if link is not None and pair not in run.within
+    ]
+    return any(link.error < limit for link in end_links)
 
 
 def _is_off(link: Link, limit: float) -> bool:

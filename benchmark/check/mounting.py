@@ -80,41 +80,41 @@ def with_mounting(verdict: Verdict, sample: Sample) -> Verdict:
     """Return the verdict with a note on a wrong ratio of fy to fx, or a forgotten lever arm, if beyond doubt."""
     if verdict.mend or verdict.state == "unclear":
         return verdict
-    whole = fitted_change(sample, np.eye(ALL))
-    if whole is None:
+    full_change = fitted_change(sample, np.eye(ALL))
+    if full_change is None:
         return verdict
-    found = [each for look in (_aspect, _arm) if (each := look(sample, whole)) is not None]
-    if not found:
+    findings = [finding for look in (_aspect, _arm) if (finding := look(sample, full_change)) is not None]
+    if not findings:
         return verdict
-    left, text = min((mended.fit().error, text) for text, mended in found)
-    return verdict.refuted(text) if left <= REFUSED * sample.fit().error else verdict.remarking(text)
+    error, text = min((mended.fit().error, text) for text, mended in findings)
+    return verdict.refuted(text) if error <= REFUSED * sample.fit().error else verdict.remarking(text)
 
 
-def _aspect(sample: Sample, whole: Change) -> tuple[str, Sample] | None:
+def _aspect(sample: Sample, full_change: Change) -> tuple[str, Sample] | None:
     """Return what is said of fx and fy where they do not belong together, and the sample with the one that does."""
-    fx, fy = float(whole.values[FX]), float(whole.values[FY])
+    fx, fy = float(full_change.values[FX]), float(full_change.values[FY])
     difference = np.zeros((1, ALL))
     difference[0, [FX, FY]] = -1, 1
-    if abs(fy - fx) < LEAST_ASPECT or whole.certainty(difference) < CERTAIN:
+    if abs(fy - fx) < LEAST_ASPECT or full_change.certainty(difference) < CERTAIN:
         return None
     axis, other = (FY, FX) if abs(fy) >= abs(fx) else (FX, FY)
     alone = fitted_change(sample, np.eye(ALL)[[axis]])
-    beside = float(whole.values[axis] - whole.values[other])
-    if alone is None or abs(float(alone.values[axis]) - beside) > ALIKE * abs(beside):
+    log_ratio = float(full_change.values[axis] - full_change.values[other])
+    if alone is None or abs(float(alone.values[axis]) - log_ratio) > ALIKE * abs(log_ratio):
         return None
     names, K = ("fx", "fy"), next(iter(sample.views.values())).camera
-    share, now = abs(math.expm1(-beside)), (K.fx, K.fy)
+    share, now = abs(math.expm1(-log_ratio)), (K.fx, K.fy)
     return (
-        f"{names[axis]} is {share:.0%} too {'small' if beside > 0 else 'large'} beside {names[other]}: depth fits best"
-        f" under {names[axis]} = {now[axis] * math.exp(beside):.4g} where {names[other]} ="
+        f"{names[axis]} is {share:.0%} too {'small' if log_ratio > 0 else 'large'} beside {names[other]}: depth fits"
+        f" best under {names[axis]} = {now[axis] * math.exp(log_ratio):.4g} where {names[other]} ="
         f" {now[other]:.4g}; correct it, or scale each by its own side of the image"
     ), _changed(sample, alone)
 
 
-def _arm(sample: Sample, whole: Change) -> tuple[str, Sample] | None:
+def _arm(sample: Sample, full_change: Change) -> tuple[str, Sample] | None:
     """Return what is said of a lever arm from the tracked body to the camera, and the sample with it."""
     rows = np.eye(ALL)[ARM]
-    if whole.certainty(rows) < CERTAIN:
+    if full_change.certainty(rows) < CERTAIN:
         return None
     alone = fitted_change(sample, rows)
     if alone is None or alone.certainty(rows) < CERTAIN:
@@ -122,7 +122,7 @@ def _arm(sample: Sample, whole: Change) -> tuple[str, Sample] | None:
     arm = alone.values[ARM]
     length = float(np.linalg.norm(arm))
     deep = float(np.median([np.median(v.depth[v.v, v.u]) for v in sample.views.values() if len(v.u)]))
-    if length < max(LEAST_ARM, ARM_OF_DEPTH * deep) or np.linalg.norm(whole.values[ARM] - arm) > ALIKE * length:
+    if length < max(LEAST_ARM, ARM_OF_DEPTH * deep) or np.linalg.norm(full_change.values[ARM] - arm) > ALIKE * length:
         return None
     right, down, forward = arm.tolist()
     return (
@@ -136,7 +136,7 @@ def fitted_change(sample: Sample, free: Float64) -> Change | None:
     """Return the change of the calibration in directions (k, 11) under which depth fits best; None of few points."""
     change, now = Change(np.zeros(ALL), np.zeros((ALL, ALL))), sample
     for _ in range(ROUNDS):
-        slopes = {at: _slopes(view) for at, view in now.views.items()}
+        slopes = {position: _slopes(view) for position, view in now.views.items()}
         pairs = [_linear(now, pair, *slopes[pair[1]]) for pair in now.pairs]
         if sum(len(error) for error, _ in pairs) < LEAST_POINTS:
             return None
@@ -149,7 +149,7 @@ def fitted_change(sample: Sample, free: Float64) -> Change | None:
 
 
 def _changed(sample: Sample, change: Change) -> Sample:
-    return sample.of({at: change.of(view) for at, view in sample.views.items()})
+    return sample.of({position: change.of(view) for position, view in sample.views.items()})
 
 
 def _least_squares(pairs: list[tuple[Float64, Float64]]) -> tuple[Float64, Float64]:
@@ -157,14 +157,14 @@ def _least_squares(pairs: list[tuple[Float64, Float64]]) -> tuple[Float64, Float
 
     Errors of one pair are not independent of each other.
     """
-    error, J = np.concatenate([e for e, _ in pairs]), np.concatenate([each for _, each in pairs])
+    error, J = np.concatenate([e for e, _ in pairs]), np.concatenate([jacobian for _, jacobian in pairs])
     spread = max(1.4826 * float(np.median(np.abs(error))), 1e-9)
     weight = 1 / np.maximum(1, np.abs(error) / (HUBER * spread))
     inverse = np.linalg.pinv((J * weight[:, None]).T @ J, rcond=1e-12)
     step = -inverse @ ((J * weight[:, None]).T @ error)
     pull = J * (weight * (error + J @ step))[:, None]
     ends = np.cumsum([len(e) for e, _ in pairs])[:-1]
-    sums = np.stack([each.sum(axis=0) for each in np.split(pull, ends)])
+    sums = np.stack([part.sum(axis=0) for part in np.split(pull, ends)])
     return step, inverse @ (sums.T @ sums) @ inverse
 
 
@@ -182,38 +182,40 @@ def _linear(sample: Sample, pair: Pair, along_u: Float64, along_v: Float64) -> t
 
     An error is the logarithm of the depth that is met, at the very place of the point, over that of the point.
     """
-    a, b = (sample.views[at] for at in pair)
+    a, b = (sample.views[position] for position in pair)
     met = sample.matched(pair, sample.configured, np.array([1.0]))
-    seen = met.error[0] <= SAME
-    column, row = np.where(seen, met.u[0], 0), np.where(seen, met.v[0], 0)
+    valid = met.error[0] <= SAME
+    column, row = np.where(valid, met.u[0], 0), np.where(valid, met.v[0], 0)
     with np.errstate(invalid="ignore"):
-        seen &= (np.abs(along_u[row, column]) < STEEPEST) & (np.abs(along_v[row, column]) < STEEPEST)
-    column, row = column[seen], row[seen]
+        valid &= (np.abs(along_u[row, column]) < STEEPEST) & (np.abs(along_v[row, column]) < STEEPEST)
+    column, row = column[valid], row[valid]
     to_u, to_v = along_u[row, column], along_v[row, column]
-    own, other = a.camera.every(a.stride), b.camera.every(b.stride)
-    depth = a.depth[a.v, a.u][seen].astype(np.float64)
-    first = np.stack([(a.u[seen] - own.cx) / own.fx * depth, (a.v[seen] - own.cy) / own.fy * depth, depth])
+    camera_a, camera_b = a.camera.every(a.stride), b.camera.every(b.stride)
+    depth = a.depth[a.v, a.u][valid].astype(np.float64)
+    first = np.stack(
+        [(a.u[valid] - camera_a.cx) / camera_a.fx * depth, (a.v[valid] - camera_a.cy) / camera_a.fy * depth, depth]
+    )
     motion = np.linalg.inv(b.T_wc) @ a.T_wc
     R = motion[:3, :3]
     x, y, z = second = R @ first + motion[:3, 3:]
-    off = to_u * (other.fx * x / z + other.cx - column) + to_v * (other.fy * y / z + other.cy - row)
+    off = to_u * (camera_b.fx * x / z + camera_b.cx - column) + to_v * (camera_b.fy * y / z + camera_b.cy - row)
     error = np.log(b.depth[row, column].astype(np.float64)) + off - np.log(z)
 
     def moved(by: Float64) -> Float64:
         """Return how the error changes where points (3, n) of the second camera move."""
-        du, dv = other.fx * (by[0] - x * by[2] / z) / z, other.fy * (by[1] - y * by[2] / z) / z
+        du, dv = camera_b.fx * (by[0] - x * by[2] / z) / z, camera_b.fy * (by[1] - y * by[2] / z) / z
         change: Float64 = to_u * du + to_v * dv - by[2] / z
         return change
 
-    one, zero = np.ones_like(depth), np.zeros_like(depth)
+    ones, zero = np.ones_like(depth), np.zeros_like(depth)
     axes = np.eye(3)
     columns = [
-        moved(R @ np.stack([-first[0], zero, zero])) + to_u * other.fx * x / z,
-        moved(R @ np.stack([zero, -first[1], zero])) + to_v * other.fy * y / z,
-        moved(R @ np.stack([-depth / own.fx, zero, zero])) / a.stride + to_u / b.stride,
-        moved(R @ np.stack([zero, -depth / own.fy, zero])) / a.stride + to_v / b.stride,
+        moved(R @ np.stack([-first[0], zero, zero])) + to_u * camera_b.fx * x / z,
+        moved(R @ np.stack([zero, -first[1], zero])) + to_v * camera_b.fy * y / z,
+        moved(R @ np.stack([-depth / camera_a.fx, zero, zero])) / a.stride + to_u / b.stride,
+        moved(R @ np.stack([zero, -depth / camera_a.fy, zero])) / a.stride + to_v / b.stride,
         moved(R @ first) + 1,
-        *(moved(np.outer((R - axes)[:, k], one)) for k in range(3)),
+        *(moved(np.outer((R - axes)[:, k], ones)) for k in range(3)),
         *(moved(R @ np.cross(axes[k], first.T).T - np.cross(axes[k], second.T).T) for k in range(3)),
     ]
     return error, np.stack(columns, axis=1)

@@ -76,8 +76,8 @@ def with_invalid_depth(config: Config, scenes: Mapping[str, Scene]) -> tuple[Con
     sentinels = {name: sentinel for name, scene in scenes.items() if (sentinel := _of_scene(scene)) is not None}
     if not sentinels:
         return config, {}
-    said = (value for name in sentinels for value in scenes[name].settings.get(OPTION) or ())
-    values = [*dict.fromkeys((*said, *(sentinel.value for sentinel in sentinels.values())))]
+    configured = (value for name in sentinels for value in scenes[name].settings.get(OPTION) or ())
+    values = [*dict.fromkeys((*configured, *(sentinel.value for sentinel in sentinels.values())))]
     listed = ", ".join(f"{value:.15g}" for value in values)
     return _with_option(config, values), {
         name: f"{sentinel}; it is left out ({OPTION}: [{listed}])" for name, sentinel in sentinels.items()

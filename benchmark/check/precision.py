@@ -49,9 +49,9 @@ def _coarse(verdict: Verdict, sample: Sample) -> str | None:
 
 def expected_error(sample: Sample) -> tuple[float, str]:
     """Return the relative error that depth has with exact poses, and the kind of depth, in words."""
-    known = [noise for view in sample.views.values() if math.isfinite(noise := _noise(view))]
-    noise = float(np.median(known)) if known else 0.0
-    if not known:  # no pixel has neighbours with depth, as where LiDAR points are projected
+    noises = [noise for view in sample.views.values() if math.isfinite(noise := _noise(view))]
+    noise = float(np.median(noises)) if noises else 0.0
+    if not noises:  # no pixel has neighbours with depth, as where LiDAR points are projected
         least, kind = SENSOR, "depth as sparse as this"
     else:
         least, kind = (SENSOR, "depth as noisy as this") if noise >= MEASURED else (SURFACE, "depth as smooth as this")

@@ -79,18 +79,18 @@ def find_offset(pairs: Sequence[Edges]) -> Offset | None:
         return None
     fits = [_fits(a, b) for a, b in maps]
     halves = [np.mean(fits[k::2], axis=0) for k in (0, 1)]
-    whole = np.mean(fits, axis=0)
-    best, here = _peak(whole), _identity(whole)
-    if any(at in (0, size - 1) for at, size in zip(best, whole.shape, strict=True)):
+    mean_fits = np.mean(fits, axis=0)
+    best, here = _peak(mean_fits), _identity(mean_fits)
+    if any(position in (0, size - 1) for position, size in zip(best, mean_fits.shape, strict=True)):
         return None
     agree = all(_distance(_peak(half), best, maps[0][0].shape) < LEAST_OFFSET for half in halves)
-    clear = all(half[best] > CLEARLY * half[here] for half in halves) and whole[best] >= LEAST_FIT
+    clear = all(half[best] > CLEARLY * half[here] for half in halves) and mean_fits[best] >= LEAST_FIT
     clear = clear and np.mean([fit[best] > fit[here] for fit in fits]) >= MOST
     if not (agree and clear) or _distance(best, here, maps[0][0].shape) < LEAST_OFFSET:
         return None
-    cell, reach = pairs[0][0].shape[1] / maps[0][0].shape[1], whole.shape[1] // 2
-    shift = ((best[2] - whole.shape[2] // 2) * cell, (best[1] - reach) * cell)
-    return Offset(float(SCALES[best[0]]), shift, float(whole[best]), float(whole[here]))
+    cell, reach = pairs[0][0].shape[1] / maps[0][0].shape[1], mean_fits.shape[1] // 2
+    shift = ((best[2] - mean_fits.shape[2] // 2) * cell, (best[1] - reach) * cell)
+    return Offset(float(SCALES[best[0]]), shift, float(mean_fits[best]), float(mean_fits[here]))
 
 
 def grey_levels(color: UInt8) -> UInt8:
@@ -138,11 +138,11 @@ def _identity(fits: Map) -> tuple[int, ...]:
     return (int(np.abs(SCALES - 1).argmin()), fits.shape[1] // 2, fits.shape[2] // 2)
 
 
-def _distance(one: tuple[int, ...], other: tuple[int, ...], shape: tuple[int, ...]) -> float:
+def _distance(first: tuple[int, ...], second: tuple[int, ...], shape: tuple[int, ...]) -> float:
     """Return how far two registrations lie apart in the middle of the image's sides, as a share of its width."""
     H, W = shape
-    scale = abs(SCALES[one[0]] - SCALES[other[0]])
-    x, y = (abs(one[k] - other[k]) / W for k in (2, 1))
+    scale = abs(SCALES[first[0]] - SCALES[second[0]])
+    x, y = (abs(first[k] - second[k]) / W for k in (2, 1))
     return float(max(x + scale / 2, y + scale / 2 * H / W))
 
 
@@ -185,7 +185,9 @@ def match_images(scene: Scene, views: Mapping[int, View], pairs: Sequence[Pair])
     """Compare the images of neighbouring frames; return None without images, or with too little in common."""
     near = sorted((abs(a - b), a, b) for a, b in pairs if a < b)
     closest = [(a, b) for _, a, b in near[:MOST_PAIRS]]
-    images = {at: _image(scene, views[at]) for at in {at for pair in closest for at in pair}}
+    images = {
+        position: _image(scene, views[position]) for position in {position for pair in closest for position in pair}
+    }
     curves: list[Float64] = []
     depths: list[Float32] = []
     for a, b in closest:
@@ -198,9 +200,9 @@ def match_images(scene: Scene, views: Mapping[int, View], pairs: Sequence[Pair])
     if not together:
         return None
     mean = np.mean(together, axis=0)
-    at, now = int(mean.argmax()), float(mean[present])
-    change = float(CHANGES[at])
-    return ImageMatch(now, float(mean[at]), change, change * float(np.median(np.concatenate(depths))), len(together))
+    best, now = int(mean.argmax()), float(mean[present])
+    change = float(CHANGES[best])
+    return ImageMatch(now, float(mean[best]), change, change * float(np.median(np.concatenate(depths))), len(together))
 
 
 def assess_surface(match: ImageMatch | None, frames: int) -> Verdict:
@@ -276,11 +278,11 @@ def _correlations(a: View, image_a: _Image, b: View, image_b: _Image) -> Float64
     with np.errstate(all="ignore"):
         column, row = image_b.camera.fx * x / z + image_b.camera.cx, image_b.camera.fy * y / z + image_b.camera.cy
     h, w = image_b.grey.shape
-    seen = (z > 0) & (column >= 0) & (column <= w - 1) & (row >= 0) & (row <= h - 1)
-    met = _at(image_b.grey, np.where(seen, column, 0), np.where(seen, row, 0))
+    inside = (z > 0) & (column >= 0) & (column <= w - 1) & (row >= 0) & (row <= h - 1)
+    met = _at(image_b.grey, np.where(inside, column, 0), np.where(inside, row, 0))
     K = image_a.camera
-    (own,) = _at(image_a.grey, K.fx * rays[:1] + K.cx, K.fy * rays[1:2] + K.cy)
-    return np.array([_correlation(own[one], met[k][one]) for k, one in enumerate(seen)])
+    (grey,) = _at(image_a.grey, K.fx * rays[:1] + K.cx, K.fy * rays[1:2] + K.cy)
+    return np.array([_correlation(grey[valid], met[k][valid]) for k, valid in enumerate(inside)])
 
 
 def _at(image: Float32, column: Float64, row: Float64) -> Float32:

@@ -223,8 +223,8 @@ class Sample:
 
     def _placed_by(self, convention: Convention, position: int) -> Placed:
         """Return a view as a convention reads it; it is in several pairs."""
-        if (known := self._placed.get((position, convention))) is not None:
-            return known
+        if (cached := self._placed.get((position, convention))) is not None:
+            return cached
         view, pose = self.views[position], self.views[position].pose(convention, self.configured)
         K, (power, rays) = view.sampled_camera(convention), view.rays(convention, self.configured)
         depth = self._read_as(convention, position)[view.v, view.u] * ray_lengths(rays, view.u, view.v) ** power
@@ -245,7 +245,7 @@ class Sample:
 
     def motions(self, convention: Convention) -> list[tuple[Float64, Float64]]:
         """Return for each pair the rotation and translation from the first camera to the second."""
-        poses = {at: view.pose(convention, self.configured) for at, view in self.views.items()}
+        poses = {position: view.pose(convention, self.configured) for position, view in self.views.items()}
         return [motion(poses[a], poses[b]) for a, b in self.pairs]
 
 
@@ -280,15 +280,17 @@ class Shared:
     @classmethod
     def of(cls, view: View, matches: Matches) -> Shared:
         """Return the pixels of a view's sample that lie on one surface with the pixels that they meet."""
-        same = matches.error[0] <= CONSISTENT
-        return cls((view.v[same], view.u[same]), (matches.v[0][same], matches.u[0][same]), same)
+        consistent = matches.error[0] <= CONSISTENT
+        return cls(
+            (view.v[consistent], view.u[consistent]), (matches.v[0][consistent], matches.u[0][consistent]), consistent
+        )
 
     def labels(self, first: Ids | None, second: Ids | None, *ignored: int) -> Ids:
         """Return (2, n) the labels of the points in two maps, those that have one in both; none without maps."""
         if first is None or second is None:
             return np.empty((2, 0), dtype=np.int64)
-        both = np.stack([first[self.first], second[self.second]]).astype(np.int64)
-        return both[:, (both[0] != ignored[0]) & (both[1] != ignored[-1])]
+        label_pairs = np.stack([first[self.first], second[self.second]]).astype(np.int64)
+        return label_pairs[:, (label_pairs[0] != ignored[0]) & (label_pairs[1] != ignored[-1])]
 
 
 def _lens(camera: Intrinsics) -> tuple[float, float, float, float]:
@@ -304,7 +306,7 @@ def motion(pose: Float64, other: Float64) -> tuple[Float64, Float64]:
 def median_of_seen(errors: npt.NDArray[Any]) -> Float64:
     """Return the median of finite values along the last axis (the lower one of two), or NaN without finite values."""
     ordered = np.sort(errors, axis=-1)
-    seen = np.isfinite(ordered).sum(axis=-1)
-    middle = np.take_along_axis(ordered, np.maximum(seen - 1, 0)[..., None] // 2, axis=-1)[..., 0]
-    median: Float64 = np.where(seen > 0, middle, np.nan)
+    num_finite = np.isfinite(ordered).sum(axis=-1)
+    middle = np.take_along_axis(ordered, np.maximum(num_finite - 1, 0)[..., None] // 2, axis=-1)[..., 0]
+    median: Float64 = np.where(num_finite > 0, middle, np.nan)
     return median

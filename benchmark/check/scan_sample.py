@@ -107,14 +107,14 @@ class ScanSample:
         """Return the same scans with each pose (4, 4) changed."""
         other = copy.copy(self)
         vars(other).update(poses={position: change(T) for position, T in self.poses.items()})
-        for known in {"met", "_errors", "_in_world"} & vars(other).keys():
-            delattr(other, known)
+        for cached in {"met", "_errors", "_in_world"} & vars(other).keys():
+            delattr(other, cached)
         return other
 
     def surfaces(self, pair: Pair, every: int = 1) -> Surfaces:
         """Compare points of the pair's first scan with surfaces of its second scan."""
-        here, there = (self._clouds[position] for position in pair)
-        return Surfaces.of(here.sought[::every], there.points, there.tree, *self._motion(pair))
+        cloud_a, cloud_b = (self._clouds[position] for position in pair)
+        return Surfaces.of(cloud_a.sought[::every], cloud_b.points, cloud_b.tree, *self._motion(pair))
 
     @cached_property
     def _errors(self) -> list[Float64]:
@@ -123,14 +123,14 @@ class ScanSample:
 
     def by_pair(self) -> Float64:
         """Return (pairs,) the typical error of each pair, or NaN without points of known error."""
-        return np.array([_typical(own) for own in self._errors])
+        return np.array([_typical(errors) for errors in self._errors])
 
     def fit(self) -> Fit:
         """Return the typical error of all points that are told, and the share of them on one surface."""
-        every = np.concatenate(self._errors)
-        told = every[np.isfinite(every)]
-        share = float(np.mean(told <= CONSISTENT)) if len(told) else 0.0
-        return Fit(Convention(), _typical(every), share, len(told))
+        all_errors = np.concatenate(self._errors)
+        finite = all_errors[np.isfinite(all_errors)]
+        share = float(np.mean(finite <= CONSISTENT)) if len(finite) else 0.0
+        return Fit(Convention(), _typical(all_errors), share, len(finite))
 
     @property
     def ranges(self) -> list[Float32]:
@@ -152,18 +152,18 @@ class ScanSample:
     def spacing(self) -> float:
         """Median distance of a point from the nearest of its own scan, metres."""
         clouds = [self._clouds[position] for position in {pair[0] for pair in self.pairs}]
-        own = [cloud.tree.query(cloud.sought, k=2)[0][:, 1] for cloud in clouds]
-        return float(np.median(np.concatenate(own))) if own else math.nan
+        distances = [cloud.tree.query(cloud.sought, k=2)[0][:, 1] for cloud in clouds]
+        return float(np.median(np.concatenate(distances))) if distances else math.nan
 
     def overlaps(self) -> list[Overlap]:
         """Return one row a distance between scans."""
-        return [self._overlap(apart, pairs) for apart, pairs in by_distance(self.pairs)]
+        return [self._overlap(distances, pairs) for distances, pairs in by_distance(self.pairs)]
 
-    def _overlap(self, apart: tuple[int, int], pairs: Sequence[Pair]) -> Overlap:
+    def _overlap(self, distances: tuple[int, int], pairs: Sequence[Pair]) -> Overlap:
         error = np.concatenate([self.met[pair].error for pair in pairs])
         agree = np.concatenate([self.agree(pair) for pair in pairs])
         share, agreement = float(np.mean(error <= CONSISTENT)), float(agree.mean()) if len(agree) else math.nan
-        return Overlap(apart, len(pairs), share, share, float(np.median(error)), agreement)
+        return Overlap(distances, len(pairs), share, share, float(np.median(error)), agreement)
 
     def noise(self) -> Noise:
         """Return the distance of points from the nearest of another scan and of their own, and between rays."""
@@ -178,11 +178,11 @@ class ScanSample:
     def agree(self, pair: Pair) -> Mask:
         """Return whether labels agree, of the points met that have one in both scans."""
         a, b = self.scans[pair[0]], self.scans[pair[1]]
-        here, there, met = self._clouds[pair[0]], self._clouds[pair[1]], self.met[pair]
-        first = a.predicted.reshape(-1)[here.rows][here.chosen]
-        second = b.predicted.reshape(-1)[there.rows][met.nearest]
-        known = (met.error <= CONSISTENT) & (first != a.ignore_id) & (second != b.ignore_id)
-        agree: Mask = (first == second)[known]
+        cloud_a, cloud_b, met = self._clouds[pair[0]], self._clouds[pair[1]], self.met[pair]
+        first = a.predicted.reshape(-1)[cloud_a.rows][cloud_a.chosen]
+        second = b.predicted.reshape(-1)[cloud_b.rows][met.nearest]
+        labelled = (met.error <= CONSISTENT) & (first != a.ignore_id) & (second != b.ignore_id)
+        agree: Mask = (first == second)[labelled]
         return agree
 
     def faces(self, voxel_size: float) -> None:
@@ -191,18 +191,18 @@ class ScanSample:
     def stays(self, voxel_size: float) -> float:
         """Return the share of the points met that lie in the same voxel as the nearest of the other scan."""
         first, second = self._in_world
-        same = np.all(np.floor(first / voxel_size) == np.floor(second / voxel_size), axis=1)
-        return float(same.mean()) if len(same) else math.nan
+        in_one_voxel = np.all(np.floor(first / voxel_size) == np.floor(second / voxel_size), axis=1)
+        return float(in_one_voxel.mean()) if len(in_one_voxel) else math.nan
 
     @cached_property
     def _in_world(self) -> tuple[Float64, Float64]:
         """Return (n, 3) the points met of all pairs, and the nearest ones of the other scans, in the world."""
         first, second = [np.zeros((0, 3))], [np.zeros((0, 3))]
         for pair, met in self.met.items():
-            (here, T), (there, T_other) = ((self._clouds[p], self.poses[p]) for p in pair)
+            (cloud_a, T), (cloud_b, T_other) = ((self._clouds[p], self.poses[p]) for p in pair)
             near = met.error <= CONSISTENT
-            first.append(in_world(here.sought[near].T, T).T)
-            second.append(in_world(there.points[met.nearest[near]].T, T_other).T)
+            first.append(in_world(cloud_a.sought[near].T, T).T)
+            second.append(in_world(cloud_b.points[met.nearest[near]].T, T_other).T)
         return np.concatenate(first), np.concatenate(second)
 
 
@@ -241,5 +241,5 @@ def quick_sample_of_scans(scene: Scene, indices: Sequence[int]) -> ScanSample:
 
 def _typical(errors: Float64) -> float:
     """Return the geometric mean of finite errors (n,), or NaN; points without a surface in the other scan are NaN."""
-    told = errors[np.isfinite(errors)]
-    return float(np.exp(np.log(np.maximum(told, EXACT)).mean())) if len(told) else math.nan
+    finite = errors[np.isfinite(errors)]
+    return float(np.exp(np.log(np.maximum(finite, EXACT)).mean())) if len(finite) else math.nan

@@ -44,15 +44,15 @@ def assess_scans(sample: ScanSample) -> Verdict:
         return Verdict("unsound", text, () if mend is None else (mend,))
     now, trials = sample.fit(), ranked(SCANS, sample)
     frames, best = len({p for pair in pairs for p in pair}), trials[0]
-    shown = (("as configured", now), *((trial.hypothesis.name, trial.fit) for trial in trials[:4]))
-    about = Verdict("sound", "", (), now.error, now.share, frames, len(pairs), fits=shown)
+    fits = (("as configured", now), *((trial.hypothesis.name, trial.fit) for trial in trials[:4]))
+    about = Verdict("sound", "", (), now.error, now.share, frames, len(pairs), fits=fits)
     if best.is_right(sample, now, BETTER):
-        told = best.hypothesis
-        mend = next((text for (key, value), text in told.options.items() if settings.get(key) == value), None)
-        advice = f"set {mend} (--option {mend.replace(': ', '=')})" if mend else told.mend
+        reading = best.hypothesis
+        mend = next((text for (key, value), text in reading.options.items() if settings.get(key) == value), None)
+        advice = f"set {mend} (--option {mend.replace(': ', '=')})" if mend else reading.mend
         return about.refuted(
             f"scans do not lie on each other: points are typically {now.error:.1%} of their range from the"
-            f" surfaces of another scan, and {best.fit.error:.2%} with {told.name}; {advice}",
+            f" surfaces of another scan, and {best.fit.error:.2%} with {reading.name}; {advice}",
             () if mend is None else (mend,),
         )
     nearest = float(np.median(np.concatenate([met.error for met in sample.met.values()])))
@@ -66,6 +66,6 @@ def assess_scans(sample: ScanSample) -> Verdict:
         about,
         text=f"scans lie on each other: points are typically {now.error:.2%} of their range from the surfaces of"
         " another scan",
-        undetermined=tuple(each.name for each in SCANS if each.name in open_),
+        undetermined=tuple(hypothesis.name for hypothesis in SCANS if hypothesis.name in open_),
         reason="the sensor hardly moves or turns" if open_ else "",
     )

@@ -130,13 +130,13 @@ class SceneCheck:
         """Return those of label maps."""
         ids = [labels.problem for labels in self.labels if labels.problem is not None]
         unread = [] if self.unread is None or self.labels else [self.unread]
-        return (*unread, *ids, *(line for each in self.label_findings for line in each.wrong))
+        return (*unread, *ids, *(line for findings in self.label_findings for line in findings.wrong))
 
     def to_dict(self) -> dict[str, Any]:
         """Return the JSON object."""
         content = {field.name: getattr(self, field.name) for field in dataclasses.fields(self)}
-        said = {"verdict": self.verdict.to_dict(), "problems": self.problems, "sound": not self.problems}
-        return {name: to_json(value) for name, value in (content | said).items()}
+        derived = {"verdict": self.verdict.to_dict(), "problems": self.problems, "sound": not self.problems}
+        return {name: to_json(value) for name, value in (content | derived).items()}
 
 
 def check(config: Config) -> Iterator[SceneCheck]:
@@ -192,8 +192,10 @@ def check_scene(scene: Scene, config: Config, told: Sequence[str] = ()) -> Scene
         notes=(
             *told,
             *verdict.remarks,
-            *(line for each in findings for line in each.remarks),
-            *notes(scene, [inspection.views[at] for at in sorted(inspection.views)], inspection.tally.model),
+            *(line for of_model in findings for line in of_model.remarks),
+            *notes(
+                scene, [inspection.views[position] for position in sorted(inspection.views)], inspection.tally.model
+            ),
             *begun,
         ),
     )
@@ -222,7 +224,7 @@ def _check_scans(
     sample = ScanSample(scene, indices, first, clusters(len(indices), SCAN_CLUSTERS), fused=FUSED_FRAMES)
     verdict = with_sweep(assess_scans(sample), sample)
     scans, ranges = [*sample.scans.values()], sample.ranges
-    valid = [len(own) / scan.depth.size for own, scan in zip(ranges, scans, strict=True)]
+    valid = [len(valid_ranges) / scan.depth.size for valid_ranges, scan in zip(ranges, scans, strict=True)]
     tally = Tally(first or "")
     for scan in scans if first is not None else ():
         tally.add(scan)
@@ -254,17 +256,17 @@ def _whole(scene: Scene, config: Config) -> tuple[list[str], list[str]]:
     if config.models is not None or scene.skips_incomplete or len(models) < 2:
         return models, []
     indices = frame_indices(scene, config)
-    there = {name: sum(not scene.missing(index, [name]) for index in indices) for name in models}
-    whole = [name for name in models if there[name] == len(indices)]
-    if not whole:
+    num_maps = {name: sum(not scene.missing(index, [name]) for index in indices) for name in models}
+    complete = [name for name in models if num_maps[name] == len(indices)]
+    if not complete:
         return models, []
     begun = [
-        f"labels of {name}: {there[name]} of {len(indices)} selected frames have a map, so they were not checked;"
+        f"labels of {name}: {num_maps[name]} of {len(indices)} selected frames have a map, so they were not checked;"
         " predict the others, or delete the folder"
         for name in models
-        if name not in whole
+        if name not in complete
     ]
-    return whole, begun
+    return complete, begun
 
 
 def quick_check(scene: Scene, indices: Sequence[int], options: Mapping[str, Any] | None = None) -> Verdict:
@@ -314,9 +316,9 @@ def require_sound(scene: Scene, indices: Sequence[int], options: Mapping[str, An
 def refuse_unsound(scene: Scene, verdict: Verdict) -> None:
     """Raise DataError where the verdict on that scene is that depth and poses contradict each other."""
     if verdict.state == "unsound":
-        then = "`semstab-bench check` reports more, --no-geometry-check fuses the scene as it is"
+        advice = "`semstab-bench check` reports more, --no-geometry-check fuses the scene as it is"
         raise DataError(
-            f"{scene.name}: {verdict.text}; {'check_geometry=False fuses it as it is' if scene.in_program else then}"
+            f"{scene.name}: {verdict.text}; {'check_geometry=False fuses it as it is' if scene.in_program else advice}"
         )
 
 

@@ -29,11 +29,11 @@ def scene_notes(
         return ()
     stored = stored_labels(scene, model, config)
     inspection = Inspection(scene, indices, stored, (), POINTS, fused=REGISTERED_FRAMES)
-    views = [inspection.views[at] for at in sorted(inspection.views)]
+    views = [inspection.views[position] for position in sorted(inspection.views)]
     options = config.dataset.options
     findings = [] if stored is None else label_findings(scene, indices, [model], options, known, thorough=False)
     return (
-        *(line for each in findings for line in (*each.wrong, *each.remarks)),
+        *(line for of_model in findings for line in (*of_model.wrong, *of_model.remarks)),
         *notes(scene, views, model),
     )
 

@@ -31,7 +31,7 @@ class Swept:
         """Seek the points of each pair of scans; pairs of which no point is near to a surface are left out."""
         motions = {p: _motion(sample, p) for pair in sample.pairs for p in pair}
         sought = [(sample.surfaces((a, b)), motions[a], motions[b]) for a, b in sample.pairs]
-        return cls(tuple(each for each in sought if each[0].met.any()))
+        return cls(tuple(sought_pair for sought_pair in sought if sought_pair[0].met.any()))
 
     def by_pair(self) -> Float64:
         """Return (pairs,) the median distance of points from surfaces, metres."""

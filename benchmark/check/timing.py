@@ -133,17 +133,24 @@ def _period(scene: Scene) -> float:
 
 def _moved(scene: Scene, sample: Sample) -> tuple[list[Pair], Callable[[float], Float64]]:
     """Return the pairs of frames with poses within reach, and a function from a delay in frames to their errors."""
-    known, views = dict(_poses_around(scene, sample)), sample.views
-    reach = {at for at, v in views.items() if all(v.index + k in known for k in range(-REACH, REACH + 1))}
+    poses_by_index, views = dict(_poses_around(scene, sample)), sample.views
+    reach = {
+        position
+        for position, v in views.items()
+        if all(v.index + k in poses_by_index for k in range(-REACH, REACH + 1))
+    }
     pairs = [pair for pair in sample.pairs if {*pair} <= reach]
-    used = {at: views[at] for pair in pairs for at in pair}
-    indices, poses = np.array([*known], dtype=np.float64), np.array([*known.values()])
+    used = {position: views[position] for pair in pairs for position in pair}
+    indices, poses = np.array([*poses_by_index], dtype=np.float64), np.array([*poses_by_index.values()])
 
     @functools.cache
     def errors(shift: float) -> Float64:
-        wanted = np.array([view.index + shift for view in used.values()])
-        there = at_times(indices, poses, wanted, 1.0, "interpolate")
-        moved = {at: dataclasses.replace(view, T_wc=T) for (at, view), T in zip(used.items(), there, strict=True)}
+        times = np.array([view.index + shift for view in used.values()])
+        interpolated = at_times(indices, poses, times, 1.0, "interpolate")
+        moved = {
+            position: dataclasses.replace(view, T_wc=T)
+            for (position, view), T in zip(used.items(), interpolated, strict=True)
+        }
         return Sample(moved, pairs, sample.configured).by_pair()
 
     return pairs, errors

@@ -81,8 +81,8 @@ class Trial(Generic[D]):
 
 def ranked(hypotheses: Iterable[Hypothesis[D]], data: D) -> list[Trial[D]]:
     """Try the hypotheses that apply, the one under which frames agree best first."""
-    changed = [(each, each.change(data)) for each in hypotheses if each.applies(data)]
-    trials = [Trial(each, other, other.fit()) for each, other in changed]
+    changed = [(hypothesis, hypothesis.change(data)) for hypothesis in hypotheses if hypothesis.applies(data)]
+    trials = [Trial(hypothesis, other, other.fit()) for hypothesis, other in changed]
     return sorted(trials, key=lambda trial: (not trial.fit.has_evidence, trial.fit.error))
 
 
@@ -114,14 +114,14 @@ class Contrast:
     @classmethod
     def of(cls, given: Sequence[float] | Float64, other: Sequence[float] | Float64) -> Contrast:
         """Compare two measures, one pair of numbers for each frame or pair; NaN does not count."""
-        both = np.array([given, other], dtype=np.float64).reshape(2, -1)
-        both = both[:, np.isfinite(both).all(axis=0)]
-        n = both.shape[1]
-        gain, won = both[1] - both[0], float(np.mean(both[1] > both[0])) if n else 0.0
+        pairs = np.array([given, other], dtype=np.float64).reshape(2, -1)
+        pairs = pairs[:, np.isfinite(pairs).all(axis=0)]
+        n = pairs.shape[1]
+        gain, won = pairs[1] - pairs[0], float(np.mean(pairs[1] > pairs[0])) if n else 0.0
         if n < 2:
             return cls(math.nan, math.nan, 0.0, won, n)
         error = max(float(gain.std(ddof=1)) / math.sqrt(n), 1e-9)
-        return cls(float(both[0].mean()), float(both[1].mean()), float(gain.mean()) / error, won, n)
+        return cls(float(pairs[0].mean()), float(pairs[1].mean()), float(gain.mean()) / error, won, n)
 
     @property
     def wins(self) -> bool:
@@ -141,7 +141,7 @@ class Contrast:
 
 def falls(errors: Float64, present: Float64, least: float = 0.0) -> Contrast:
     """Compare errors (pairs,) with the present ones, by their logarithms; of pairs that change by less none counts."""
-    now, other = (-np.log(np.maximum(each, TINY)) for each in (present, errors))
+    now, other = (-np.log(np.maximum(values, TINY)) for values in (present, errors))
     return Contrast.of(now, np.where(np.abs(other - now) > least, other, np.nan) if least else other)
 
 
@@ -153,8 +153,8 @@ def clearly_falls(errors: Float64, present: Float64) -> bool:
 
 def mean_log(errors: Float64) -> float:
     """Return the mean logarithm of the known errors (pairs,), or inf without known errors."""
-    told = errors[np.isfinite(errors)]
-    return float(np.log(np.maximum(told, TINY)).mean()) if len(told) else math.inf
+    finite = errors[np.isfinite(errors)]
+    return float(np.log(np.maximum(finite, TINY)).mean()) if len(finite) else math.inf
 
 
 def middle(errors: Float64) -> float:

@@ -48,9 +48,9 @@ def interruptible() -> Iterator[None]:
         raise KeyboardInterrupt(number)
 
     hook = sys.unraisablehook
-    for each in ENDINGS:
-        if signal.getsignal(each) != signal.SIG_IGN:  # nohup
-            ended[each] = signal.signal(each, interrupt)
+    for signal_number in ENDINGS:
+        if signal.getsignal(signal_number) != signal.SIG_IGN:  # nohup
+            ended[signal_number] = signal.signal(signal_number, interrupt)
     try:
         yield
     except Exception as error:
@@ -73,8 +73,8 @@ RESUMED = ("run", "study", "benchmark", "filters", "predict", "convert")
 def _interrupted(command: str | None, folder: Path | None) -> str:
     """Return the message of a command that a signal ended; its folder may not be on the command line."""
     if command in RESUMED:
-        again = "the same --out" if folder is None else f"--out {folder}"
-        return f"interrupted; finished work is stored, and the same command with {again} resumes there"
+        out_option = "the same --out" if folder is None else f"--out {folder}"
+        return f"interrupted; finished work is stored, and the same command with {out_option} resumes there"
     return "interrupted; no file is half-written; start the same command again"
 
 
@@ -103,7 +103,7 @@ def _is_path(word: str) -> bool:
     return os.sep in word or bool(Path(word).suffix) or Path(word).exists()
 
 
-UsageError: Any = next(each for each in typer.BadParameter.__mro__ if each.__name__ == "UsageError")
+UsageError: Any = next(parent for parent in typer.BadParameter.__mro__ if parent.__name__ == "UsageError")
 """The error of a command line that the options do not allow: typer exports only its subclass."""
 
 
@@ -167,9 +167,9 @@ class Group(TyperGroup):
             say(f"error: {_usage(error)}; see {command} --help")
             raise typer.Exit(2) from error
         except KeyboardInterrupt as error:
-            folder = next((each for each in error.args if isinstance(each, Path)), None)
+            folder = next((argument for argument in error.args if isinstance(argument, Path)), None)
             say(_interrupted(ctx.invoked_subcommand, folder))
-            number = next((each for each in error.args if isinstance(each, int)), signal.SIGINT)
+            number = next((argument for argument in error.args if isinstance(argument, int)), signal.SIGINT)
             raise typer.Exit(128 + number) from error
         except OSError as error:
             say(f"error: {error.filename or 'input or output'}: {error.strerror or error}")

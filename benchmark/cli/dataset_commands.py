@@ -40,8 +40,8 @@ def check(
 
     if json_file is not None:
         require_output(json_file, [config])
-    named = {"scenes": source.scene, "models": source.model, "voxel_size": voxel_size}
-    content = chosen(named, settings, options, source.dataset, source.data, frames)
+    run_settings = {"scenes": source.scene, "models": source.model, "voxel_size": voxel_size}
+    content = chosen(run_settings, settings, options, source.dataset, source.data, frames)
     selected = resolve(load_config(config, content))
     console, results = Console(quiet=quiet), []
     for checked in check_scenes(selected):
@@ -93,19 +93,19 @@ def predict(
     from semstab.configure import load_config, resolve
     from semstab.predict import command
 
-    named = {
+    model_settings = {
         "checkpoint": checkpoint, "revision": revision, "device": device, "dtype": dtype, "threads": threads,
         "classes": classes, "image_size": None if image_size is None else _input_size(image_size),
     }  # fmt: skip
     of_data = [setting for setting in settings or () if setting.startswith(("dataset.", "frames."))]
     content = chosen({}, of_data, options, dataset, data, frames)
-    model_options = chosen(named, [setting for setting in settings or () if setting not in of_data], None)
+    model_options = chosen(model_settings, [setting for setting in settings or () if setting not in of_data], None)
     read = content.get("dataset")
     if read is not None and data is None and dataset is None:
         raise ConfigError("--option sets how a dataset is read; choose one with --data or --dataset")
-    given = {"name": name, "taxonomy": taxonomy, "mapping": mapping, "scores": scores, "filters": filters}
+    predictor_settings = {"name": name, "taxonomy": taxonomy, "mapping": mapping, "scores": scores, "filters": filters}
     command.run(
-        predictor={"model": model, **{key: value for key, value in given.items() if value is not None}},
+        predictor={"model": model, **{key: value for key, value in predictor_settings.items() if value is not None}},
         options=model_options,
         images=images,
         dataset=None if read is None else resolve(load_config(None, {"dataset": read})).dataset,
@@ -147,8 +147,8 @@ def convert(
     from semstab.convert import convert, frame_bar, print_converted
     from semstab.core.console import Console
 
-    named = {"scenes": source.scene, "models": source.model}
-    content = chosen(named, settings, options, source.dataset, source.data, frames)
+    run_settings = {"scenes": source.scene, "models": source.model}
+    content = chosen(run_settings, settings, options, source.dataset, source.data, frames)
     selected, console = resolve(load_config(config, content)), Console(quiet=quiet, markup=False)
     with frame_bar(Console(stderr=True, quiet=quiet)) as bar:
         for converted in convert(selected, out, depth_error=depth_error, progress=bar):

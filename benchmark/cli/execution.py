@@ -53,8 +53,8 @@ def execute(config: Config, out: Path, execution: Execution, *, quiet: bool, ver
             print_answer(result, Console(), out=out, seconds=time.monotonic() - began, verbose=verbose)
         else:
             print_lines([f"  folder  {out}"], quiet=quiet)
-        for each in recording:
-            each.serve()
+        for recorder in recording:
+            recorder.serve()
     finally:
         for observer in observers:
             observer.close()

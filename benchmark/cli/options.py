@@ -69,9 +69,9 @@ def own_defaults() -> Path | None:
 
     It is SEMSTAB_CONFIG, if set, else semstab/config.yaml in the user's folder of configurations.
     """
-    named = os.environ.get("SEMSTAB_CONFIG")
-    if named is not None:
-        return Path(named) if named else None
+    stated = os.environ.get("SEMSTAB_CONFIG")
+    if stated is not None:
+        return Path(stated) if stated else None
     path = Path(os.environ.get("XDG_CONFIG_HOME") or Path.home() / ".config") / "semstab/config.yaml"
     return path if path.is_file() else None
 
@@ -268,7 +268,7 @@ class Measurement:
 
     def content(self, source: Source, backends: list[str] | None, tile_size: str | None) -> dict[str, Any]:
         """Return the settings of a run by their names in a file of settings."""
-        named = {
+        run_settings = {
             "backends": backends, "scenes": source.scene, "models": source.model, "taxonomy": self.taxonomy,
             "distances": self.distances, "voxel_size": self.voxel_size, "pixel_stride": self.pixel_stride,
             "top_k": self.top_k, "moving": self.moving,
@@ -279,7 +279,7 @@ class Measurement:
             "tile_size": int(tile_size) if tile_size is not None and tile_size.isdigit() else tile_size,
         }
         content = chosen(
-            named, self.settings, self.options, source.dataset, source.data, self.frames, self.seed
+            run_settings, self.settings, self.options, source.dataset, source.data, self.frames, self.seed
         )
         if self.check in ("none", "off"):
             content["check"] = None
@@ -344,8 +344,8 @@ def select_dataset(content: dict[str, Any], name: str | None, data: Path | None,
         raise ConfigError(f"{data}: there is no such {'file' if data.suffix else 'folder'}")
     options = {"root": None if data is None else str(data), "seed": seed}
     options = {key: value for key, value in options.items() if value is not None}
-    given = content.get("dataset")
-    if name is None and data is not None and not (isinstance(given, dict) and "name" in given):
+    stated = content.get("dataset")
+    if name is None and data is not None and not (isinstance(stated, dict) and "name" in stated):
         name = _recognised(data)
     if name is None and not options:
         return

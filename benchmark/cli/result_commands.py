@@ -150,7 +150,7 @@ def leaderboard(
     from semstab.leaderboard.board import boards, lines, write_page
     from semstab.leaderboard.definition import load_benchmark
 
-    definitions = {each.id: each for each in map(load_benchmark, definition or ())}
+    definitions = {benchmark.id: benchmark for benchmark in map(load_benchmark, definition or ())}
     made = boards(folder, definitions)
     print_lines(lines(made), quiet=quiet)
     if out is not None:

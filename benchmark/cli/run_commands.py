@@ -90,10 +90,10 @@ def _on_device(config: Config, device: str) -> Config:
     if not any(takes_option(name, "device") for name in names):
         raise ConfigError(f"--device {device}: none of {', '.join(names)} runs on a device")
     changed = [
-        each.model_copy(update={"options": each.options | {"device": device}})
-        if takes_option(each.name, "device")
-        else each
-        for each in config.backends
+        backend.model_copy(update={"options": backend.options | {"device": device}})
+        if takes_option(backend.name, "device")
+        else backend
+        for backend in config.backends
     ]
     return config.model_copy(update={"backends": changed})
 
@@ -204,10 +204,10 @@ def filters(
     from semstab.filter_study import filter_study_config
     from semstab.predict.predictor import parse_predictors
 
-    named: dict[str, Any] = {"scenes": source.scene, "voxel_size": voxel_size, "taxonomy": taxonomy}
-    named["check_geometry"] = False if trust_geometry else None
+    run_settings: dict[str, Any] = {"scenes": source.scene, "voxel_size": voxel_size, "taxonomy": taxonomy}
+    run_settings["check_geometry"] = False if trust_geometry else None
     models = parse_predictors(prediction.predict or [], prediction.model_options)
-    content = chosen(named, settings, options, source.dataset, source.data, frames)
+    content = chosen(run_settings, settings, options, source.dataset, source.data, frames)
     config, left_out = filter_study_config(models, source.model or [], prediction.filters or [], content)
     for line in left_out if not quiet else ():
         say(line)

@@ -75,8 +75,8 @@ def show(
         matching = {key: table for key, table in by_name.items() if key.startswith(name)}
         if not matching:
             raise ConfigError(f"{run}: no table '{name}'; the tables are {', '.join(by_name)}")
-        one = out is not None and out.suffix == ".csv" and name in matching
-        chosen |= {name: matching[name]} if one else matching
+        is_single = out is not None and out.suffix == ".csv" and name in matching
+        chosen |= {name: matching[name]} if is_single else matching
     if out is not None and figures is None:
         print_lines([str(save_as([*(chosen if what else by_name).values()], out))])
     else:
@@ -137,10 +137,10 @@ def view(
         print_lines([str(screenshot)])
         return
     display = sys.platform != "linux" or bool(os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY"))
-    with tempfile.TemporaryFile() as said:  # several lines without a display that answers
-        ended = subprocess.run([*viewer_command(), str(recording)], check=False, stderr=said).returncode
-        said.seek(0)
-        words = said.read().decode(errors="replace")
+    with tempfile.TemporaryFile() as output:  # several lines without a display that answers
+        ended = subprocess.run([*viewer_command(), str(recording)], check=False, stderr=output).returncode
+        output.seek(0)
+        words = output.read().decode(errors="replace")
     if ended and (not display or NO_WINDOW in words):
         raise ConfigError(
             f"{recording}: there is no display for the viewer; copy the file to a machine with one, show it in a"
@@ -216,19 +216,19 @@ def list_(
     }
     sections["study"] = {name: load_study(name).description for name in shipped_studies()}
     sections["benchmark"] = {name: read_yaml(file)["description"] for name, file in shipped_benchmarks().items()}
-    wanted = _kind(kind)
-    plural = {one: several for several, one in KINDS.items()}
+    section = _kind(kind)
+    plural = {singular: several for several, singular in KINDS.items()}
     console = Console()
-    for one, described in sections.items():
-        if wanted in (None, one):
-            print_lines([f"{plural[one]} ({len(described)})"])
+    for kind_name, described in sections.items():
+        if section in (None, kind_name):
+            print_lines([f"{plural[kind_name]} ({len(described)})"])
             print_lines(_entry(name, text, console.width) for name, text in described.items())
-            print_lines([""] if wanted is None else [])
-    if wanted is not None:
+            print_lines([""] if section is None else [])
+    if section is not None:
         return
-    if (own := own_defaults()) is None:
+    if (defaults_file := own_defaults()) is None:
         print_lines(["no settings in ~/.config/semstab/config.yaml or SEMSTAB_CONFIG"])
     else:
-        print_lines([f"settings used without --config: {own}"])
-        content = yaml.safe_dump(read_yaml(own), sort_keys=False, allow_unicode=True)
+        print_lines([f"settings used without --config: {defaults_file}"])
+        content = yaml.safe_dump(read_yaml(defaults_file), sort_keys=False, allow_unicode=True)
         print_lines(f"  {line}" for line in content.splitlines())

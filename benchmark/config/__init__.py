@@ -76,10 +76,13 @@ class BackendConfig(Part):
 
     def fusing_by(self, rule: str) -> BackendConfig:
         """Return the same backend with a rule, of that name or FILE.py:NAME; its own name then has the rule's."""
-        own, options = self.name.partition(BY_RULE)[0], {k: v for k, v in self.options.items() if k not in self.ruled}
+        base_name, options = (
+            self.name.partition(BY_RULE)[0],
+            {k: v for k, v in self.options.items() if k not in self.ruled},
+        )
         if rule == "mean":
-            return self.model_copy(update={"name": own, "options": options})
-        name = f"{own}{BY_RULE}{rule.rpartition(':')[2].removesuffix('.py')}"
+            return self.model_copy(update={"name": base_name, "options": options})
+        name = f"{base_name}{BY_RULE}{rule.rpartition(':')[2].removesuffix('.py')}"
         rule_options = {key: value for key, value in self.ruled.items() if key == "rule_options"}
         by = {"rule": absolute(rule)} | rule_options
         return self.model_copy(update={"name": name, "options": options | by})
@@ -92,9 +95,9 @@ class BackendConfig(Part):
     @property
     def ruled(self) -> dict[str, Any]:
         """Options that name the rule of fusion; empty for the backend's own rule."""
-        named = self.name.partition(BY_RULE)[2]
-        own = {"rule": named} if named else {}
-        return own | {key: self.options[key] for key in ("rule", "rule_options") if key in self.options}
+        rule = self.name.partition(BY_RULE)[2]
+        by_name = {"rule": rule} if rule else {}
+        return by_name | {key: self.options[key] for key in ("rule", "rule_options") if key in self.options}
 
     def model_post_init(self, _: Any) -> None:
         """Let the registry know the class behind the name."""
@@ -260,9 +263,10 @@ class Config(Settings):
     @classmethod
     def _rules_are_named(cls, value: list[BackendConfig]) -> list[BackendConfig]:
         """Name the rule that a backend has among its options only, so that several stand side by side."""
-        unnamed = [each.options.get("rule") if BY_RULE not in each.name else None for each in value]
+        unnamed = [backend.options.get("rule") if BY_RULE not in backend.name else None for backend in value]
         return [
-            each.fusing_by(rule) if isinstance(rule, str) else each for each, rule in zip(value, unnamed, strict=True)
+            backend.fusing_by(rule) if isinstance(rule, str) else backend
+            for backend, rule in zip(value, unnamed, strict=True)
         ]
 
     @field_validator("backends")
@@ -285,8 +289,8 @@ class Config(Settings):
     @field_validator("region_maps")
     @classmethod
     def _regions_are_not_fused(cls, value: list[str], info: ValidationInfo) -> list[str]:
-        if both := [name for name in value if name in (info.data.get("models") or ())]:
-            raise ValueError(f"'{both[0]}' is named among the models too; use one of the two")
+        if duplicates := [name for name in value if name in (info.data.get("models") or ())]:
+            raise ValueError(f"'{duplicates[0]}' is named among the models too; use one of the two")
         return value
 
     @field_validator("tile_size", mode="wrap")
@@ -324,7 +328,7 @@ class Config(Settings):
             return [*self.backends]
         checking, fusing = BackendConfig.of(self.check), {backend.name: backend for backend in self.backends}
         by_rule = [checking.like(backend) for backend in self.backends]
-        return [*self.backends, *{each.name: each for each in by_rule if each.name not in fusing}.values()]
+        return [*self.backends, *{backend.name: backend for backend in by_rule if backend.name not in fusing}.values()]
 
     def only(self, parts: Sequence[str]) -> Config:
         """Return the base units and these parts alone: sweeps, 'shared_taxonomy', 'backends'.
@@ -332,10 +336,10 @@ class Config(Settings):
         Raises:
             ConfigError: For a part that there is not.
         """
-        known = {name for name, _ in self.sweeps.given()} | {BASE, SHARED, BACKENDS}
+        available = {name for name, _ in self.sweeps.given()} | {BASE, SHARED, BACKENDS}
         for part in parts:
-            if part not in known:
-                raise ConfigError(f"study {self.name}: no part '{part}'; {nearest(part, sorted(known))}")
+            if part not in available:
+                raise ConfigError(f"study {self.name}: no part '{part}'; {nearest(part, sorted(available))}")
         dropped = {name: None for name, _ in self.sweeps.given() if name not in parts}
         return self.model_copy(
             update={

@@ -49,13 +49,13 @@ def merge(base: Mapping[str, Any], over: Mapping[str, Any]) -> dict[str, Any]:
     """Return the settings of `over` on top of `base`, group by group."""
     merged = dict(base)
     for key, value in over.items():
-        both = isinstance(value, Mapping) and isinstance(merged.get(key), Mapping)
-        merged[key] = merge(merged[key], value) if both else value
+        are_groups = isinstance(value, Mapping) and isinstance(merged.get(key), Mapping)
+        merged[key] = merge(merged[key], value) if are_groups else value
     return merged
 
 
 ScopeSetting = Annotated[
-    Scope, BeforeValidator(lambda given: given.replace("-", " ") if isinstance(given, str) else given)
+    Scope, BeforeValidator(lambda value: value.replace("-", " ") if isinstance(value, str) else value)
 ]
 """'this scene', or 'this-scene'."""
 
@@ -89,9 +89,9 @@ def explain(error: ValidationError, model: type[BaseModel]) -> str:
     message = problem["msg"].removeprefix("Value error, ")
     if not name:  # of the settings as a whole
         return message
-    given = problem["input"]
-    plain = all(isinstance(each, str | int | float) for each in (given if isinstance(given, list | tuple) else [given]))
-    return f"{name}: {message[0].lower()}{message[1:]}{f' (got {reprlib.repr(given)})' if plain else ''}"
+    value = problem["input"]
+    plain = all(isinstance(item, str | int | float) for item in (value if isinstance(value, list | tuple) else [value]))
+    return f"{name}: {message[0].lower()}{message[1:]}{f' (got {reprlib.repr(value)})' if plain else ''}"
 
 
 def _models_in(annotation: Any) -> Iterator[type[BaseModel]]:

@@ -130,15 +130,15 @@ class _Execution:
             trim_malloc()
         for line in sizing.lines:
             logger.warning("%s", line)
-        whole = list[Work]()
+        untiled = list[Work]()
         for key, unit in self._missing.items():
             if (error := sizing.refused.get(key)) is not None:
                 self._keep(Work.of(unit, start).failed(ConfigError(error)))
             elif (size := sizing.tile_sizes.get(key)) is not None:
                 self._tiled[key] = TiledUnit(unit, size, self._folder, start)
             else:
-                whole.append(Work.of(unit, start))
-        self._queue = deque(jobs_of(whole, self._executor.width))
+                untiled.append(Work.of(unit, start))
+        self._queue = deque(jobs_of(untiled, self._executor.width))
         self.ended = [work for tiled in self._tiled.values() if (work := tiled.ended()) is not None]
 
     def next_job(self) -> Job | None:
@@ -155,11 +155,11 @@ class _Execution:
             return
         self.units.add_seconds(work)
         with self.units.watch("assemble"):
-            whole = tiled.take(work)
+            finished = tiled.take(work)
         step, name = tiled.step(), tiled.name
         self._observers.tell(lambda observer: observer.advanced(step, name))
-        if whole is not None:
-            self._keep(whole)
+        if finished is not None:
+            self._keep(finished)
 
     def _keep(self, work: Work) -> None:
         """Store a whole unit, or why there is none, and tell the observers."""
@@ -211,7 +211,7 @@ class _Execution:
         for (scene, model), task in fused.items():
             if scene in verdicts:
                 with contextlib.suppress(DataError):
-                    found = scene_notes(task.scene, task.indices, model, config, ordered.get(scene))
-                    found = (*found, *faces.get(scene, []))
+                    notes = scene_notes(task.scene, task.indices, model, config, ordered.get(scene))
+                    notes = (*notes, *faces.get(scene, []))
                     left_out = [self._gaps[scene]] if scene in self._gaps else []
-                    self.units.notes[scene, model] = (*left_out, *verdicts[scene].remarks, *found)
+                    self.units.notes[scene, model] = (*left_out, *verdicts[scene].remarks, *notes)

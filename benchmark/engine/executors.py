@@ -123,7 +123,7 @@ class LocalProcesses(Executor):
             _check_start(pool)
             for future, job in _ended(take, submit, lambda: width):
                 works = future.result()
-                begun[:] = [each for each in begun if each is not job]
+                begun[:] = [other for other in begun if other is not job]
                 yield from works
             pool.shutdown()
             done = True
@@ -278,19 +278,20 @@ class DaskCluster(Executor):
 
     def _require_same_version(self) -> None:
         """Raise ConfigError where a worker's semstab is missing, or another one."""
-        own = importlib.metadata.version("semstab")
+        own_version = importlib.metadata.version("semstab")
         try:
-            there = self._client.run(importlib.metadata.version, "semstab")
+            versions = self._client.run(importlib.metadata.version, "semstab")
         except importlib.metadata.PackageNotFoundError as error:
             raise ConfigError("a worker of the scheduler has no semstab; install semstab there") from error
         except AWAY as error:
             raise ConfigError(LOST) from error
-        if not there:
+        if not versions:
             raise ConfigError("the scheduler has no worker; start some with 'dask worker'")
-        for worker, version in there.items():
-            if version != own:
+        for worker, version in versions.items():
+            if version != own_version:
                 raise ConfigError(
-                    f"worker {worker} has semstab {version}, this process has {own}; install the same version on both"
+                    f"worker {worker} has semstab {version}, this process has {own_version}; install the same version"
+                    " on both"
                 )
 
 

@@ -79,10 +79,10 @@ def require_output(path: str | Path, inputs: Iterable[str | Path | None] = ()) -
     real = path.resolve()
     for folder in real.parents:
         parts = real.relative_to(folder).parts
-        own = (parts[0] in WRITTEN and len(parts) > 1) or (real.name in OWN_FILES and len(parts) == 1)
-        if own and (folder / SETTINGS).is_file() and _holds_run(folder):
+        is_run_file = (parts[0] in WRITTEN and len(parts) > 1) or (real.name in OWN_FILES and len(parts) == 1)
+        if is_run_file and (folder / SETTINGS).is_file() and _holds_run(folder):
             raise ConfigError(f"{path}: is a file of the run in this folder; name another file")
-    if any(real == Path(given).resolve() for given in inputs if given is not None):
+    if any(real == Path(input_path).resolve() for input_path in inputs if input_path is not None):
         raise ConfigError(f"{path}: is also read; name another file")
 
 
@@ -94,15 +94,17 @@ def _holds_run(folder: Path) -> bool:
 
 def require_file_names(out: Path, units: Iterable[UnitName]) -> None:
     """Raise ConfigError where two units' files would share a name, or one is too long for the file system."""
-    there = next(folder for folder in (out.absolute(), *out.absolute().parents) if folder.is_dir())
-    longest = os.pathconf(there, "PC_NAME_MAX") - len(".parquet")
-    named: dict[str, UnitName] = {}
+    existing = next(folder for folder in (out.absolute(), *out.absolute().parents) if folder.is_dir())
+    longest = os.pathconf(existing, "PC_NAME_MAX") - len(".parquet")
+    units_by_slug: dict[str, UnitName] = {}
     for unit in units:
-        other = named.setdefault(unit.slug, unit)
+        other = units_by_slug.setdefault(unit.slug, unit)
         if other != unit:
             raise ConfigError(f"{other} and {unit} would be written to one file, {unit.slug}; rename a scene or model")
         if len(os.fsencode(unit.slug)) > longest:
-            raise ConfigError(f"{there}: its file system allows no name as long as {unit.slug}; choose another --out")
+            raise ConfigError(
+                f"{existing}: its file system allows no name as long as {unit.slug}; choose another --out"
+            )
 
 
 class Folder:
@@ -138,9 +140,9 @@ class Folder:
         """Return whether the folder has a unit of a plan: of these settings and this dataset, or of this very input."""
         units = plan.distinct().values()
         if same_dataset:
-            return any(name.startswith(each.identity) for name in self._files for each in units)
+            return any(name.startswith(unit.identity) for name in self._files for unit in units)
         with contextlib.suppress(DataError):
-            return any(each.key in self._files for each in units)
+            return any(unit.key in self._files for unit in units)
         return False
 
     def remove_outputs(self) -> None:
@@ -284,15 +286,15 @@ class Folder:
 
 def _wanted(unit: Unit, record: Record) -> list[str]:
     """Return the files that a unit must have."""
-    name, wanted = unit.name, list[str]()
+    name, required = unit.name, list[str]()
     if unit.stored:
-        wanted += (_in_tiles(record) or [f"{VOXELS}/{name.slug}.parquet"]) if unit.fuses else []
-        wanted.append(f"{FRAMES}/{name.slug}.csv")
+        required += (_in_tiles(record) or [f"{VOXELS}/{name.slug}.parquet"]) if unit.fuses else []
+        required.append(f"{FRAMES}/{name.slug}.csv")
     if unit.stored and unit.assessed:
-        wanted.append(f"{SUMS}/{name.slug}.parquet")
+        required.append(f"{SUMS}/{name.slug}.parquet")
     if unit.stored and unit.config.events and keeps_log(name.backend):
-        wanted += _in_tiles(record, EVENTS) or [f"{EVENTS}/{name.slug}.parquet"]
-    return wanted + ([f"{OVERVIEW}/{slug(name.scene, name.model)}.npz"] if unit.image_space else [])
+        required += _in_tiles(record, EVENTS) or [f"{EVENTS}/{name.slug}.parquet"]
+    return required + ([f"{OVERVIEW}/{slug(name.scene, name.model)}.npz"] if unit.image_space else [])
 
 
 def _models_in(folder: Path) -> set[str]:
@@ -308,9 +310,9 @@ def _are(names: Sequence[str]) -> str:
     return f"{', '.join(names)} {'is' if len(names) == 1 else 'are'}"
 
 
-def _in_tiles(record: Record, of: str = VOXELS) -> list[str]:
+def _in_tiles(record: Record, kind: str = VOXELS) -> list[str]:
     """Return the files of a record's tiles; none of a map that is in one file."""
-    return [name for name in record.files if name.startswith(f"{of}/{record.unit.slug}/")]
+    return [name for name in record.files if name.startswith(f"{kind}/{record.unit.slug}/")]
 
 
 def run_and_model(named: str | os.PathLike[str]) -> tuple[Path, str | None]:
@@ -326,10 +328,10 @@ def model_of(named: str | os.PathLike[str], model: str | None) -> tuple[Path, st
     Raises:
         ConfigError: If both name one, and not the same.
     """
-    folder, own = run_and_model(named)
-    if own is not None and model not in (None, own):
-        raise ConfigError(f"{folder}:{own}: --model {model} names another model; use one of the two")
-    return folder, model if own is None else own
+    folder, stated = run_and_model(named)
+    if stated is not None and model not in (None, stated):
+        raise ConfigError(f"{folder}:{stated}: --model {model} names another model; use one of the two")
+    return folder, model if stated is None else stated
 
 
 def load_result(folder: str | Path) -> Result:
@@ -425,14 +427,16 @@ def _first_change(old: Mapping[str, Any], new: Mapping[str, Any], prefix: str = 
     """Return the first setting that differs, with both values; not what a run may add: scenes, models, ..."""
     left_out = set() if prefix else {"name", "description", "scenes", "models", "backends", "sweeps"}
     for key in (key for key in old if key in new and key not in left_out):
-        there, here, name = old[key], new[key], f"{prefix}{key}"
-        if isinstance(there, list) and isinstance(here, list):
-            there, here = ({str(k): item for k, item in enumerate(each)} for each in (there, here))
-            if len(there) != len(here):
-                return f"{name}: {len(there)} there, {len(here)} here"
-        if isinstance(there, dict) and isinstance(here, dict):
-            if change := _first_change(there, here, f"{name}."):
+        old_value, new_value, name = old[key], new[key], f"{prefix}{key}"
+        if isinstance(old_value, list) and isinstance(new_value, list):
+            old_value, new_value = (
+                {str(k): item for k, item in enumerate(values)} for values in (old_value, new_value)
+            )
+            if len(old_value) != len(new_value):
+                return f"{name}: {len(old_value)} there, {len(new_value)} here"
+        if isinstance(old_value, dict) and isinstance(new_value, dict):
+            if change := _first_change(old_value, new_value, f"{name}."):
                 return change
-        elif there != here:
-            return f"{name}: {there} there, {here} here"
+        elif old_value != new_value:
+            return f"{name}: {old_value} there, {new_value} here"
     return None

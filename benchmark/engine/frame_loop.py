@@ -32,18 +32,18 @@ def run_job(job: Job, observers: Observers | None = None) -> Iterator[Work]:
 
     Observers see the works that are computed in their process.
     """
-    left = [*job]
+    unfinished = [*job]
     try:
         scene = _scene(job[0])
         for work in (work for work in job if work.unit.regions):
             yield _measured_regions(scene, work)
-            left.remove(work)
-        while left:
-            fusion = Fusion(scene, left, observers or Observers())
+            unfinished.remove(work)
+        while unfinished:
+            fusion = Fusion(scene, unfinished, observers or Observers())
             yield from fuse_sequence(fusion)
-            left = fusion.put_off
+            unfinished = fusion.put_off
     except Exception as error:  # noqa: BLE001 - whatever happens to a job is reported, and the other jobs continue
-        yield from (work.failed(error) for work in left)
+        yield from (work.failed(error) for work in unfinished)
 
 
 def fuse_sequence(fusion: Fusion) -> Iterator[Work]:
@@ -99,17 +99,23 @@ class Fusion:
     def decoded_frames(self) -> Generator[Fetched[Decodings], None, None]:
         """Yield frames in order, decoded ahead by threads."""
         fetched = prefetch(
-            self._decode, self.order, threads=self._threads, size=lambda each: sum(own.nbytes for own in _of(each))
+            self._decode,
+            self.order,
+            threads=self._threads,
+            size=lambda decodings: sum(decoded.nbytes for decoded in _of(decodings)),
         )
         with contextlib.ExitStack() as stack:
             for model in dict.fromkeys(stream.task.model for stream in self.streams):
                 stack.enter_context(self._scene.reading(self.order, model))
-            for each in stack.enter_context(contextlib.closing(fetched)):
-                in_network = min(each.waited, sum(own.network for own in _of(each.item) if own.network > 0))
-                self.watch.seconds["read"] += each.waited - in_network
+            for fetched_frame in stack.enter_context(contextlib.closing(fetched)):
+                in_network = min(
+                    fetched_frame.waited,
+                    sum(decoded.network for decoded in _of(fetched_frame.item) if decoded.network > 0),
+                )
+                self.watch.seconds["read"] += fetched_frame.waited - in_network
                 if in_network:
                     self.watch.seconds["network"] += in_network
-                yield each
+                yield fetched_frame
 
     def _decode(self, index: int) -> Decodings:
         """Decode a frame in a worker thread, with the labels of each model; its image and truth are decoded once."""
@@ -117,21 +123,21 @@ class Fusion:
         color = self._observers.want_color or any(stream.wants_color or stream.shown == index for stream in wanting)
         decodings: dict[str, Decoded | Exception] = {}
         for model in dict.fromkeys(stream.task.model for stream in wanting):
-            own = [stream for stream in wanting if stream.task.model == model]
-            known = next(_of(decodings), None)
-            decodings[model] = self._decoded(index, model, own, known, color=color)
+            model_streams = [stream for stream in wanting if stream.task.model == model]
+            decoded_before = next(_of(decodings), None)
+            decodings[model] = self._decoded(index, model, model_streams, decoded_before, color=color)
         return decodings
 
     def _decoded(
-        self, index: int, model: str, wanting: Sequence[Stream], known: Decoded | None, *, color: bool
+        self, index: int, model: str, wanting: Sequence[Stream], decoded_before: Decoded | None, *, color: bool
     ) -> Decoded | Exception:
         """Decode a model's frame; an error fails the units that need the frame, not those that do not."""
-        scene, same = self._scene, None if known is None else known.frame
+        scene, shared_frame = self._scene, None if decoded_before is None else decoded_before.frame
         try:
-            frame = scene.frame(index, model, color=color and same is None)
-            frame = frame if same is None else replace(frame, color=same.color)
-            truth = None if known is None else known.truth
-            if known is None and any(stream.truth_task is not None for stream in wanting):
+            frame = scene.frame(index, model, color=color and shared_frame is None)
+            frame = frame if shared_frame is None else replace(frame, color=shared_frame.color)
+            truth = None if decoded_before is None else decoded_before.truth
+            if decoded_before is None and any(stream.truth_task is not None for stream in wanting):
                 truth = _ground_truth(scene, index)
             measures_quality = any(stream.quality is not None for stream in wanting)
             name = scene.filtering(model).model if measures_quality else model  # without filters
@@ -176,7 +182,7 @@ class Fusion:
 
 def _of(decodings: Decodings) -> Iterator[Decoded]:
     """Yield what could be decoded."""
-    return (each for each in decodings.values() if isinstance(each, Decoded))
+    return (decoded for decoded in decodings.values() if isinstance(decoded, Decoded))
 
 
 # --- Open scenes ------------------------------------------------------------------------------------------------------
@@ -246,5 +252,5 @@ def _region_frames(scene: Scene, work: Work) -> Iterator[Frame]:
 
     fetched = prefetch(decode, work.frames, threads=work.start.threads, size=lambda frame: frame.nbytes)
     with contextlib.closing(fetched):
-        for each in fetched:
-            yield each.item
+        for fetched_frame in fetched:
+            yield fetched_frame.item

@@ -89,9 +89,9 @@ class LiveMap:
             if unit.compares_truth and truth_task(task) is not None:
                 live.truth = live.new_map(log=False, by_rule=False)
             if unit.sampled:
-                whole = not is_builtin(config.backends[0].name)
+                all_voxels = not is_builtin(config.backends[0].name)
                 ruled = config.backends[0].ruled
-                live.reference = NumpySample(config.voxel_size, K, work.within, whole=whole, **ruled)
+                live.reference = NumpySample(config.voxel_size, K, work.within, whole=all_voxels, **ruled)
         if unit.assessed and work.measures_images:
             live.sampler = Sampler(K, moving=config.moving == "tell" and scene.surface is None)
         return live
@@ -113,8 +113,8 @@ class LiveMap:
         """
         config, (backend,), K = self.config, self.config.backends, len(self.task.mapping.target)
         backend = backend if by_rule else backend.fusing_by("mean")
-        wanted = log and (config.events or config.statistics) and takes_option(backend.name, "history")
-        options = ({"history": True} if wanted else {}) | backend.options
+        keeps_history = log and (config.events or config.statistics) and takes_option(backend.name, "history")
+        options = ({"history": True} if keeps_history else {}) | backend.options
         return create(backend.name, voxel_size=config.voxel_size, num_classes=K, within=self.work.within, **options)
 
     def warm_up(self, frame: Frame) -> None:
@@ -273,8 +273,8 @@ class Stream:
             truth = prepare(self.truth_task, decoded.truth, self.pixel_stride)
         if decoded.frame.index == self.shown:
             self.overview = _overview(self.task, decoded.frame)
-            wanted = self._observers.want_color or self.wants_color
-            frame = frame if wanted else dataclasses.replace(frame, color=None)
+            needs_color = self._observers.want_color or self.wants_color
+            frame = frame if needs_color else dataclasses.replace(frame, color=None)
         seconds, waited = fetched.seconds, fetched.waited
         return dataclasses.replace(decoded, frame=frame, truth=truth, seconds=seconds, waited=waited)
 
@@ -336,16 +336,16 @@ def streams_of(maps: Iterable[LiveMap], watch: Stopwatch, observers: Observers) 
     flows = Flows()
     for live in maps:
         config = live.config
-        same = (config.taxonomy, config.exclude, config.perturbation, config.pixel_stride, config.top_k)
+        shared_settings = (config.taxonomy, config.exclude, config.perturbation, config.pixel_stride, config.top_k)
         frames = None if live.work.within is not None else live.frames
-        groups.setdefault((live.name.model, *same, frames), []).append(live)
+        groups.setdefault((live.name.model, *shared_settings, frames), []).append(live)
     return [Stream(group, watch, observers, flows) for group in groups.values()]
 
 
 def frame_order(streams: Iterable[Stream]) -> Sequence[int]:
     """Return the frames of all of them."""
-    first, *others = {stream.frames for stream in streams} or {range(0)}
-    return first if isinstance(first, range) and not others else sorted({*first}.union(*others))
+    first, *rest = {stream.frames for stream in streams} or {range(0)}
+    return first if isinstance(first, range) and not rest else sorted({*first}.union(*rest))
 
 
 def _as_set(frames: Iterable[int]) -> range | frozenset[int]:

@@ -83,11 +83,11 @@ def finish(live: LiveMap, stream: Stream, watch: Stopwatch) -> Work:
     fused = _fused_map(live, watch) if work.fuses else None
     observations, sums, sample, analysis = live.sampled_observations(), dict[str, Float64](), None, None
     features = live.sampled_features()
-    with contextlib.closing(live.background), contextlib.closing(Background("semstab-files", 1)) as beside:
+    with contextlib.closing(live.background), contextlib.closing(Background("semstab-files", 1)) as writer:
         if fused is not None and tile is None and not len(fused.table):
             raise no_voxels(live.task, config)
         if fused is not None and not config.statistics:  # else columns of the statistics go along
-            beside.submit(partial(files.write, _map_savers(live, fused, None)))
+            writer.submit(partial(files.write, _map_savers(live, fused, None)))
         with watch("statistics"):
             if fused is not None and work.unit.assessed:
                 log = fused.events if config.statistics else None
@@ -123,7 +123,7 @@ def finish(live: LiveMap, stream: Stream, watch: Stopwatch) -> Work:
                     pixels, of_frames = pixel_statistics(live.task, stream.pixels)
                     record = replace(record, pixels=pixels)
         with watch("write"):
-            beside.drain()
+            writer.drain()
             files.write(_savers(live, stream, fused, observations, features, sample, analysis, of_frames))
             if fused is not None and config.statistics:
                 files.write(_map_savers(live, fused, analysis))
@@ -176,13 +176,13 @@ def _check_evidence(table: VoxelTable, name: UnitName) -> None:
     """Raise DataError where a backend's evidence of a voxel does not sum to its OP, or to the weight that it states."""
     stated, what = (table.op, "OP") if table.weight is None else (table.weight, "weight")
     starts, _, weight = table.evidence.entries
-    for some in stretches(len(table)):
-        first, op = starts[some], stated[some]
-        total, filled = np.zeros(len(op)), starts[some.start + 1 : some.stop + 1] > first
-        total[filled] = np.add.reduceat(weight[: starts[some.stop]], first[filled]) if filled.any() else 0.0
+    for rows in stretches(len(table)):
+        first, op = starts[rows], stated[rows]
+        total, filled = np.zeros(len(op)), starts[rows.start + 1 : rows.stop + 1] > first
+        total[filled] = np.add.reduceat(weight[: starts[rows.stop]], first[filled]) if filled.any() else 0.0
         wrong = np.flatnonzero(~((np.abs(total - op) <= OF_OP * op) & (op > 0)))
         if len(wrong):
-            row = some.start + wrong[0]
+            row = rows.start + wrong[0]
             voxel = ", ".join(str(axis[row]) for axis in (table.ix, table.iy, table.iz))
             raise DataError(
                 f"{name.scene}, {name.model}: backend '{name.backend}': the evidence of voxel ({voxel}) sums to"
@@ -233,15 +233,15 @@ def pixel_statistics(task: Task, meter: VideoFlickerMeter) -> tuple[PixelStatist
             " and the taxonomy"
         )
     share, largest = meter.pixels / total, int(meter.pixels.argmax())
-    known = [own for own in meter.lone if own.pixels]
-    alone = np.array([own.share for own in known], np.float64)
-    frames, places = (np.array([*each], np.int64) for each in ((o.frame for o in known), (o.pixels for o in known)))
-    lone = LoneDisagreement(frames, places, alone, np.full(len(alone), mean(alone)))
-    outlying = outlying_frames(lone, len(known), name=task.scene.frame_name)
-    found = PixelStatistics(
+    rows = [row for row in meter.lone if row.pixels]
+    lone_shares = np.array([row.share for row in rows], np.float64)
+    frames, places = (np.array([*column], np.int64) for column in ((o.frame for o in rows), (o.pixels for o in rows)))
+    disagreement = LoneDisagreement(frames, places, lone_shares, np.full(len(lone_shares), mean(lone_shares)))
+    outlying = outlying_frames(disagreement, len(rows), name=task.scene.frame_name)
+    statistics = PixelStatistics(
         meter.size, tuple(classes), outlying, classes[largest], float(share[largest]), float(1 / (share**2).sum())
     )
-    return found, by_frame(lone, outlying)
+    return statistics, by_frame(disagreement, outlying)
 
 
 def _quality(stream: Stream) -> FrameQuality | None:
@@ -266,9 +266,9 @@ def _checked(live: LiveMap, table: VoxelTable, reference: NumpySample, watch: St
     with watch("reference"):
         expected, one_in = replace(reference.table(), classes=table.classes), reference.one_in
         some_in = [in_sample(np.stack([table.ix[s], table.iy[s], table.iz[s]]), one_in) for s in stretches(len(table))]
-        drawn = rows_of(table, np.concatenate(some_in))
+        sampled_table = rows_of(table, np.concatenate(some_in))
         units = (live.name, replace(live.name, backend="numpy"))
-        return replace(compare(drawn, expected, units, tolerance=live.config.tolerance), one_in=one_in)
+        return replace(compare(sampled_table, expected, units, tolerance=live.config.tolerance), one_in=one_in)
 
 
 def record_of(unit: Unit, task: Task, rows: Series, result: TileResult, analysis: Analysis | None) -> Record:
@@ -373,20 +373,20 @@ def _map_savers(live: LiveMap, fused: FusedMap, analysis: Analysis | None) -> Sa
     config, tile, unit, of_unit, savers = live.config, live.work.tile, live.work.unit, live.name.slug, Savers()
     if not unit.stored or not len(fused.table):
         return savers
-    own = None if tile is None or tile.index is None else Tile(*tile.index, tile.size, tile.key)
+    map_tile = None if tile is None or tile.index is None else Tile(*tile.index, tile.size, tile.key)
 
     def path(folder: str, *, waits: bool) -> str:
-        if tile is None or own is None:
+        if tile is None or map_tile is None:
             return f"{folder}/{of_unit}.parquet"
-        return f"{tile.folder}/{folder}/{own.name}" if waits else f"{folder}/{of_unit}/{own.name}"
+        return f"{tile.folder}/{folder}/{map_tile.name}" if waits else f"{folder}/{of_unit}/{map_tile.name}"
 
     columns = analysis.columns(fused.table, fused.truth) if config.statistics and analysis is not None else {}
     voxels = path(VOXELS, waits=config.statistics and unit.assessed)
-    savers[voxels] = partial(save_voxels, fused.table, columns=columns, tile=own)
+    savers[voxels] = partial(save_voxels, fused.table, columns=columns, tile=map_tile)
     if fused.events is not None and config.events:
-        savers[path(EVENTS, waits=False)] = partial(fused.events.save, tile=own)
-    if fused.truth is not None and (unit.image_space if own is None else len(fused.truth)):
-        savers[path(TRUTH, waits=not unit.image_space)] = partial(fused.truth.save, tile=own)
+        savers[path(EVENTS, waits=False)] = partial(fused.events.save, tile=map_tile)
+    if fused.truth is not None and (unit.image_space if map_tile is None else len(fused.truth)):
+        savers[path(TRUTH, waits=not unit.image_space)] = partial(fused.truth.save, tile=map_tile)
     return savers
 
 
@@ -420,16 +420,16 @@ def pictures_of_outlying(task: Task, config: Config, of_frames: OfFrames) -> dic
 
     A frame is held against those of the run before and after it, the first and the last one against the two nearest.
     """
-    excess = {k: own["lone_percent"] - own["lone_null_percent"] for k, own in of_frames.items() if own.get("outlying")}
+    excess = {k: row["lone_percent"] - row["lone_null_percent"] for k, row in of_frames.items() if row.get("outlying")}
     outlying = sorted(excess, key=lambda frame: -excess[frame])
     pictures, posed = list[LonePicture](), task.scene.posed
     for frame in () if task.scene.of_scans else outlying[:PICTURED]:
-        at = task.indices.index(frame)
-        start = min(max(at - 1, 0), len(task.indices) - 3)
-        beside = [task.indices[k] for k in range(start, start + 3) if k != at]
-        others = [read(task, index, config.pixel_stride, color=not posed) for index in beside]
+        position = task.indices.index(frame)
+        start = min(max(position - 1, 0), len(task.indices) - 3)
+        neighbours = [task.indices[k] for k in range(start, start + 3) if k != position]
+        neighbour_frames = [read(task, index, config.pixel_stride, color=not posed) for index in neighbours]
         hold = lone_picture if posed else video_picture
-        pictures.append(hold(read(task, frame, config.pixel_stride, color=True), others))
+        pictures.append(hold(read(task, frame, config.pixel_stride, color=True), neighbour_frames))
     return picture_arrays(pictures)
 
 
@@ -470,5 +470,5 @@ def save_voxels(
     table: VoxelTable, path: Path, columns: Mapping[str, npt.NDArray[Any]] | None = None, tile: Tile | None = None
 ) -> None:
     """Write a voxel table together with its measures, and further columns (n,) by name."""
-    own = {measure.key: measure.of for measure in measures()}
-    table.save(path, columns, {**own, "label": dominant}, tile)
+    measure_columns = {measure.key: measure.of for measure in measures()}
+    table.save(path, columns, {**measure_columns, "label": dominant}, tile)

@@ -59,24 +59,26 @@ class MapMemory:
 
     def growing(self, voxels: float, observations: float) -> float:
         """Return the bytes of a map, of that of the ground truth or of reduced scores, and of the reference."""
-        n, seen = int(voxels), int(observations)
-        total = expected_bytes(self.backend, n, seen, self.K, soft=self.soft)
-        total += (self.compared + self.soft) * expected_bytes(self.backend, n, seen, self.K)
+        n, num_observations = int(voxels), int(observations)
+        total = expected_bytes(self.backend, n, num_observations, self.K, soft=self.soft)
+        total += (self.compared + self.soft) * expected_bytes(self.backend, n, num_observations, self.K)
         if is_builtin(self.backend):
             return total + self.sampled * expected_bytes("numpy", n // ONE_IN, 0, self.K)
-        whole = min(n, MOST_OF_ALL)
-        return total + self.sampled * expected_bytes("numpy", whole, seen * whole // max(n, 1), self.K, soft=self.soft)
+        reference_voxels = min(n, MOST_OF_ALL)
+        return total + self.sampled * expected_bytes(
+            "numpy", reference_voxels, num_observations * reference_voxels // max(n, 1), self.K, soft=self.soft
+        )
 
     def tables(self, voxels: float, observations: float) -> float:
         """Return the bytes of its tables and of its log."""
-        n, seen = int(voxels), int(observations)
+        n, num_observations = int(voxels), int(observations)
         tables = (1 + self.compared) * table_bytes(n, self.K, soft=self.soft)
-        return tables + self.logged * log_bytes(seen, self.K, soft=self.soft)
+        return tables + self.logged * log_bytes(num_observations, self.K, soft=self.soft)
 
     def statistics(self, voxels: float) -> float:
         """Return the bytes that statistics take beyond the tables: columns of voxels, and a stretch of scores."""
-        drawn = min(int(voxels), MOST_VOXELS)
-        return 160 * drawn + self.soft * 40 * min(self.K * drawn, STRETCH_ENTRIES)
+        sampled_voxels = min(int(voxels), MOST_VOXELS)
+        return 160 * sampled_voxels + self.soft * 40 * min(self.K * sampled_voxels, STRETCH_ENTRIES)
 
     def whole(self, voxels: float, observations: float) -> float:
         """Return the bytes of a map and its tables, while they are made of it or measured."""
@@ -92,11 +94,15 @@ class MapMemory:
         That is a tile beside the voxels that are drawn from those before it, these twice while they are joined, or the
         statistics of the voxels that are drawn from all of them.
         """
-        seen, drawn = observations / max(voxels, 1.0), min(voxels, MOST_VOXELS)
-        held = min(voxels, 2 * drawn)
-        parts = self.tables(held, seen * held)
-        tile = self.tile(tile_voxels, seen * tile_voxels)
-        return max(parts + tile, 2 * parts, self.tables(drawn, seen * drawn) + self.statistics(drawn))
+        per_voxel, sampled_voxels = observations / max(voxels, 1.0), min(voxels, MOST_VOXELS)
+        held = min(voxels, 2 * sampled_voxels)
+        parts = self.tables(held, per_voxel * held)
+        tile = self.tile(tile_voxels, per_voxel * tile_voxels)
+        return max(
+            parts + tile,
+            2 * parts,
+            self.tables(sampled_voxels, per_voxel * sampled_voxels) + self.statistics(sampled_voxels),
+        )
 
 
 def log_bytes(observations: int, num_classes: int, *, soft: bool) -> int:
@@ -156,10 +162,10 @@ class Sizing:
 def planned_sizes(config: Config, missing: Iterable[Unit], width: int) -> Sizing:
     """Estimate the units that are to be fused; where one cannot be read, its computation reports the error."""
     sizing, together = Sizing(), dict[object, list[Unit]]()
-    for each in missing:
-        if each.fuses:  # watched units of a sequence are in memory together; others can be put off
-            key = (each.name.scene, each.name.model) if each.stored else each.identity
-            together.setdefault(key, []).append(each)
+    for unit in missing:
+        if unit.fuses:  # watched units of a sequence are in memory together; others can be put off
+            key = (unit.name.scene, unit.name.model) if unit.stored else unit.identity
+            together.setdefault(key, []).append(unit)
     for group in together.values():
         try:
             _plan_sizes(config, group, width, sizing)
@@ -173,18 +179,18 @@ def _plan_sizes(config: Config, group: Sequence[Unit], width: int, sizing: Sizin
     why = None
     if config.tile_size == "off":
         why = "tile_size: off forbids to fuse it in tiles"
-    elif other := [each.name.backend for each in group if not is_pointwise(each.name.backend)]:
+    elif other := [unit.name.backend for unit in group if not is_pointwise(unit.name.backend)]:
         why = f"backend '{other[0]}' cannot be restricted to tiles"
     if isinstance(config.tile_size, int):
         if why is not None:
             raise ConfigError(f"tile_size = {config.tile_size}: {why}")
-        sizing.tile_sizes |= {each.identity: config.tile_size for each in group}
+        sizing.tile_sizes |= {unit.identity: config.tile_size for unit in group}
         return
     first = _geometry(task, settings, task.indices[0])
     most = DOUBT * len(task.indices) * len(voxels_in(first.every(2), settings.voxel_size))
     for soft in (True, False):  # if scores would fit, no label is decoded to know, which a network may have to predict
         free = available_for_maps(config, width, process_bytes(first, K, settings.threads, soft=soft))
-        kinds = [_kind(each, soft=soft) for each in group]
+        kinds = [_kind(unit, soft=soft) for unit in group]
         if sum(kind.whole(most, most) for kind in kinds) <= free:
             return
         if soft and read(task, task.indices[0], settings.pixel_stride).scores is not None:
@@ -198,15 +204,15 @@ def _plan_sizes(config: Config, group: Sequence[Unit], width: int, sizing: Sizin
         f" would take {needed / GB:.2g} GB"
     )
     if why is not None:
-        there = f"{free / GB:.2g} GB " + ("are free for it" if config.memory_gb is None else "is memory_gb")
+        free_text = f"{free / GB:.2g} GB " + ("are free for it" if config.memory_gb is None else "is memory_gb")
         line = (
-            f"{takes}, and {there}; use larger voxels (voxel_size), fewer frames (frames), a larger pixel_stride"
+            f"{takes}, and {free_text}; use larger voxels (voxel_size), fewer frames (frames), a larger pixel_stride"
             f"{_without(group, settings)}; or set memory_gb to try anyway ({why})"
         )
-        sizing.refused |= {each.identity: line for each in group}
+        sizing.refused |= {unit.identity: line for unit in group}
         return
     edges = [_tile_edge(kind, size, SHARE * free, width) for kind in kinds]
-    sizing.tile_sizes |= {each.identity: edge for each, edge in zip(group, edges, strict=True)}
+    sizing.tile_sizes |= {unit.identity: edge for unit, edge in zip(group, edges, strict=True)}
     tiles = max(
         kind.tiles(size.voxels, size.observations, size.of_tile(edge)) for kind, edge in zip(kinds, edges, strict=True)
     )
@@ -232,7 +238,7 @@ def _kind(unit: Unit, *, soft: bool) -> MapMemory:
 
 
 def _without(group: Sequence[Unit], settings: Config) -> str:
-    backends = [each.name.backend for each in group]
+    backends = [unit.name.backend for unit in group]
     keep_all = [name for name in backends if expected_bytes(name, 1, 2, 2) > expected_bytes(name, 1, 1, 2)]
     without = f", no backend that keeps every observation ({', '.join(keep_all)})" if keep_all else ""
     return without + (", no statistics" if settings.statistics else "")
@@ -271,34 +277,38 @@ def map_size(task: Task, settings: Config) -> MapSize:
     There are no more voxels than if each frame added as many as the second one of two successive frames adds to the
     first.
     """
-    frames, seen, one_in = len(task.indices), dict[int, Int32](), 0
+    frames, voxels_of_frame, one_in = len(task.indices), dict[int, Int32](), 0
     sampled = evenly(frames, SAMPLED)
     following = [k + 1 for k in sampled[:: -(-len(sampled) // PAIRS)] if k + 1 < frames]
-    wanted = sorted({*sampled, *following})
-    ahead = prefetch(lambda k: _geometry(task, settings, task.indices[k]), wanted, threads=settings.threads)
-    for k, fetched in zip(wanted, ahead, strict=True):
-        whole = voxels_in(fetched.item, settings.voxel_size)
-        one_in = one_in or max(1, len(whole) // DRAWN)
-        seen[k] = _drawn(whole, one_in)
-    own = [seen[k] for k in sampled]
-    together = np.concatenate(own)
+    positions = sorted({*sampled, *following})
+    ahead = prefetch(lambda k: _geometry(task, settings, task.indices[k]), positions, threads=settings.threads)
+    for k, fetched in zip(positions, ahead, strict=True):
+        frame_voxels = voxels_in(fetched.item, settings.voxel_size)
+        one_in = one_in or max(1, len(frame_voxels) // DRAWN)
+        voxels_of_frame[k] = _drawn(frame_voxels, one_in)
+    sampled_voxels = [voxels_of_frame[k] for k in sampled]
+    together = np.concatenate(sampled_voxels)
     distinct, columns = count_distinct(together), count_distinct(together[:, :2])
-    each = float(np.mean([len(voxels) for voxels in own]))
-    new = [_count((seen[k - 1], seen[k])) - len(seen[k - 1]) for k in following]
-    most = each + (frames - 1) * (float(np.mean(new)) if new else 0.0)
-    voxels = max(float(distinct), min(_of_all_frames(own, distinct, frames), most))
-    return MapSize(one_in * voxels, one_in * frames * each, distinct / max(columns, 1))
+    mean_voxels = float(np.mean([len(voxels) for voxels in sampled_voxels]))
+    new = [_count((voxels_of_frame[k - 1], voxels_of_frame[k])) - len(voxels_of_frame[k - 1]) for k in following]
+    most = mean_voxels + (frames - 1) * (float(np.mean(new)) if new else 0.0)
+    voxels = max(float(distinct), min(_of_all_frames(sampled_voxels, distinct, frames), most))
+    return MapSize(one_in * voxels, one_in * frames * mean_voxels, distinct / max(columns, 1))
 
 
-def _of_all_frames(seen: Sequence[Int32], distinct: int, frames: int) -> float:
+def _of_all_frames(frame_voxels: Sequence[Int32], distinct: int, frames: int) -> float:
     """Return the number of voxels that `frames` frames see.
 
-    `seen` has the voxels that each frame of a sample sees, `distinct` together. The more frames, the fewer voxels are
-    new: a quarter, a half and all of the sample give the factor from the voxels of one doubling of the frames to the
-    voxels of the next.
+    `frame_voxels` has the voxels that each frame of a sample sees, `distinct` together. The more frames, the fewer
+    voxels are new: a quarter, a half and all of the sample give the factor from the voxels of one doubling of the
+    frames to the voxels of the next.
     """
-    quarter, half, voxels = _count(seen[::4]), _count(seen[::2]), float(distinct)
-    factor, added, reached = min((distinct - half) / max(half - quarter, 1), 2.0), float(distinct - half), len(seen)
+    quarter, half, voxels = _count(frame_voxels[::4]), _count(frame_voxels[::2]), float(distinct)
+    factor, added, reached = (
+        min((distinct - half) / max(half - quarter, 1), 2.0),
+        float(distinct - half),
+        len(frame_voxels),
+    )
     while reached < frames:
         added *= factor
         voxels += added * min(1.0, math.log2(frames / reached))
@@ -309,12 +319,12 @@ def _of_all_frames(seen: Sequence[Int32], distinct: int, frames: int) -> float:
 def _drawn(voxels: Int64, one_in: int) -> Int32:
     """Return the voxels of a fixed random sample of columns, one in `one_in`; each column is taken whole."""
     places = voxels[:, 0] * 0x9E3779B1 + voxels[:, 1] * 0x85EBCA77  # that are drawn lie evenly, without a grid
-    drawn: Int32 = voxels[(places >> 16) % one_in == 0].astype(np.int32)
-    return drawn
+    sample: Int32 = voxels[(places >> 16) % one_in == 0].astype(np.int32)
+    return sample
 
 
-def _count(seen: Sequence[Int32]) -> int:
-    return count_distinct(np.concatenate(seen)) if seen else 0
+def _count(frame_voxels: Sequence[Int32]) -> int:
+    return count_distinct(np.concatenate(frame_voxels)) if frame_voxels else 0
 
 
 def _geometry(task: Task, settings: Config, index: int) -> Frame:

@@ -42,8 +42,13 @@ def pictures_of_places(task: Task, places: Sequence[Place], pixel_stride: int) -
                 rows.append((place.number, place.centre, view.frame, *cut))
     if not rows:
         return {}
-    numbers, centres, shown, labels, color, rings = zip(*rows, strict=True)
-    arrays = {"of": np.array(numbers), "centre": np.array(centres), "frame": np.array(shown), "ring": np.array(rings)}
+    numbers, centres, frame_indices, labels, color, rings = zip(*rows, strict=True)
+    arrays = {
+        "of": np.array(numbers),
+        "centre": np.array(centres),
+        "frame": np.array(frame_indices),
+        "ring": np.array(rings),
+    }
     arrays |= {"labels": np.stack(labels)}
     arrays |= {} if any(image is None for image in color) else {"color": np.stack(color)}
     return {f"place_{name}": values for name, values in arrays.items()}
@@ -54,18 +59,18 @@ def chosen_frames(places: Sequence[Place]) -> set[int]:
     chosen = set[int]()
     for place in places:
         for label in (place.label, place.other):
-            own = [view for view in place.views if view.label == label]
-            if own and len(chosen) < READ and not any(view.frame in chosen for view in own):
-                chosen.add(max(own, key=lambda view: view.spots).frame)
+            class_views = [view for view in place.views if view.label == label]
+            if class_views and len(chosen) < READ and not any(view.frame in chosen for view in class_views):
+                chosen.add(max(class_views, key=lambda view: view.spots).frame)
     return chosen
 
 
 def pictured_views(place: Place, chosen: set[int]) -> list[PlaceView]:
     """Return the views of a place among the chosen frames, with one of each class first."""
-    known = sorted((view for view in place.views if view.frame in chosen), key=lambda view: -view.spots)
-    first = {view.label: view for view in reversed(known)}
-    different = [view for view in known if first[view.label] is view]
-    return [*different, *(view for view in known if view not in different)][:EACH]
+    candidates = sorted((view for view in place.views if view.frame in chosen), key=lambda view: -view.spots)
+    first = {view.label: view for view in reversed(candidates)}
+    different = [view for view in candidates if first[view.label] is view]
+    return [*different, *(view for view in candidates if view not in different)][:EACH]
 
 
 def cut_out(
@@ -99,7 +104,9 @@ def _color(frame: Frame, x: int, y: int, edge: int) -> npt.NDArray[Any] | None:
     """Return the colour (EDGE, EDGE, 3) of a square of the frame's pixels."""
     if frame.color is None:
         return None
-    down, across = (there / own for there, own in zip(frame.color.shape[:2], frame.shape, strict=True))
+    down, across = (
+        color_size / frame_size for color_size, frame_size in zip(frame.color.shape[:2], frame.shape, strict=True)
+    )
     rows, columns = (
         slice(round(start * by), max(round(start * by) + 1, round((start + edge) * by)))
         for start, by in ((y, down), (x, across))

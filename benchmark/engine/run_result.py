@@ -52,7 +52,7 @@ class UnitResults:
 def result_of(plan: Plan, folder: Folder, units: UnitResults) -> Result:
     """Return the result of all units that there are: how backends agree."""
     config = plan.config
-    finished = [(unit, kept) for unit in plan.units if isinstance(kept := units.records.get(unit.identity), Record)]
+    finished = [(unit, stored) for unit in plan.units if isinstance(stored := units.records.get(unit.identity), Record)]
     records = tuple(folder.record(unit, record) for unit, record in finished)
     tables = Tables(most=len({record.unit.backend for record in records}))
     with units.watch("agreement"):
@@ -72,9 +72,13 @@ def result_of(plan: Plan, folder: Folder, units: UnitResults) -> Result:
         failures=tuple(Failure(unit.name, unit.variation, units.errors[unit.identity]) for unit in failed),
         agreement=agreement,
         up=up,
-        georeference={name: known for name, scene in plan.scenes.items() if (known := scene.georeference) is not None},
+        georeference={
+            name: georeference
+            for name, scene in plan.scenes.items()
+            if (georeference := scene.georeference) is not None
+        },
         regions=tuple(
-            kept for unit in plan.regions if isinstance(kept := units.records.get(unit.identity), RegionFlicker)
+            flicker for unit in plan.regions if isinstance(flicker := units.records.get(unit.identity), RegionFlicker)
         ),
         compared=compared,
         advice=units.advice,
@@ -86,7 +90,9 @@ def result_of(plan: Plan, folder: Folder, units: UnitResults) -> Result:
 def advice_of(plan: Plan, records: Mapping[str, Record | RegionFlicker]) -> dict[str, VoxelAdvice]:
     """Return the voxel size's advice of each scene, from when its base units were computed."""
     base = (records.get(unit.identity) for unit in plan.units if unit.variation.sweep == BASE)
-    return {each.unit.scene: each.advice for each in base if isinstance(each, Record) and each.advice is not None}
+    return {
+        record.unit.scene: record.advice for record in base if isinstance(record, Record) and record.advice is not None
+    }
 
 
 def _notes_of(base: Sequence[Record]) -> dict[str, tuple[str, ...]]:
@@ -125,7 +131,7 @@ def _alike(config: Config, a: Record, b: Record, tables: Tables) -> Agreement:
     maps = [Tiles.open(file, VoxelTable) for record in (a, b) if (file := record.voxels_file) is not None]
     if not (a.in_tiles or b.in_tiles):
         return compare(tables.of(a), tables.of(b), units, tolerance=config.tolerance)
-    return together([compare(one, other, units, tolerance=config.tolerance) for one, other in side_by_side(maps)])
+    return together([compare(first, second, units, tolerance=config.tolerance) for first, second in side_by_side(maps)])
 
 
 # The content of manifest.json: the origin of a run's numbers.

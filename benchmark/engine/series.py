@@ -167,9 +167,9 @@ class Series:
         """Yield the rows in turn."""
         return (self[k] for k in range(len(self)))
 
-    def __getitem__(self, at: int) -> FrameRow:
+    def __getitem__(self, index: int) -> FrameRow:
         """Return a row."""
-        values: dict[str, Any] = dict(zip(NUMBERS, self._rows.row(at), strict=True))
+        values: dict[str, Any] = dict(zip(NUMBERS, self._rows.row(index), strict=True))
         values |= {name: int(values[name]) for name in INTEGERS}
         values["timestamp"] = None if math.isnan(values["timestamp"]) else values["timestamp"]
         report = FrameReport(**{name: values.pop(name) for name in REPORT})

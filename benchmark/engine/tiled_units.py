@@ -147,15 +147,15 @@ def assembled(
     if sums is None or not sums.total[2]:
         raise no_voxels(task, config)
     rows = joined_series(frames.series, [tile.series for tile in tiles])
-    seen = folder / tasks[0].folder / f"{tasks[0].size}_{TILE_OBSERVATIONS}"
-    observations = SpotObservations.load(seen) if seen.exists() else None
+    observations_file = folder / tasks[0].folder / f"{tasks[0].size}_{TILE_OBSERVATIONS}"
+    observations = SpotObservations.load(observations_file) if observations_file.exists() else None
     analysis = None
     if sample is not None:  # sums in the order of the tiles, not in that of their ends
         sample = dataclasses.replace(sample, summary=sums)
         vectors = folder / tasks[0].folder / f"{tasks[0].size}_{TILE_FEATURES}"
         features = FeatureObservations.load(vectors, observations) if vectors.exists() and observations else None
         analysis = analyse_sample(task, config, sample, observations, features)
-    files = {name: digest for each in (frames, *tiles) for name, digest in each.files.items()}
+    files = {name: digest for part in (frames, *tiles) for name, digest in part.files.items()}
     files = {name: digest for name, digest in files.items() if not name.startswith(tasks[0].folder)}
     of_frames = {} if analysis is None else analysis.of_frames()
     if (pictures := pictures_of_outlying(task, config, of_frames)) and overview_file(task) in files:
@@ -165,8 +165,8 @@ def assembled(
     if unit.stored:
         savers = unit_savers(task, rows, observations, analysis, of_frames)
         if config.statistics and analysis is not None:
-            for each in tasks:
-                savers |= _with_columns(each, unit.name.slug, analysis, folder)
+            for tile_task in tasks:
+                savers |= _with_columns(tile_task, unit.name.slug, analysis, folder)
         files |= written(start, savers)[0]
     reduced = [tile.reduced for tile in tiles if len(tile.reduced)]
     checked = [tile.checked for tile in tiles if tile.checked is not None]

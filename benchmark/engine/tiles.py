@@ -67,8 +67,8 @@ def tiles_met(frame: Frame, voxel_size: float, size: int) -> Int32:
     normal = (corners[a] - corners[b])[:, ::-1] * [1, -1]  # of each line through two corners: the hull's are among them
     reach = size / 2 * np.abs(normal).sum(axis=1) + MARGIN * np.linalg.norm(normal, axis=1)
     centre, along = (tiles + 0.5) * size @ normal.T, corners @ normal.T
-    apart = (centre + reach < along.min(axis=0)) | (centre - reach > along.max(axis=0))
-    met: Int32 = tiles[~apart.any(axis=1)].astype(np.int32)
+    separated = (centre + reach < along.min(axis=0)) | (centre - reach > along.max(axis=0))
+    met: Int32 = tiles[~separated.any(axis=1)].astype(np.int32)
     return met
 
 
@@ -126,8 +126,8 @@ class TileResult(TileMeta):
         except (DataError, ValueError):
             return None
         sums = {name[5:]: array for name, array in arrays.items() if name.startswith("sums ")}
-        own: dict[str, Any] = {name: arrays[name] for name in ARRAYS}
-        return cls(**vars(meta), **own, sums=sums)
+        contents: dict[str, Any] = {name: arrays[name] for name in ARRAYS}
+        return cls(**vars(meta), **contents, sums=sums)
 
     def tiles(self) -> dict[tuple[int, int], list[int]]:
         """Return the frames that meet each tile, in order, by its index."""
@@ -157,22 +157,24 @@ def joined_series(frames: Float64, tiles: Sequence[Float64]) -> Series:
     totals = {name: np.zeros(len(rows)) for name in MEANS}
     voxels = np.zeros(len(rows))
     for tile in tiles:
-        own = tile[:, column["frame"]]
-        at = np.searchsorted(frame, own)
+        tile_frames = tile[:, column["frame"]]
+        positions = np.searchsorted(frame, tile_frames)
         for name in (*SUMS, *SECONDS):
-            before = rows[at, column[name]]
-            rows[at, column[name]] = (np.nan_to_num(before) if name in SECONDS else before) + tile[:, column[name]]
+            before = rows[positions, column[name]]
+            rows[positions, column[name]] = (np.nan_to_num(before) if name in SECONDS else before) + tile[
+                :, column[name]
+            ]
         so_far = tile[:, column["map_voxels"]]
-        voxels += _latest(frame, own, so_far)
+        voxels += _latest(frame, tile_frames, so_far)
         for name in MEANS:
-            totals[name] += _latest(frame, own, np.where(so_far > 0, so_far * tile[:, column[name]], 0.0))
+            totals[name] += _latest(frame, tile_frames, np.where(so_far > 0, so_far * tile[:, column[name]], 0.0))
     rows[:, column["map_voxels"]] = voxels
     for name in MEANS:
         rows[:, column[name]] = totals[name] / np.where(voxels > 0, voxels, math.nan)
     return Series(rows)
 
 
-def _latest(frame: Float64, own: Float64, values: Float64) -> Float64:
+def _latest(frame: Float64, tile_frames: Float64, values: Float64) -> Float64:
     """Return (F,) the value of the last of its own frames at each frame, 0 before them."""
-    latest: Float64 = np.concatenate([np.zeros(1), values])[np.searchsorted(own, frame, side="right")]
+    latest: Float64 = np.concatenate([np.zeros(1), values])[np.searchsorted(tile_frames, frame, side="right")]
     return latest

@@ -129,8 +129,8 @@ class Unit:
 
     def merged_with(self, other: Unit) -> Unit:
         """Return the same unit as the other one, with what is wanted of either."""
-        wanted = ("image_space", "stored", "assessed", "sampled")
-        return dataclasses.replace(other, **{name: getattr(self, name) or getattr(other, name) for name in wanted})
+        flags = ("image_space", "stored", "assessed", "sampled")
+        return dataclasses.replace(other, **{name: getattr(self, name) or getattr(other, name) for name in flags})
 
 
 def unit_key(identity: str, digest: str) -> str:
@@ -154,23 +154,25 @@ class Plan:
     def distinct(self) -> dict[str, Unit]:
         """Return what is to be computed, by its identity, with all that is wanted of it anywhere."""
         distinct: dict[str, Unit] = {}
-        for each in (*self.regions, *self.units):
-            known = distinct.get(each.identity)
-            distinct[each.identity] = each if known is None else each.merged_with(known)
+        for unit in (*self.regions, *self.units):
+            earlier = distinct.get(unit.identity)
+            distinct[unit.identity] = unit if earlier is None else unit.merged_with(earlier)
         return distinct
 
     @cached_property
     def tasks(self) -> tuple[Task, ...]:
         """Each model on each scene at the base settings, with all backends that fuse it so."""
         backends: dict[tuple[str, str], list[str]] = {}
-        for each in self.units:
-            if each.variation.sweep in (BASE, BACKENDS):
-                backends.setdefault((each.name.scene, each.name.model), []).append(each.name.backend)
-        apart = tuple(backend.name for backend in self.config.fused_by() if not must_agree(backend))
+        for unit in self.units:
+            if unit.variation.sweep in (BASE, BACKENDS):
+                backends.setdefault((unit.name.scene, unit.name.model), []).append(unit.name.backend)
+        not_compared = tuple(backend.name for backend in self.config.fused_by() if not must_agree(backend))
         return tuple(
-            dataclasses.replace(each.task, backends=tuple(backends[each.name.scene, each.name.model]), apart=apart)
-            for each in self.units
-            if each.variation.sweep == BASE
+            dataclasses.replace(
+                unit.task, backends=tuple(backends[unit.name.scene, unit.name.model]), apart=not_compared
+            )
+            for unit in self.units
+            if unit.variation.sweep == BASE
         )
 
 
@@ -238,7 +240,7 @@ def _base_units(config: Config, scenes: Mapping[str, Scene]) -> Iterator[Unit]:
         settings = _base_settings(config, name, fused)
         for task in tasks_of(scene, settings):
             _check_classes(config.critical_classes, task)
-            one = settings.model_copy(update={"models": [task.model]})
+            model_settings = settings.model_copy(update={"models": [task.model]})
             if config.truth and scene.ground_truth and task.model != GROUND_TRUTH and truth_task(task) is None:
                 space, target = scene.label_space(GROUND_TRUTH), task.mapping.target
                 if target == OF_FEATURES:
@@ -253,9 +255,9 @@ def _base_units(config: Config, scenes: Mapping[str, Scene]) -> Iterator[Unit]:
                 raise ConfigError(f"{name}: there are no images for optical flow; use --video-measures depth")
             if not scene.posed:
                 _check_video(config, task)
-            wanted = {"image_space": True, "stored": True, "sampled": sampled}
-            wanted |= {"assessed": scene.posed, "fuses": scene.posed}
-            yield Unit.of(Variation(BASE), one, task, identity(one, task), **wanted)
+            flags = {"image_space": True, "stored": True, "sampled": sampled}
+            flags |= {"assessed": scene.posed, "fuses": scene.posed}
+            yield Unit.of(Variation(BASE), model_settings, task, identity(model_settings, task), **flags)
 
 
 def _check_video(config: Config, task: Task) -> None:
@@ -296,20 +298,22 @@ def _planned_regions(config: Config, scenes: Mapping[str, Scene]) -> Iterator[Un
 
 def _varied_units(config: Config, base: Sequence[Unit], scenes: Mapping[str, Scene]) -> Iterator[Unit]:
     compared: dict[str, list[str]] = {}
-    for each in base:
-        compared.setdefault(each.name.scene, []).append(each.name.model)
+    for unit in base:
+        compared.setdefault(unit.name.scene, []).append(unit.name.model)
     for variation, part, value in _variations(config):
-        for each in _restricted(base, part, variation.sweep):
-            settings = _base_settings(config, each.name.scene, [each.name.model])
+        for unit in _restricted(base, part, variation.sweep):
+            settings = _base_settings(config, unit.name.scene, [unit.name.model])
             varied = settings.model_copy(update=_changed_settings(config, variation, value, settings))
-            (task,) = tasks_of(scenes[each.name.scene], varied, compared[each.name.scene])
+            (task,) = tasks_of(scenes[unit.name.scene], varied, compared[unit.name.scene])
             _check_count(variation, task)
-            left, (backend, *_) = variation.sweep == BACKENDS, varied.backends
-            reference = left and backend.name not in [named.name for named in config.backends]
+            compares_backends, (backend, *_) = variation.sweep == BACKENDS, varied.backends
+            reference = compares_backends and backend.name not in [
+                base_backend.name for base_backend in config.backends
+            ]
             assessed = varied.statistics or not reference
-            sampled = left and _is_sampled(config, backend)
-            wanted = {"stored": left, "assessed": assessed, "sampled": sampled}
-            yield Unit.of(variation, varied, task, identity(varied, task), **wanted)
+            sampled = compares_backends and _is_sampled(config, backend)
+            flags = {"stored": compares_backends, "assessed": assessed, "sampled": sampled}
+            yield Unit.of(variation, varied, task, identity(varied, task), **flags)
 
 
 def _variations(config: Config) -> Iterator[tuple[Variation, Part, Any]]:
@@ -379,9 +383,9 @@ def identity(config: Config, task: Task) -> str:
         content["distances"] = distances.tolist()
     truth = truth_task(task) if config.truth else None
     compared = {} if truth is None else {"truth": truth.mapping.rows}
-    beside = {"beside": filtering.model} if config.frame_quality else {}
+    unfiltered = {"beside": filtering.model} if config.frame_quality else {}
     settings = config.model_dump(mode="json", exclude=NOT_IN_KEYS, exclude_defaults=True)
-    return _hash(settings, content | compared | beside)
+    return _hash(settings, content | compared | unfiltered)
 
 
 def _hash(settings: Mapping[str, Any], content: Mapping[str, Any]) -> str:
@@ -391,12 +395,12 @@ def _hash(settings: Mapping[str, Any], content: Mapping[str, Any]) -> str:
 
 
 def _restricted(base: Sequence[Unit], part: Part, name: str) -> list[Unit]:
-    _check_names(part.scenes, [each.name.scene for each in base], f"{name}.scenes")
-    _check_names(part.models, [each.name.model for each in base], f"{name}.models")
-    return [each for each in base if applies(part, each.name.scene, each.name.model)]
+    _check_names(part.scenes, [unit.name.scene for unit in base], f"{name}.scenes")
+    _check_names(part.models, [unit.name.model for unit in base], f"{name}.models")
+    return [unit for unit in base if applies(part, unit.name.scene, unit.name.model)]
 
 
-def _check_names(wanted: Iterable[str] | None, known: Sequence[str], where: str) -> None:
-    for name in wanted or ():
-        if name not in known:
-            raise ConfigError(f"{where}: '{name}' is not among {', '.join(dict.fromkeys(known))}")
+def _check_names(names: Iterable[str] | None, available: Sequence[str], where: str) -> None:
+    for name in names or ():
+        if name not in available:
+            raise ConfigError(f"{where}: '{name}' is not among {', '.join(dict.fromkeys(available))}")

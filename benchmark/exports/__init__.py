@@ -151,8 +151,8 @@ def export(
         if task_format is not None:
             task, _ = held.enter_context(task_of(run, record, result.manifest["inputs"], code))
             tasks = annotation_tasks(chosen(("op",)), task, most)
-            named = task.mapping.target, task.scene.name, task.model
-            return [_tasks_written(TaskFile(tasks, *named, file), task) for file in files]
+            unit_names = task.mapping.target, task.scene.name, task.model
+            return [_tasks_written(TaskFile(tasks, *unit_names, file), task) for file in files]
         if any(map(holds_masks, files)):
             unit, _ = held.enter_context(task_of(run, record, result.manifest["inputs"], code))
         if classify is not None:
@@ -220,7 +220,7 @@ def _masks_written(task: Task, folder: Path) -> Exported:
 
 def _tasks_written(file: TaskFile, task: Task) -> Exported:
     note, images = write_tasks(file, task), len(file.sizes())
-    bits = sum(each.score for each in file.tasks)
+    bits = sum(annotation.score for annotation in file.tasks)
     return Exported(file.path, f"{len(file.tasks)} tasks in {images} images, {bits:,.0f} bits of entropy", (note,))
 
 

@@ -89,9 +89,9 @@ def annotation_tasks(chosen: Chosen, task: Task, most: int) -> list[AnnotationTa
         raise ConfigError(
             "no image shows a location where frames disagree large enough for a person; use larger voxels"
         )
-    best = [_ranked(own) for own in by_location.values()]
-    best.sort(key=lambda own: -own[0].bits)
-    return [locations.task(own, task) for own in best[:most]]
+    best = [_ranked(location_views) for location_views in by_location.values()]
+    best.sort(key=lambda location_views: -location_views[0].bits)
+    return [locations.task(location_views, task) for location_views in best[:most]]
 
 
 @dataclass(frozen=True, eq=False)
@@ -140,29 +140,29 @@ class _Locations:
     def task(self, views: list[_View], task: Task) -> AnnotationTask:
         """Return the task of a location from its views, the best first."""
         best, names = views[0], task.scene.image_name
-        own = self.location == best.location
-        k = int(np.flatnonzero(own)[0])
-        center = self.projected(self.table.centers[own].mean(axis=0, keepdims=True))[0]
+        in_location = self.location == best.location
+        k = int(np.flatnonzero(in_location)[0])
+        center = self.projected(self.table.centers[in_location].mean(axis=0, keepdims=True))[0]
         return AnnotationTask(
-            best.bits, self.names[self.label[k]], self.names[self.other[k]], int(own.sum()),
-            float(np.median(self.table.op[own])), tuple(center.tolist()), best.frame, names(best.frame), best.size,
-            best.outline, tuple(names(view.frame) for view in views[1:]),
+            best.bits, self.names[self.label[k]], self.names[self.other[k]], int(in_location.sum()),
+            float(np.median(self.table.op[in_location])), tuple(center.tolist()), best.frame, names(best.frame),
+            best.size, best.outline, tuple(names(view.frame) for view in views[1:]),
         )  # fmt: skip
 
 
 def _disagreed(table: VoxelTable) -> Int64:
     """Return the rows of voxels on which frames disagree."""
     category = np.array(CATEGORIES)[categories(table)]
-    wanted = np.isin(category, ("drifting", "uncertain")) | (np.nan_to_num(psa(table), nan=1.0) < MIN_PSA)
-    return np.flatnonzero(wanted & (table.op >= 2))
+    uncertain = np.isin(category, ("drifting", "uncertain")) | (np.nan_to_num(psa(table), nan=1.0) < MIN_PSA)
+    return np.flatnonzero(uncertain & (table.op >= 2))
 
 
 def _connected(index: Int32, classes: Int64) -> Int64:
     """Return the connected set (n,) of each voxel (n, 3) with others of its classes (n, 2); blocks cut large ones."""
-    whole = connected(index, classes)
-    corner = np.full((whole.max() + 1, 3), np.iinfo(index.dtype).max)
-    np.minimum.at(corner, whole, index)
-    return connected(index, np.column_stack([whole, (index - corner[whole]) // BLOCK]))
+    component = connected(index, classes)
+    corner = np.full((component.max() + 1, 3), np.iinfo(index.dtype).max)
+    np.minimum.at(corner, component, index)
+    return connected(index, np.column_stack([component, (index - corner[component]) // BLOCK]))
 
 
 # Locations in the images.
@@ -206,8 +206,8 @@ def _views(task: Task, index: int, locations: _Locations) -> list[_View]:
     location = np.where(rows == NONE, NONE, locations.location[rows])
     sharpness: Float64 = cv2.Laplacian(cv2.cvtColor(image, cv2.COLOR_RGB2GRAY), cv2.CV_64F).astype(np.float64) ** 2
     boxes = enumerate(find_objects(location + 1))
-    seen = [_view(frame, rows, location, k, box, locations, sharpness) for k, box in boxes if box is not None]
-    return [view for view in seen if view is not None]
+    candidates = [_view(frame, rows, location, k, box, locations, sharpness) for k, box in boxes if box is not None]
+    return [view for view in candidates if view is not None]
 
 
 def _view(
@@ -220,16 +220,16 @@ def _view(
     sharpness: Float64,
 ) -> _View | None:
     """Return location k within a box of the image, or None if the image shows too little of it."""
-    seen = location[box] == k
-    K, z = frame.intrinsics, frame.depth[box][seen].astype(np.float64)
-    outline, mask = outlined(seen, locations.table.voxel_size * K.fx / float(np.median(z)), SMALLEST * rows.size)
+    pixels = location[box] == k
+    K, z = frame.intrinsics, frame.depth[box][pixels].astype(np.float64)
+    outline, mask = outlined(pixels, locations.table.voxel_size * K.fx / float(np.median(z)), SMALLEST * rows.size)
     if not mask.any():
         return None
     corner, (H, W) = np.array([box[1].start, box[0].start], np.float64), frame.shape
     return _View(
         k, frame.index, (W, H), tuple(polygon + corner for polygon in outline),
-        float(locations.bits[np.unique(rows[box][seen])].sum()), float(mask.sum()), float((z**2).sum() / (K.fx * K.fy)),
-        float(sharpness[box][mask].mean()) + 1e-9,
+        float(locations.bits[np.unique(rows[box][pixels])].sum()), float(mask.sum()),
+        float((z**2).sum() / (K.fx * K.fy)), float(sharpness[box][mask].mean()) + 1e-9,
     )  # fmt: skip
 
 

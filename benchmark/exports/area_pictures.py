@@ -55,24 +55,28 @@ def area_pictures(
         runs: The base and the run.
         scene: Name of the scene.
     """
-    wanted = {k: area.frames[0].frame for k, area in enumerate(areas) if area.frames and k in points}
-    first = dict(list(wanted.items())[:PICTURED])
+    top_frames = {k: area.frames[0].frame for k, area in enumerate(areas) if area.frames and k in points}
+    first = dict(list(top_frames.items())[:PICTURED])
     indices = [*dict.fromkeys(first.values())][:READ]
     if not indices:
         return {}
-    known = [(run.name, frames_of(run, scene, indices)) for run in runs]
+    run_frames = [(run.name, frames_of(run, scene, indices)) for run in runs]
     made = {}
     for k, index in first.items():
         cuts = [
-            (name, each, cut)
-            for name, each in known
-            if each is not None and index in each.frames and (cut := cut_out(each.frames[index], points[k])) is not None
+            (name, of_run, cut)
+            for name, of_run in run_frames
+            if of_run is not None
+            and index in of_run.frames
+            and (cut := cut_out(of_run.frames[index], points[k])) is not None
         ]
         if cuts:
             image = cuts[0][2][1]
-            shown = [] if image is None else [("image", jpeg(image))]
-            shown += [(f"labels of {name}", label_picture(cut[0], np.array(each.palette))) for name, each, cut in cuts]
+            images = [] if image is None else [("image", jpeg(image))]
+            images += [
+                (f"labels of {name}", label_picture(cut[0], np.array(of_run.palette))) for name, of_run, cut in cuts
+            ]
             x, y, radius = cuts[0][2][2]
             name = areas[k].frames[0].name or str(index)
-            made[k] = {"title": name, "shown": shown, "ring": [100 * x, 100 * y, 200 * radius]}
+            made[k] = {"title": name, "shown": images, "ring": [100 * x, 100 * y, 200 * radius]}
     return made

@@ -84,13 +84,13 @@ def write_las(parts: Iterable[Voxels], path: Path, asprs: Path | None = None) ->
     Raises:
         MissingDependencyError, ConfigError: For a table of codes.
     """
-    las, left = with_lazrs(path), iter(parts)
-    first = next(left)
+    las, remaining = with_lazrs(path), iter(parts)
+    first = next(remaining)
     header, written = las.LasHeader(point_format=FORMAT, version="1.4"), 0
     header.scales, header.offsets = np.full(3, MILLIMETRE), np.floor(first.points.min(axis=0))
     declare(header, first)
     with atomic_path(path) as temporary, las_writer(temporary, header) as cloud:
-        for voxels in itertools.chain([first], left):
+        for voxels in itertools.chain([first], remaining):
             points = las.ScaleAwarePointRecord.zeros(len(voxels.table), header=header)
             points.x, points.y, points.z = voxels.points.T
             points.red, points.green, points.blue = (voxels.colors[voxels.classified - 1].astype(np.uint16) * 257).T
@@ -121,10 +121,10 @@ def las_writer(path: Path, header: laspy.LasHeader) -> Iterator[laspy.LasWriter]
         raise not_written() from error
     try:
         with open_las(path) as reader:
-            whole = reader.header.point_count == writer.header.point_count
+            complete = reader.header.point_count == writer.header.point_count
     except DataError as error:
         raise not_written() from error
-    if not whole:
+    if not complete:
         raise not_written()
 
 
@@ -178,14 +178,14 @@ def codes(voxels: Voxels, table: Path | None = None) -> UInt8:
     """
     row = {name_key(name): k for k, name in enumerate(voxels.classes, start=1)}
     if table is not None:
-        given = read_yaml(table)
+        stated = read_yaml(table)
     else:
         content = read_yaml(str(importlib.resources.files("semstab.configs") / "asprs.yaml"))
         shipped = content.get(voxels.taxonomy, {})
-        given = {name: code for name, code in shipped.items() if name_key(name) in row}
+        stated = {name: code for name, code in shipped.items() if name_key(name) in row}
     codes_by_row = np.full(1 + len(row), UNCLASSIFIED, np.uint8)
     codes_by_row[0] = NEVER_CLASSIFIED
-    for name, code in given.items():
+    for name, code in stated.items():
         if name_key(str(name)) not in row:
             raise ConfigError(f"{table}: no class '{name}' in the run; {nearest(str(name), voxels.classes)}")
         if isinstance(code, bool) or not isinstance(code, int) or not 0 <= code < 2**8:
@@ -196,5 +196,5 @@ def codes(voxels: Voxels, table: Path | None = None) -> UInt8:
 
 def without_code(voxels: Voxels, table: Path | None) -> list[str]:
     """Return the classes of these voxels without a code of their own, which become 'unclassified'."""
-    known, there = codes(voxels, table), np.unique(voxels.classified)
-    return [voxels.classes[row - 1] for row in there.tolist() if row and known[row] == UNCLASSIFIED]
+    code_of_row, present = codes(voxels, table), np.unique(voxels.classified)
+    return [voxels.classes[row - 1] for row in present.tolist() if row and code_of_row[row] == UNCLASSIFIED]

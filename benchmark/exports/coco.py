@@ -68,12 +68,12 @@ def write_coco(file: TaskFile) -> None:
         low = [min(float(p[:, k].min()) for p in task.outline) for k in range(2)]
         high = [max(float(p[:, k].max()) for p in task.outline) for k in range(2)]
         area = sum(float(cv2.contourArea(p.astype("float32"))) for p in task.outline)
-        own: dict[str, Any] = {
+        annotation: dict[str, Any] = {
             "id": rank, "image_id": numbers[file.image(task)], "category_id": ids[task.label], "iscrowd": 0,
             "segmentation": [p.ravel().tolist() for p in task.outline], "area": area,
             "bbox": [*low, high[0] - low[0], high[1] - low[1]],
         }  # fmt: skip
-        annotations.append(own | about(task))
+        annotations.append(annotation | about(task))
     write_json(file.path, {
         "info": {"description": f"{file.scene}, {file.source}: locations where frames disagree, by semstab"},
         "licenses": [],
@@ -97,10 +97,10 @@ def check(kind: str, path: Path) -> None:
 
 def write_tasks(file: TaskFile, task: Task) -> str:
     """Write tasks of frames, and their images; return where the images are."""
-    for one in {task.image: task for task in file.tasks}.values():
-        color = task.scene.color(one.frame)
+    for of_image in {task.image: task for task in file.tasks}.values():
+        color = task.scene.color(of_image.frame)
         assert color is not None
-        image = file.path.parent / file.image(one)
+        image = file.path.parent / file.image(of_image)
         write_image(image, cv2.cvtColor(color, cv2.COLOR_RGB2BGR), cv2.IMWRITE_JPEG_QUALITY, 95)
     write_coco(file)
     return f"images: {file.folder}"

@@ -114,36 +114,36 @@ class FusedLabels:
         voxel = lookup.rows(points)
         met = voxel != NONE
         rows, inverse = np.unique(voxel[met], return_inverse=True)
-        seen = rows_of(lookup.table, rows)
+        voxels = rows_of(lookup.table, rows)
         if vote is not None:
-            seen = _without(vote, lookup, seen, rows)
-        label = np.where(self._belief.of(seen), dominant(seen), UNSTABLE)
+            voxels = _without(vote, lookup, voxels, rows)
+        label = np.where(self._belief.of(voxels), dominant(voxels), UNSTABLE)
         labels = np.full(len(points), UNSEEN)
         labels[met] = label[inverse]
         return labels
 
 
-def _without(vote: Observations, lookup: VoxelLookup, seen: VoxelTable, rows: Int64) -> VoxelTable:
+def _without(vote: Observations, lookup: VoxelLookup, voxels: VoxelTable, rows: Int64) -> VoxelTable:
     """Return the voxels of a tile that a frame sees, `rows` of it, without the frame's own vote."""
-    centers = np.add(vote.index, 0.5, dtype=np.float64) * seen.voxel_size
+    centers = np.add(vote.index, 0.5, dtype=np.float64) * voxels.voxel_size
     seen_rows = lookup.rows(centers)
     met = seen_rows != NONE
-    at = np.searchsorted(rows, seen_rows[met])
-    if seen.weight is not None:
+    positions = np.searchsorted(rows, seen_rows[met])
+    if voxels.weight is not None:
         raise ConfigError(
             "leave_one_out: no frame's vote can be taken away from evidence by another rule than the mean; do without,"
             " or take a map by the mean (--backend)"
         )
-    evidence, op, self_sum = seen.evidence[:], seen.op.copy(), seen.self_sum.copy()
-    evidence[at] = np.abs(np.round(evidence[at] - vote.s_bar[met], DECIMALS))
-    op[at] -= 1
-    self_sum[at] -= (vote.s_bar[met] ** 2).sum(axis=1)
-    return dataclasses.replace(seen, evidence=Evidence.of(evidence), op=op, self_sum=self_sum)
+    evidence, op, self_sum = voxels.evidence[:], voxels.op.copy(), voxels.self_sum.copy()
+    evidence[positions] = np.abs(np.round(evidence[positions] - vote.s_bar[met], DECIMALS))
+    op[positions] -= 1
+    self_sum[positions] -= (vote.s_bar[met] ** 2).sum(axis=1)
+    return dataclasses.replace(voxels, evidence=Evidence.of(evidence), op=op, self_sum=self_sum)
 
 
 def labels_of(fused: Int64, ids: Sequence[int]) -> UInt8 | UInt16:
     """Return the label map of fused rows: the ids of the classes, or the ignore id."""
-    at = np.where(fused < 0, len(ids), fused)
+    position = np.where(fused < 0, len(ids), fused)
     if max(ids) < IGNORE_8BIT:
-        return np.array([*ids, IGNORE_8BIT], np.uint8)[at]
-    return np.array([*ids, IGNORE_16BIT], np.uint16)[at]
+        return np.array([*ids, IGNORE_8BIT], np.uint8)[position]
+    return np.array([*ids, IGNORE_16BIT], np.uint16)[position]

@@ -60,24 +60,24 @@ class VoxelLookup:
         """Return the voxels, and the distance of their centres, 0 for the voxel that a point lies in."""
         index = np.floor(points / self.table.voxel_size).astype(np.int64)
         inside = np.flatnonzero(((index >= self._low) & (index <= self._high)).all(axis=1))
-        rows, apart = np.full(len(points), NONE), np.full(len(points), np.inf)
+        rows, distances = np.full(len(points), NONE), np.full(len(points), np.inf)
         keys = np.ravel_multi_index(tuple((index[inside] - self._low).T), tuple(self._high - self._low + 1))
-        at = np.minimum(np.searchsorted(self._keys, keys), len(self._keys) - 1)
-        met = inside[self._keys[at] == keys]
-        rows[met], apart[met] = at[self._keys[at] == keys], 0.0
+        positions = np.minimum(np.searchsorted(self._keys, keys), len(self._keys) - 1)
+        met = inside[self._keys[positions] == keys]
+        rows[met], distances[met] = positions[self._keys[positions] == keys], 0.0
         if self._radius > 0:
             lost = np.flatnonzero(rows == NONE)
-            rows[lost], apart[lost] = self._around(points[lost])
-        return rows, apart
+            rows[lost], distances[lost] = self._around(points[lost])
+        return rows, distances
 
     def _around(self, points: Float64) -> tuple[Int64, Float64]:
         """Return (n,) the voxel whose centre is nearest to each point, within the radius, and its distance."""
         low, high = self.bounds
         near = np.flatnonzero(((points >= low) & (points <= high)).all(axis=1))
-        rows, apart = np.full(len(points), NONE), np.full(len(points), np.inf)
-        apart[near], nearest = self._tree.query(points[near], distance_upper_bound=self._radius, workers=-1)
+        rows, distances = np.full(len(points), NONE), np.full(len(points), np.inf)
+        distances[near], nearest = self._tree.query(points[near], distance_upper_bound=self._radius, workers=-1)
         rows[near] = np.where(nearest < len(self.table), nearest, NONE)
-        return rows, apart
+        return rows, distances
 
     @cached_property
     def _tree(self) -> cKDTree:
@@ -181,7 +181,7 @@ class _Finder:
         return low, high
 
     def __call__(self, points: Float64) -> Taken:
-        part, apart = self.chosen.first, np.full(len(points), np.inf)
+        part, best_distance = self.chosen.first, np.full(len(points), np.inf)
         label = np.zeros(len(points), part.classified.dtype)
         columns = {
             name: np.zeros(len(points), clouds.as_stored(column.values).dtype) for name, column in part.columns.items()
@@ -192,14 +192,14 @@ class _Finder:
             if not len(voxels.table):
                 continue
             nearest, distance = self._lookups[tile].nearest(placed[rows])
-            nearer = distance < apart[rows]
-            to, of = rows[nearer], nearest[nearer]
-            apart[to], label[to] = distance[nearer], voxels.classified[of]
-            for name, own in columns.items():
-                own[to] = clouds.as_stored(voxels.columns[name].values)[of]
+            nearer = distance < best_distance[rows]
+            point_rows, voxel_rows = rows[nearer], nearest[nearer]
+            best_distance[point_rows], label[point_rows] = distance[nearer], voxels.classified[voxel_rows]
+            for name, values in columns.items():
+                values[point_rows] = clouds.as_stored(voxels.columns[name].values)[voxel_rows]
         low, high = (edge[:2] for edge in self.bounds)
         over = ((points[:, :2] >= low) & (points[:, :2] <= high)).all(axis=1)
-        self.tally.add(points, int(np.isfinite(apart).sum()), int(over.sum()))
+        self.tally.add(points, int(np.isfinite(best_distance).sum()), int(over.sum()))
         return Taken(label, columns)
 
     def _near(self, points: Float64) -> Iterator[tuple[TileIndex, Int64]]:
@@ -223,13 +223,13 @@ class _Finder:
 def _outside(cloud: Path, finder: _Finder) -> DataError:
     """Return the error of a cloud without a point in the map."""
     map_box = finder.bounds
-    there, here = (
+    cloud_span, map_span = (
         " to ".join("(" + ", ".join(f"{value:.1f}" for value in corner) + ")" for corner in box)
         for box in ((finder.tally.low, finder.tally.high), map_box)
     )
     georeferenced = finder.chosen.first.georeference is not None
     mend = "correct the cloud's coordinates" if georeferenced else "give the run's dataset a georeference (crs, offset)"
-    return DataError(f"{cloud}: no point lies in the map: the cloud spans {there} m, the map {here}; {mend}")
+    return DataError(f"{cloud}: no point lies in the map: the cloud spans {cloud_span} m, the map {map_span}; {mend}")
 
 
 # --- LAS --------------------------------------------------------------------------------------------------------------
@@ -303,9 +303,9 @@ def _require_same_crs(voxels: Voxels, header: laspy.LasHeader, cloud: Path) -> N
     from pyproj import CRS
 
     flat = stated.sub_crs_list[0] if stated.is_compound else stated
-    there, here = (crs.to_epsg() for crs in (flat, CRS.from_wkt(voxels.georeference.crs)))
-    if there is not None and here is not None and there != here:
-        raise DataError(f"{cloud}: the cloud is in EPSG:{there}, the run in EPSG:{here}; reproject the cloud")
+    cloud_epsg, run_epsg = (crs.to_epsg() for crs in (flat, CRS.from_wkt(voxels.georeference.crs)))
+    if cloud_epsg is not None and run_epsg is not None and cloud_epsg != run_epsg:
+        raise DataError(f"{cloud}: the cloud is in EPSG:{cloud_epsg}, the run in EPSG:{run_epsg}; reproject the cloud")
 
 
 # --- PLY --------------------------------------------------------------------------------------------------------------
@@ -314,18 +314,18 @@ def _require_same_crs(voxels: Voxels, header: laspy.LasHeader, cloud: Path) -> N
 def _classify_ply(voxels: Voxels, cloud: Path, out: Path, find: Finder) -> None:
     with cloud.open("rb") as source, out.open("wb") as target:
         header = Header.read(source, cloud)
-        own = {name: header.dtype[name].newbyteorder("<") for name in header.dtype.names or ()}
+        fields = {name: header.dtype[name].newbyteorder("<") for name in header.dtype.names or ()}
         kinds = {
             "class": voxels.classified.dtype,
             **{k: clouds.as_stored(column.values).dtype for k, column in voxels.columns.items()},
         }
-        dtype = np.dtype([*(own | kinds).items()])
+        dtype = np.dtype([*(fields | kinds).items()])
         comments = dict.fromkeys((*header.comments, *clouds.legend(voxels)))
         target.write(Header(dtype, header.count, 0, tuple(comments)).text())
         for points in _ply_chunks(source, header, cloud):
             assigned = find(np.stack([points[axis].astype(np.float64) for axis in "xyz"], axis=1))
             chunk = np.empty(len(points), dtype)
-            for name in own:
+            for name in fields:
                 chunk[name] = points[name]
             chunk["class"] = assigned.label
             for name, values in assigned.columns.items():
@@ -335,9 +335,9 @@ def _classify_ply(voxels: Voxels, cloud: Path, out: Path, find: Finder) -> None:
 
 def _ply_chunks(source: Any, header: Header, cloud: Path) -> Iterator[npt.NDArray[np.void]]:
     for first in range(0, header.count, CHUNK):
-        wanted = min(CHUNK, header.count - first)
-        points = np.fromfile(source, header.dtype, wanted)
-        if len(points) < wanted:
+        count = min(CHUNK, header.count - first)
+        points = np.fromfile(source, header.dtype, count)
+        if len(points) < count:
             raise DataError(
                 f"{cloud}: the file ends after {first + len(points):,} of {header.count:,} points; it is cut short"
             )

@@ -51,12 +51,12 @@ def write_raster(chosen: Chosen, path: Path, cell: int = 1) -> int:
         import rasterio  # noqa: F401
     except ImportError as error:
         raise MissingDependencyError(f"{path}: .tif needs rasterio; {INSTALL}") from error
-    part, seen, voxels = chosen.first, {}, 0
+    part, windows, voxels = chosen.first, {}, 0
     for tile in chosen.tiles():
-        seen[tile] = _window(chosen[tile], cell)
+        windows[tile] = _window(chosen[tile], cell)
         voxels += len(chosen[tile].table)
-    whole = _fitting(functools.reduce(Window.around, seen.values()))
-    grid, names = _grid(part, whole, cell), _names(part)
+    extent = _fitting(functools.reduce(Window.around, windows.values()))
+    grid, names = _grid(part, extent, cell), _names(part)
     few = len(part.classes) < 2**8
     with (
         atomic_path(path) as temporary,
@@ -64,12 +64,12 @@ def write_raster(chosen: Chosen, path: Path, cell: int = 1) -> int:
         _raster(temporary, count=len(names), dtype="float32", nodata=np.nan, predictor=3, **grid) as measures,
         _raster(temporary_classes, count=1, dtype="uint8" if few else "uint16", nodata=0, **grid) as classes,
     ):
-        for window in whole.parts():
-            parts = [chosen[tile] for tile, own in seen.items() if own.meets(window)]
+        for window in extent.parts():
+            parts = [chosen[tile] for tile, tile_window in windows.items() if tile_window.meets(window)]
             bands = _bands(together(parts), cell, window) if parts else {}
             nothing = np.full(window.shape, np.nan, np.float32)
             values = {name: bands[name].values if bands else nothing for name in names}
-            _write_window(measures, classes, values, window.within(whole))
+            _write_window(measures, classes, values, window.within(extent))
         _describe_measures(measures.raster, part)
         _describe_classes(classes.raster, part)
     return voxels
@@ -80,12 +80,12 @@ def _names(part: Voxels) -> tuple[str, ...]:
     return ("class", *part.columns, "stable", "height")
 
 
-def _grid(part: Voxels, whole: Window, cell: int) -> dict[str, Any]:
+def _grid(part: Voxels, extent: Window, cell: int) -> dict[str, Any]:
     """Return where the cells of a raster lie, and how they are stored."""
     import rasterio
 
-    edge, (west, north) = cell * part.table.voxel_size, _corner(part, whole, cell)
-    height, width = whole.shape
+    edge, (west, north) = cell * part.table.voxel_size, _corner(part, extent, cell)
+    height, width = extent.shape
     return {
         "driver": "GTiff", "width": width, "height": height,
         "transform": rasterio.Affine(edge, 0, west, 0, -edge, north),
@@ -155,13 +155,13 @@ def _raster(path: Path, **profile: Any) -> Iterator[_Raster]:
             yield written
             names = file.descriptions
         with rasterio.open(path) as file:
-            whole = file.descriptions == names and all(
+            complete = file.descriptions == names and all(
                 zlib.crc32(np.ascontiguousarray(file.read(band, window=window)).data) == checksum
                 for band, window, checksum in written.sums
             )
     except rasterio.errors.RasterioError as error:
         raise not_written() from error
-    if not whole:
+    if not complete:
         raise not_written()
 
 
@@ -180,7 +180,8 @@ class Window:
     def around(self, other: Window) -> Window:
         """Return the smallest that holds both."""
         low, high = (
-            tuple(map(of, *ends)) for of, ends in ((min, (self.low, other.low)), (max, (self.high, other.high)))
+            tuple(map(extreme, *ends))
+            for extreme, ends in ((min, (self.low, other.low)), (max, (self.high, other.high)))
         )
         return Window((low[0], low[1]), (high[0], high[1]))
 
@@ -204,8 +205,8 @@ class Window:
 
 def seen_from_above(voxels: Voxels, cell: int = 1) -> tuple[Mapping[str, Column], float, float]:
     """Return the bands (H, W) float32 by name, first row the farthest ahead, and the coordinates of their corner."""
-    whole = _fitting(_window(voxels, cell))
-    return _bands(voxels, cell, whole), *_corner(voxels, whole, cell)
+    extent = _fitting(_window(voxels, cell))
+    return _bands(voxels, cell, extent), *_corner(voxels, extent, cell)
 
 
 def _axes(voxels: Voxels) -> tuple[Float64, Float64, Float64]:
@@ -235,15 +236,15 @@ def _covered_by_turned(plane: Float64, axes: Float64, edge: float) -> tuple[Int6
         axes: (2, 2) from the scene's level axes to the raster's.
         edge: Edge of a cell and of a voxel, in the unit of `plane`.
     """
-    own, to_scene, rows = np.floor(plane / edge).astype(np.int64), np.linalg.inv(axes).T, np.arange(len(plane))
-    cells, of = [own], [rows]
+    base, to_scene, rows = np.floor(plane / edge).astype(np.int64), np.linalg.inv(axes).T, np.arange(len(plane))
+    cells, covering = [base], [rows]
     for step in np.ndindex(3, 3):
-        cell = own + (np.array(step) - 1)
-        apart = ((cell + 0.5) * edge - plane) @ to_scene
-        under = ((apart >= -edge / 2) & (apart < edge / 2)).all(axis=1) & (cell != own).any(axis=1)
+        cell = base + (np.array(step) - 1)
+        offset = ((cell + 0.5) * edge - plane) @ to_scene
+        under = ((offset >= -edge / 2) & (offset < edge / 2)).all(axis=1) & (cell != base).any(axis=1)
         cells.append(cell[under])
-        of.append(rows[under])
-    return np.concatenate(cells), np.concatenate(of)
+        covering.append(rows[under])
+    return np.concatenate(cells), np.concatenate(covering)
 
 
 def _window(voxels: Voxels, cell: int) -> Window:
@@ -265,10 +266,10 @@ def _fitting(window: Window) -> Window:
     return window
 
 
-def _corner(voxels: Voxels, whole: Window, cell: int) -> tuple[float, float]:
+def _corner(voxels: Voxels, extent: Window, cell: int) -> tuple[float, float]:
     """Return the coordinates west and north of a raster of these cells."""
     (right, ahead, _), edge = _axes(voxels), cell * voxels.table.voxel_size
-    west, north = whole.low[1] * edge + voxels.offset @ right, (whole.high[0] + 1) * edge + voxels.offset @ ahead
+    west, north = extent.low[1] * edge + voxels.offset @ right, (extent.high[0] + 1) * edge + voxels.offset @ ahead
     return float(west), float(north)
 
 
@@ -289,22 +290,22 @@ def _bands(voxels: Voxels, cell: int, window: Window) -> Mapping[str, Column]:
     cells, (H, W), (_, _, above) = fine // cell, window.shape, _axes(voxels)
     height = voxels.points @ above
     top = _topmost(fine, height[rows])
-    at = (window.high[0] - cells[:, 0]) * W + cells[:, 1] - window.low[1]
-    over, every = _Cells(at[top], rows[top], (H, W)), _Cells(at, rows, (H, W))
+    flat = (window.high[0] - cells[:, 0]) * W + cells[:, 1] - window.low[1]
+    over, all_cells = _Cells(flat[top], rows[top], (H, W)), _Cells(flat, rows, (H, W))
     belief = np.stack([over.mean(part) for part in normalise(voxels.table.evidence).T])
     label = np.where(over.empty, np.nan, np.nan_to_num(belief).argmax(axis=0) + 1.0)
     stable = (categories(voxels.table) == STABLE).astype(np.float64)
     values = {"class": label, **{name: over.mean(column.values) for name, column in voxels.columns.items()}}
-    values |= {"stable": every.mean(stable), "height": over.highest(height)}
+    values |= {"stable": all_cells.mean(stable), "height": over.highest(height)}
     return {name: Column(values[name].astype(np.float32), unit, about) for name, unit, about in _abouts(voxels)}
 
 
 class _Cells:
     """The voxels (m,) in the cells (m,) of a raster, counted row by row."""
 
-    def __init__(self, at: Int64, rows: Int64, shape: tuple[int, int]) -> None:
-        self._at, self._rows, self._shape = at, rows, shape
-        self.empty = np.bincount(at, minlength=shape[0] * shape[1]).reshape(shape) == 0
+    def __init__(self, flat: Int64, rows: Int64, shape: tuple[int, int]) -> None:
+        self._at, self._rows, self._shape = flat, rows, shape
+        self.empty = np.bincount(flat, minlength=shape[0] * shape[1]).reshape(shape) == 0
 
     def mean(self, values: npt.NDArray[Any]) -> Float64:
         """Return the mean (H, W) of values (n,) of the voxels; NaN for a column without defined values."""
@@ -396,11 +397,11 @@ def write_mesh(chosen: Chosen, path: Path) -> int:
 def _adjacent(chosen: Chosen, tile: TileIndex) -> Int64:
     """Return the voxels (n, 3) of the tiles around one that may touch it."""
     adjacent, size = [np.zeros((0, 3), np.int64)], chosen.size
-    for (dx, dy), axis, at in (((1, 0), 0, 0), ((-1, 0), 0, -1), ((0, 1), 1, 0), ((0, -1), 1, -1)):
+    for (dx, dy), axis, edge in (((1, 0), 0, 0), ((-1, 0), 0, -1), ((0, 1), 1, 0), ((0, -1), 1, -1)):
         other = tile[0] + dx, tile[1] + dy
         if size is not None and other in chosen:
             index = chosen[other].table.index.astype(np.int64)
-            adjacent.append(index[index[:, axis] % size == at % size])
+            adjacent.append(index[index[:, axis] % size == edge % size])
     return np.concatenate(adjacent)
 
 

@@ -38,8 +38,12 @@ def write_places(chosen: Chosen, record: Record, file: Path, most: int) -> tuple
         ConfigError: If frames disagree nowhere.
         MissingDependencyError: For GeoJSON without pyproj.
     """
-    seen = record.observations_file
-    spots = None if seen is None or not seen.exists() else SpotObservations.load(seen)
+    observations_file = record.observations_file
+    spots = (
+        None
+        if observations_file is None or not observations_file.exists()
+        else SpotObservations.load(observations_file)
+    )
     places = worst_places((part.table for part in chosen), spots, most)
     if not places:
         raise ConfigError(
@@ -59,12 +63,12 @@ def write_places(chosen: Chosen, record: Record, file: Path, most: int) -> tuple
 def _row(place: Place, point: Sequence[float], part: Voxels, names: Mapping[int, str]) -> dict[str, Any]:
     """Return what is known of a place, by name: coordinates are those of the other exports."""
     frames = [names.get(view.frame, str(view.frame)) for view in place.views]
-    given = ["" if view.label < 0 else part.classes[view.label] for view in place.views]
+    labels = ["" if view.label < 0 else part.classes[view.label] for view in place.views]
     return {
         "number": place.number, "class": part.classes[place.label], "confused_with": part.classes[place.other],
         "voxels": place.voxels, "size_m": round(place.size, 3), "agreement": round(place.agreement, 4),
         "share": round(place.share, 6), "op": place.op, **dict(zip("xyz", (round(c, 3) for c in point), strict=True)),
-        "crs": "" if part.georeference is None else part.georeference.name, "frames": frames, "given": given,
+        "crs": "" if part.georeference is None else part.georeference.name, "frames": frames, "given": labels,
     }  # fmt: skip
 
 
@@ -87,13 +91,13 @@ def geojson(
 ) -> dict[str, Any]:
     """Return a collection of points: longitude and latitude (RFC 7946), or with a note metres of the scene."""
     where = {"crs": None, "note": LOCAL} if degrees is None else {"note": "longitude and latitude, WGS 84"}
-    at = [[round(x, 3), round(y, 3)] for x, y, _ in points] if degrees is None else degrees
+    coordinates = [[round(x, 3), round(y, 3)] for x, y, _ in points] if degrees is None else degrees
     about = {"voxel_size": part.table.voxel_size, "taxonomy": part.taxonomy, "benchmark": part.benchmark}
     return {
-        "type": "FeatureCollection", "name": "places", **where, **{key: own for key, own in about.items() if own},
+        "type": "FeatureCollection", "name": "places", **where, **{key: value for key, value in about.items() if value},
         "features": [
-            {"type": "Feature", "geometry": {"type": "Point", "coordinates": own}, "properties": row}
-            for own, row in zip(at, rows, strict=True)
+            {"type": "Feature", "geometry": {"type": "Point", "coordinates": position}, "properties": row}
+            for position, row in zip(coordinates, rows, strict=True)
         ],
     }  # fmt: skip
 
@@ -104,7 +108,7 @@ def places_table(rows: Sequence[Mapping[str, Any]], degrees: Sequence[tuple[floa
     writer = csv.writer(text, lineterminator="\n")
     writer.writerow([*rows[0], *([] if degrees is None else ["longitude", "latitude"])])
     for k, row in enumerate(rows):
-        cells = ["; ".join(own) if isinstance(own, list) else own for own in row.values()]
+        cells = ["; ".join(cell) if isinstance(cell, list) else cell for cell in row.values()]
         cells += [] if degrees is None else degrees[k]
         writer.writerow([csv_text(cell) if isinstance(cell, str) else cell for cell in cells])
     return text.getvalue()

@@ -91,9 +91,9 @@ def relabel(
         )
         fused = FusedLabels(Tiles.open(record.voxels_file, VoxelTable), belief, len(space))
         tally = Tally(len(space))
-        for done, (frame, rows, known) in enumerate(_fused_frames(task, fused, pixel_stride), start=1):
+        for done, (frame, rows, true_frame) in enumerate(_fused_frames(task, fused, pixel_stride), start=1):
             _write_map(folder, record.key, task, frame, rows)
-            tally.add(frame, rows, known)
+            tally.add(frame, rows, true_frame)
             progress(f"{task.scene.name} · {name}", done, len(task.indices))
         folder.require_whole()
         folder.save()
@@ -119,11 +119,11 @@ def _fused_frames(task: Task, fused: FusedLabels, pixel_stride: int) -> Iterator
     truth = truth_task(task)
 
     def read_and_fuse(index: int) -> tuple[Frame, Int64, Frame | None]:
-        frame, known = read(task, index), None
+        frame, true_frame = read(task, index), None
         if truth is not None:
             with contextlib.suppress(DataError):  # a frame without ground truth
-                known = read(truth, index)
-        return frame, fused.of(frame, pixel_stride), known
+                true_frame = read(truth, index)
+        return frame, fused.of(frame, pixel_stride), true_frame
 
     return (fetched.item for fetched in prefetch(read_and_fuse, task.indices))
 

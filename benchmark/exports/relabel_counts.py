@@ -113,15 +113,15 @@ class Tally:
             self.counts[name] += int(np.count_nonzero(mask))
         if truth is None or truth.shape != fused.shape:
             return
-        true, known = truth.predicted.astype(np.int64), truth.predicted != truth.ignore_id
+        true, has_truth = truth.predicted.astype(np.int64), truth.predicted != truth.ignore_id
         compared = {
-            "all_before": (before, known & had),
-            "before": (before, known & had & has),
-            "after": (fused, known & had & has),
-            "all_after": (fused, known & has),
+            "all_before": (before, has_truth & had),
+            "before": (before, has_truth & had & has),
+            "after": (fused, has_truth & had & has),
+            "all_after": (fused, has_truth & has),
         }
-        for name, (given, mask) in compared.items():
-            pairs = true[mask] * self._K + given[mask]
+        for name, (labels, mask) in compared.items():
+            pairs = true[mask] * self._K + labels[mask]
             self._confusion[name] += np.bincount(pairs, minlength=self._K**2).reshape(self._K, self._K)
 
     def correctness(self) -> Correctness | None:

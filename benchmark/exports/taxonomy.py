@@ -31,11 +31,11 @@ def write_taxonomy(run: Path, record: Record, file: Path) -> Grouping:
         where = f"{record.unit.scene}, {record.unit.model}"
         raise ConfigError(f"{file}: {where} has no groups of classes to write; semstab-bench show RUN merges says more")
     with settings_of_folder(run) as config:
-        named = config.taxonomy
+        taxonomy = config.taxonomy
     space = (
         LabelSpace(record.summary.taxonomy, tuple(row.name for row in record.summary.table.classes))
-        if named is None
-        else LabelSpace.load(named)
+        if taxonomy is None
+        else LabelSpace.load(taxonomy)
     )
     grouped = grouped_taxonomy(space, groupings.told)
     alpha = groupings.told.alpha.text()
@@ -51,8 +51,8 @@ def grouped_taxonomy(space: LabelSpace, grouping: Grouping) -> LabelSpace:
     for k, name in enumerate(space.classes):
         title = " + ".join(group.get(name, (name,)))
         classes.setdefault(title, k)
-        own = (name,) if name in group else ()
-        members[title] = (*members.get(title, ()), *own, *space.members[k])
+        merged_names = (name,) if name in group else ()
+        members[title] = (*members.get(title, ()), *merged_names, *space.members[k])
     return LabelSpace(
         f"{space.name}, {len(classes)} groups",
         tuple(classes),

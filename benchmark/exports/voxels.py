@@ -167,12 +167,12 @@ class Chosen:
         Raises:
             ConfigError: If none has.
         """
-        left = False
+        has_voxels = False
         for tile in self._files:
             if len(self[tile].table):
-                left = True
+                has_voxels = True
                 yield tile
-        if not left:
+        if not has_voxels:
             limits = f"OP >= {self._min_op}" + (f" and class {' or '.join(self._classes)}" if self._classes else "")
             limits += " and the evidence that --thresholds requires" if self._thresholds is not None else ""
             raise ConfigError(f"{self._record.voxels_file}: no voxel with {limits}; OP goes up to {self._highest}")
@@ -235,18 +235,18 @@ def joined_columns(table: VoxelTable, file: Path) -> dict[str, Column]:
     with parquet.reading(file):
         names = [name for name in pq.read_schema(file).names if name not in INDEX]
         content = parquet.read(file, (*INDEX, *names))
-        keys, theirs = voxel_keys(table.index, np.stack([content[name] for name in INDEX], axis=1))
+        keys, file_keys = voxel_keys(table.index, np.stack([content[name] for name in INDEX], axis=1))
     if content["voxel_size"] != table.voxel_size:
         raise DataError(
             f"{file}: the file has voxels of {content['voxel_size']:g} m, the map of {table.voxel_size:g} m"
         )
-    at = np.minimum(np.searchsorted(keys, theirs), len(keys) - 1)
-    joined = keys[at] == theirs
+    positions = np.minimum(np.searchsorted(keys, file_keys), len(keys) - 1)
+    joined = keys[positions] == file_keys
     columns = {}
     for name in names:
         empty = np.nan if content[name].dtype.kind == "f" else 0
         values = np.full(len(table), empty, dtype=content[name].dtype)
-        values[at[joined]] = content[name][joined]
+        values[positions[joined]] = content[name][joined]
         columns[name] = Column(values)
     return columns
 
@@ -262,18 +262,18 @@ def rows_named(wanted: Sequence[str], names: Sequence[str], where: str) -> list[
     Raises:
         ConfigError: For an unknown name, with the nearest known one.
     """
-    known = {name_key(name): row for row, name in enumerate(names)}
+    row_of_name = {name_key(name): row for row, name in enumerate(names)}
     for name in wanted:
-        if name_key(name) not in known:
+        if name_key(name) not in row_of_name:
             raise ConfigError(f"{where}: no class '{name}'; {nearest(name, names)}")
-    return [known[name_key(name)] for name in wanted]
+    return [row_of_name[name_key(name)] for name in wanted]
 
 
 def _column(name: str, table: VoxelTable, file: Path) -> Column:
     """Return a column by its name: a measure, or one that the run wrote into its Parquet file."""
-    known = {measure.key: measure for measure in measures()}
-    if name in known:
-        return Column(known[name].of(table), known[name].unit, known[name].title)
+    measure_of_key = {measure.key: measure for measure in measures()}
+    if name in measure_of_key:
+        return Column(measure_of_key[name].of(table), measure_of_key[name].unit, measure_of_key[name].title)
     if name == "op":
         return Column(table.op, "frames", "observations")
     if name == "category":
@@ -282,7 +282,7 @@ def _column(name: str, table: VoxelTable, file: Path) -> Column:
         return Column(psa(table), "", "pairwise semantic agreement")
     in_file = parquet.names_in(file)
     if name not in in_file:
-        available = sorted({*known, "op", "category", "psa", *in_file} - {*INDEX, "label"})
+        available = sorted({*measure_of_key, "op", "category", "psa", *in_file} - {*INDEX, "label"})
         raise ConfigError(f"{file}: the run has no column '{name}'; {nearest(name, available)}")
     return Column(VoxelTable.columns(file, [name])[name])
 

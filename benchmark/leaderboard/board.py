@@ -62,24 +62,24 @@ class SceneNumbers:
     @classmethod
     def of(cls, sums: ClusterSums, spots: Spots) -> SceneNumbers:
         """Return the numbers of sums that were checked."""
-        whole = completed(sums, spots)
-        alpha, of_labelled = (estimate(each, "alpha", scope=scope_of(each)) for each in (whole, sums))
+        complete = completed(sums, spots)
+        alpha, of_labelled = (estimate(part, "alpha", scope=scope_of(part)) for part in (complete, sums))
         keys = OF_TRUTH if sums.truth else ()
         truth = {key: estimate(sums, key, scope=scope_of(sums, key=key)) for key in keys}
         labelled = labelled_share(sums.answers[0], spots)
-        level = _level(whole, spots, alpha, _at_least_wrong(sums, truth))
-        return cls(whole, alpha, of_labelled, labelled, level, truth)
+        level = _level(complete, spots, alpha, _at_least_wrong(sums, truth))
+        return cls(complete, alpha, of_labelled, labelled, level, truth)
 
 
-def _level(whole: ClusterSums, spots: Spots, alpha: Interval, wrong: Interval) -> Level:
+def _level(complete: ClusterSums, spots: Spots, alpha: Interval, wrong: Interval) -> Level:
     """Return the level of the verdict, with all answers that a model has to give."""
-    first = whole.answers[0]
-    voxels, evidence = round(float(whole["voxels"].sum())), first["evidence"].sum(axis=0)
+    first = complete.answers[0]
+    voxels, evidence = round(float(complete["voxels"].sum())), first["evidence"].sum(axis=0)
     largest, n = int(evidence.argmax()), float(evidence.sum())
     agreement = SpotAgreement(
         spacing=math.nan, spots=round(float(first["voxels"].sum())), cubes=first.cells, frames=spots.frames,
         views=len(np.unique(first.frame)) * max(first.step, 1), chance=chance_of(first),
-        largest_class=whole.classes[largest], largest_share=float(evidence[largest]) / n if n else math.nan,
+        largest_class=complete.classes[largest], largest_share=float(evidence[largest]) / n if n else math.nan,
         labelled=1.0, classes=(),
     )  # fmt: skip
     headline = HeadlineStatistics(alpha, UNKNOWN, UNKNOWN, UNKNOWN, wrong)
@@ -127,31 +127,31 @@ class BoardRow:
     @property
     def alpha(self) -> Interval:
         """Alpha, the mean over places, in which an answer that is missing disagrees."""
-        return self._mean([own.alpha for own in self.scenes.values()])
+        return self._mean([scene_numbers.alpha for scene_numbers in self.scenes.values()])
 
     @property
     def of_labelled(self) -> Interval:
         """Alpha of the answers that there are, the mean over places."""
-        return self._mean([own.of_labelled for own in self.scenes.values()])
+        return self._mean([scene_numbers.of_labelled for scene_numbers in self.scenes.values()])
 
     @property
     def labelled(self) -> float:
         """Share of the answers that a model has to give that it gives, the mean over scenes."""
-        return float(np.mean([own.labelled for own in self.scenes.values()]))
+        return float(np.mean([scene_numbers.labelled for scene_numbers in self.scenes.values()]))
 
     def truth(self, key: Number) -> Interval:
         """Return a number that needs ground truth, the mean over places."""
-        return self._mean([own.truth.get(key, UNKNOWN) for own in self.scenes.values()])
+        return self._mean([scene_numbers.truth.get(key, UNKNOWN) for scene_numbers in self.scenes.values()])
 
     @property
     def verdict(self) -> str:
         """The levels of its verdicts, in print: 'stable', 'stable 3, usable 2'."""
-        counts = Counter(own.level for own in self.scenes.values()).most_common()
+        counts = Counter(scene_numbers.level for scene_numbers in self.scenes.values()).most_common()
         return ", ".join(level if len(counts) == 1 else f"{level} {n}" for level, n in counts)
 
     def _mean(self, values: Sequence[Interval]) -> Interval:
-        known = [not math.isnan(own.value) for own in values]
-        return over_places(values, self.places) if all(known) else UNKNOWN
+        defined = [not math.isnan(interval.value) for interval in values]
+        return over_places(values, self.places) if all(defined) else UNKNOWN
 
 
 @dataclass(frozen=True, eq=False)
@@ -215,15 +215,15 @@ def board_of(benchmark: Benchmark, results: Sequence[Result]) -> Board:
         for name, (_, _, handle) in zip(names, results, strict=True)
     }
     unranked = _unranked(numbers)
-    compared = [name for name in names if not any(name in left for left in unranked.values())]
+    compared = [name for name in names if not any(name in unranked_names for unranked_names in unranked.values())]
     ranking = ranked(
         [{name: numbers[name][scene].whole for name in compared} for scene in numbers[names[0]]], compared, places
     )
     rank: dict[str, int | None] = {name: number for number, group in ranking.ranks for name in group}
     worse = dict.fromkeys(compared, 0)
-    for each in ranking.differences:
-        if each.shown:
-            worse[each.model if each.value > 0 else each.other] += 1
+    for difference in ranking.differences:
+        if difference.shown:
+            worse[difference.model if difference.value > 0 else difference.other] += 1
     rows = [
         BoardRow(file, name, about, rank.get(name), len(compared) - worse.get(name, 0), numbers[name], places)
         for name, (file, about, _) in zip(names, results, strict=True)
@@ -248,8 +248,14 @@ def _unranked(numbers: Mapping[str, Mapping[str, SceneNumbers]]) -> dict[str, tu
     """Return the models that alpha cannot rank, by the reason."""
     reasons: dict[str, tuple[str, ...]] = {}
     for name, scenes in numbers.items():
-        levels = Counter(own.level for own in scenes.values() if own.level in NOT_RANKED or math.isnan(own.alpha.value))
-        if 2 * levels.total() > len(scenes) or any(math.isnan(own.alpha.value) for own in scenes.values()):
+        levels = Counter(
+            scene_numbers.level
+            for scene_numbers in scenes.values()
+            if scene_numbers.level in NOT_RANKED or math.isnan(scene_numbers.alpha.value)
+        )
+        if 2 * levels.total() > len(scenes) or any(
+            math.isnan(scene_numbers.alpha.value) for scene_numbers in scenes.values()
+        ):
             reason = NOT_RANKED.get(levels.most_common(1)[0][0], NOT_RANKED["no verdict"])
             reasons[reason] = (*reasons.get(reason, ()), name)
     return reasons
@@ -264,15 +270,15 @@ def _name(about: Submission, handle: RunHandle) -> str:
 
 def headline(board: Board) -> Table:
     """Return the table of a benchmark: rank, model, and the numbers that follow from its sums."""
-    shown = [key for key in OF_TRUTH if key in board.benchmark.measures]
+    keys = [key for key in OF_TRUTH if key in board.benchmark.measures]
     columns = (
         Column("rank", "rank"), Column("model", "model"), Column("alpha", "alpha", 3, "higher"),
         Column("of_labelled", "of what it labels", 3, "higher"), Column("labelled", "labelled, %", 1, "higher"),
-        *(OF_TRUTH[key] for key in shown), Column("verdict", "verdict"),
+        *(OF_TRUTH[key] for key in keys), Column("verdict", "verdict"),
     )  # fmt: skip
     rows: tuple[Row, ...] = tuple(
         (
-            row.ranks, row.name, row.alpha, row.of_labelled, 100 * row.labelled, *(row.truth(key) for key in shown),
+            row.ranks, row.name, row.alpha, row.of_labelled, 100 * row.labelled, *(row.truth(key) for key in keys),
             row.verdict,
         )
         for row in board.rows
@@ -288,8 +294,8 @@ def headline(board: Board) -> Table:
         " share ranks are not told apart."
     )
     caption += "".join(f" {text[0].upper()}{text[1:]}." for text in board.reasons)
-    named = f"{benchmark.id} ({benchmark.digest})"
-    return _table(board, "leaderboard", benchmark.id, caption, columns, rows, named)
+    definition = f"{benchmark.id} ({benchmark.digest})"
+    return _table(board, "leaderboard", benchmark.id, caption, columns, rows, definition)
 
 
 def by_scene(board: Board) -> Table:
@@ -316,11 +322,11 @@ def stated(board: Board) -> Table:
         Column("url", "address"), Column("notes", "notes"),
     )  # fmt: skip
     rows: tuple[Row, ...] = tuple(_stated(row) for row in board.rows)
-    kept = [k for k, column in enumerate(columns) if k == 0 or any(_is_told(row[k]) for row in rows)]
-    rows = tuple(tuple(row[k] for k in kept) for row in rows)
+    nonempty = [k for k, column in enumerate(columns) if k == 0 or any(_is_told(row[k]) for row in rows)]
+    rows = tuple(tuple(row[k] for k in nonempty) for row in rows)
     caption = "Not checked: stated by whoever handed the result in. Ranks do not depend on it."
-    shown = tuple(columns[k] for k in kept)
-    return _table(board, "stated", f"{board.benchmark.id}, as stated", caption, shown, rows)
+    filled_columns = tuple(columns[k] for k in nonempty)
+    return _table(board, "stated", f"{board.benchmark.id}, as stated", caption, filled_columns, rows)
 
 
 def _stated(row: BoardRow) -> Row:
@@ -339,9 +345,15 @@ def _is_told(cell: object) -> bool:
 
 
 def _table(
-    board: Board, name: str, title: str, caption: str, columns: tuple[Column, ...], rows: tuple[Row, ...], of: str = ""
+    board: Board,
+    name: str,
+    title: str,
+    caption: str,
+    columns: tuple[Column, ...],
+    rows: tuple[Row, ...],
+    benchmark: str = "",
 ) -> Table:
-    return Table(f"{name}-{board.benchmark.id}", title, caption, columns, (Group("", rows),), "", of)
+    return Table(f"{name}-{board.benchmark.id}", title, caption, columns, (Group("", rows),), "", benchmark)
 
 
 def tables_of(board: Board) -> list[Table]:

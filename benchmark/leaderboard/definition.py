@@ -101,8 +101,8 @@ class Benchmark(Settings):
 
     def places(self) -> tuple[str, ...]:
         """Return the place of each scene: scenes that are one place flown again count as one together."""
-        of = {scene: place for place, own in self.flights.items() for scene in own}
-        return tuple(of.get(scene, scene) for scene in self.scenes)
+        place_of = {scene: place for place, scenes in self.flights.items() for scene in scenes}
+        return tuple(place_of.get(scene, scene) for scene in self.scenes)
 
     def configured(
         self,
@@ -129,11 +129,11 @@ class Benchmark(Settings):
         content["benchmark"] = {"id": self.id, "digest": self.digest, "file": self.file}
         content["truth"] = self.statistics
         if taxonomy is not None:
-            own, given = self._classes, LabelSpace.load(taxonomy)
-            if own != given.classes:
-                raise ConfigError(f"{taxonomy}: its classes are not those of {self.id}: {', '.join(own) or 'any'}")
+            classes, space = self._classes, LabelSpace.load(taxonomy)
+            if classes != space.classes:
+                raise ConfigError(f"{taxonomy}: its classes are not those of {self.id}: {', '.join(classes) or 'any'}")
             ignored = LabelSpace.load(self.taxonomy).ignored if self.taxonomy is not None else ()
-            if lost := [name for name in ignored if name not in given.ignored]:
+            if lost := [name for name in ignored if name not in space.ignored]:
                 raise ConfigError(f"{taxonomy}: {self.id} ignores {', '.join(lost)}; add them to 'ignored'")
             content["taxonomy"] = taxonomy
         if self.voxel_sizes:
@@ -151,10 +151,10 @@ class Benchmark(Settings):
 
     def changed(self, config: Config) -> list[str]:
         """Return the settings of a run that are not those of the definition."""
-        own, given = (each.model_dump(mode="json", include={*IN_A_RUN}) for each in (self, config))
+        defined, configured = (settings.model_dump(mode="json", include={*IN_A_RUN}) for settings in (self, config))
         if config.taxonomy is not None and LabelSpace.load(config.taxonomy).classes == self._classes:
-            own["taxonomy"] = config.taxonomy
-        return [name for name, value in given.items() if value != own[name]]
+            defined["taxonomy"] = config.taxonomy
+        return [name for name, value in configured.items() if value != defined[name]]
 
     @property
     def _classes(self) -> tuple[str, ...]:
@@ -193,14 +193,14 @@ class Benchmark(Settings):
         if self.digests is None:
             return
         for name, scene in self.open_scenes(data).items():
-            known, indices = self.digests.get(name, "").split(), self.selected(scene)
-            for (index, hashes), expected in zip(self._hashes(scene, indices), known, strict=False):
+            digests, indices = self.digests.get(name, "").split(), self.selected(scene)
+            for (index, hashes), expected in zip(self._hashes(scene, indices), digests, strict=False):
                 for (what, hashed), stated in zip(hashes.items(), expected.split("-"), strict=True):
                     if hashed != stated:
                         raise DataError(f"{name}: {what} differs from that of {self.id} (frame {index}); {self._again}")
-            if len(indices) != len(known):
+            if len(indices) != len(digests):
                 raise DataError(
-                    f"{name}: {len(indices)} frames are selected, but {self.id} has {len(known)}; {self._again}"
+                    f"{name}: {len(indices)} frames are selected, but {self.id} has {len(digests)}; {self._again}"
                 )
 
     @functools.cached_property
@@ -241,9 +241,9 @@ class Benchmark(Settings):
 
     def _spots(self, scene: Scene) -> Spots:
         indices = self.selected(scene)
-        seen = (
-            leave_out(each.item, (), masks=self.exclude.masks).every(self.pixel_stride)
-            for each in prefetch(scene.geometry, indices)
+        geometry = (
+            leave_out(fetched.item, (), masks=self.exclude.masks).every(self.pixel_stride)
+            for fetched in prefetch(scene.geometry, indices)
         )
         sources = [*((GROUND_TRUTH,) if scene.ground_truth else ()), *scene.models]
         source = scene.label_space(sources[0]) if sources else LabelSpace.load(str(self.taxonomy))
@@ -251,8 +251,8 @@ class Benchmark(Settings):
         truth = None
         if scene.ground_truth:
             task = Task(scene, GROUND_TRUTH, indices, source.mapping_to(target), (), exclude=self.exclude)
-            truth = (each.item for each in prefetch(lambda k: read(task, k, self.pixel_stride), indices))
-        return spots_of(seen, truth, target.classes)
+            truth = (fetched.item for fetched in prefetch(lambda k: read(task, k, self.pixel_stride), indices))
+        return spots_of(geometry, truth, target.classes)
 
     @property
     def _again(self) -> str:
@@ -291,9 +291,9 @@ def load_benchmark(named: str | Path) -> Benchmark:
     if text.endswith((".yaml", ".yml")):
         path = Path(text)
         return validated(Benchmark, read_yaml(path) | {"id": path.stem, "file": str(path.absolute())}, f"{path}: ")
-    known = shipped_benchmarks()
-    if text not in known and (versions := [each for each in known if each.partition("@")[0] == text]):
+    shipped = shipped_benchmarks()
+    if text not in shipped and (versions := [name for name in shipped if name.partition("@")[0] == text]):
         text = versions[-1]
-    if text not in known:
-        raise ConfigError(f"'{named}' is neither a benchmark that ships nor a .yaml file; {nearest(text, [*known])}")
-    return validated(Benchmark, read_yaml(known[text]) | {"id": text}, f"{text}.yaml: ")
+    if text not in shipped:
+        raise ConfigError(f"'{named}' is neither a benchmark that ships nor a .yaml file; {nearest(text, [*shipped])}")
+    return validated(Benchmark, read_yaml(shipped[text]) | {"id": text}, f"{text}.yaml: ")

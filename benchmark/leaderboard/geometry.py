@@ -70,9 +70,9 @@ class Spots:
 
     def coarsened(self) -> Spots:
         """Return the same with cubes of twice the edge."""
-        keys, of = distinct_rows(np.concatenate([self.table[:, :3] // 2, self.table[:, 3:4]], axis=1))
+        keys, inverse = distinct_rows(np.concatenate([self.table[:, :3] // 2, self.table[:, 3:4]], axis=1))
         counts = np.zeros((len(keys), 2), np.int64)
-        np.add.at(counts, of, self.table[:, 4:])
+        np.add.at(counts, inverse, self.table[:, 4:])
         rows = np.concatenate([keys, counts], axis=1).tolist()
         return dataclasses.replace(self, edge=2 * self.edge, rows=tuple(map(tuple, rows)))
 
@@ -97,9 +97,9 @@ def spots_of(seen: Iterable[Frame], truth: Iterable[Frame] | None, classes: tupl
     needed = answers
     if truth is not None:
         sample, _ = _sampled(truth, len(classes))
-        known = sums_of_spots(sample, first.edge).answers[0]
-        needed, at = np.zeros(len(keys)), rows_in(keys_of(known), keys)
-        needed[at[at >= 0]] = known["observations"][at >= 0, 0]
+        true_answers = sums_of_spots(sample, first.edge).answers[0]
+        needed, positions = np.zeros(len(keys)), rows_in(keys_of(true_answers), keys)
+        needed[positions[positions >= 0]] = true_answers["observations"][positions >= 0, 0]
         shares = _class_shares(sample)
     n = max(float(answers.sum()), 1.0)
     rows = np.concatenate([keys, np.stack([answers, needed], axis=1).astype(np.int64)], axis=1)

@@ -189,10 +189,10 @@ def require_whole(benchmark: Benchmark, handle: RunHandle) -> None:
     for scene in benchmark.scenes:
         if (entry := handle.scenes.get(scene)) is None:
             raise DataError(f"{handle.where}: {scene} of {benchmark.id} is missing; run all of its scenes")
-        summary, known = entry.summary, (benchmark.digests or {}).get(scene)
-        if known is not None and summary.frames != len(known.split()):
+        summary, digests = entry.summary, (benchmark.digests or {}).get(scene)
+        if digests is not None and summary.frames != len(digests.split()):
             raise DataError(
-                f"{handle.where}: {scene} has {summary.frames} frames, but {len(known.split())} in {benchmark.id};"
+                f"{handle.where}: {scene} has {summary.frames} frames, but {len(digests.split())} in {benchmark.id};"
                 " run it again"
             )
         if not math.isclose(summary.table.voxel_size, benchmark.voxel_size):
@@ -219,7 +219,7 @@ def _benchmark_of(run: Path, config: Config) -> Benchmark:
 def _about(benchmark: Benchmark, result: Result, config: Config, handle: RunHandle, card: ModelCard) -> Submission:
     network = [entry.summary.stages_ms.get("network", math.nan) for entry in handle.scenes.values()]
     predicted = config.dataset.name == PREDICTED and not np.isnan(network).all()
-    known = {name: version for name in PACKAGES if (version := version_of(name))}
+    versions = {name: version for name in PACKAGES if (version := version_of(name))}
     return Submission(
         benchmark.id,
         benchmark.digest,
@@ -230,7 +230,7 @@ def _about(benchmark: Benchmark, result: Result, config: Config, handle: RunHand
         f"{platform.system()} {platform.machine()}",
         _processor(),
         os.cpu_count() or 1,
-        known,
+        versions,
         predicted,
         float(np.nanmean(network)) if predicted else math.nan,
     )

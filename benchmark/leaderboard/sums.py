@@ -75,8 +75,8 @@ def checked(
     _refuse(where, "map", sums, _of_rows(sums, [name for name in names if name in sums.layout]))
     if not sums["voxels"].any():
         raise DataError(f"{where}: its map is empty; run the benchmark again")
-    known = sums.frame[sums.frame >= 0]
-    if sums.fused not in (0, spots.frames) or (sums.step and len(np.unique(known)) > spots.frames):
+    frames = sums.frame[sums.frame >= 0]
+    if sums.fused not in (0, spots.frames) or (sums.step and len(np.unique(frames)) > spots.frames):
         raise DataError(f"{where}: its map is of other frames than the definition's {spots.frames}; run it again")
     _refuse(where, "map", sums, _of_map(sums))
     answers = tuple(_at(where, part, spots) for part in sums.answers)
@@ -103,8 +103,8 @@ def _refuse(where: str, what: str, part: ClusterSums, rules: Iterator[Impossible
                 cube, frames = part.cell[row], f", frames from {int(part.frame[row]) * max(part.step, 1)}"
             else:
                 cube, frames = part.index.cubes[min(row, len(part.index.cubes) - 1)], ""
-            at = " ".join(str(int(x)) for x in cube)
-            raise DataError(f"{where}: {rule.what} ({what}, cube {at}{frames}); run the benchmark again")
+            cube_text = " ".join(str(int(x)) for x in cube)
+            raise DataError(f"{where}: {rule.what} ({what}, cube {cube_text}{frames}); run the benchmark again")
 
 
 def _column(part: ClusterSums, name: str) -> Float64:
@@ -164,9 +164,11 @@ def _at(where: str, part: ClusterSums, spots: Spots) -> ClusterSums:
 
 def _of_spots(part: ClusterSums, spots: Spots) -> Iterator[Impossible]:
     """Yield what cannot be of answers that are one class each: a spot has one answer a view."""
-    at, n = rows_in(keys_of(part), spots.keys), _column(part, "observations")
-    yield Impossible("a view that does not see a cube has answers there", at < 0)
-    yield Impossible("there are more answers than spots that the view sees", _more(n, spots.table[at, 4].astype(float)))
+    rows, n = rows_in(keys_of(part), spots.keys), _column(part, "observations")
+    yield Impossible("a view that does not see a cube has answers there", rows < 0)
+    yield Impossible(
+        "there are more answers than spots that the view sees", _more(n, spots.table[rows, 4].astype(float))
+    )
     for name in ("observations", "twice", "evidence", *_by_class(part, "class_own")):
         yield Impossible(f"{name} is no whole number", _any(part[name] != np.round(part[name])))
     for name in ("own", "evidence", *_by_class(part, "class_own")):
@@ -177,10 +179,11 @@ def _of_spots(part: ClusterSums, spots: Spots) -> Iterator[Impossible]:
         yield Impossible(
             "agreeing is not what its classes give", _differ(_column(part, "class_apart") / 2, disagreeing)
         )
-        of_class, apart = (_by_cube(part, name) for name in ("evidence", "class_apart"))
+        of_class, disagreement = (_by_cube(part, name) for name in ("evidence", "class_apart"))
         most = 2 * np.minimum(of_class, of_class.sum(axis=1, keepdims=True) - of_class)
         yield Impossible(
-            "a class disagrees more often than it was seen", _any(_more(apart, most) | _more(-apart, 0 * apart))
+            "a class disagrees more often than it was seen",
+            _any(_more(disagreement, most) | _more(-disagreement, 0 * disagreement)),
         )
     yield Impossible(
         "voxels is not what its parts give",
@@ -208,7 +211,8 @@ def _of_further(nearer: ClusterSums, part: ClusterSums, name: str) -> Iterator[I
         differ = _differ(_column(nearer, column), _column(part, column))
         yield Impossible(f"{column} is not that of the {name} answers", differ)
     n, before, agreeing = (
-        float(of[column].sum()) for of, column in ((part, "observations"), (nearer, "agreeing"), (part, "agreeing"))
+        float(columns[column].sum())
+        for columns, column in ((part, "observations"), (nearer, "agreeing"), (part, "agreeing"))
     )
     yield Impossible(
         f"they agree more often than the {name} answers, which are nearer", np.array([agreeing - before > NOISE * n])
@@ -243,22 +247,26 @@ def _of_map(sums: ClusterSums) -> Iterator[Impossible]:
     """Yield what cannot be of locations: right ones are known, consistent ones were seen three times."""
     if not sums.truth:
         return
-    known, right = _column(sums, "known"), _column(sums, "right")
-    yield Impossible("more locations are known than there are", _more(known, _column(sums, "voxels")))
-    for name, total in (("class_known", known), ("class_right", right), ("class_predicted", known)):
+    with_truth, right = _column(sums, "known"), _column(sums, "right")
+    yield Impossible("more locations are known than there are", _more(with_truth, _column(sums, "voxels")))
+    for name, total in (("class_known", with_truth), ("class_right", right), ("class_predicted", with_truth)):
         for _ in _by_class(sums, name):
             yield Impossible(f"{name} is not what its classes give", _differ(_column(sums, name), total))
     names = ("known", "right", "recurrent", "consistent", "consistent_wrong", "observed", "observed_right")
-    of = {name: _cubes(sums, name) for name in names}
+    totals = {name: _cubes(sums, name) for name in names}
     for smaller, larger in (
         ("right", "known"), ("consistent", "known"), ("consistent", "recurrent"), ("consistent_wrong", "consistent"),
         ("observed_right", "observed"),
     ):  # fmt: skip
-        yield Impossible(f"{smaller} is more than {larger}", _more(of[smaller], of[larger]))
+        yield Impossible(f"{smaller} is more than {larger}", _more(totals[smaller], totals[larger]))
     for name in ("right", "consistent", "consistent_wrong"):
-        yield Impossible(f"{name} is negative", _more(-of[name], 0 * of[name]))
-    yield Impossible("more are wrong than there are", _more(of["consistent_wrong"], of["known"] - of["right"]))
-    yield Impossible("more are right than there are", _more(of["consistent"] - of["consistent_wrong"], of["right"]))
+        yield Impossible(f"{name} is negative", _more(-totals[name], 0 * totals[name]))
+    yield Impossible(
+        "more are wrong than there are", _more(totals["consistent_wrong"], totals["known"] - totals["right"])
+    )
+    yield Impossible(
+        "more are right than there are", _more(totals["consistent"] - totals["consistent_wrong"], totals["right"])
+    )
 
 
 def _of_classes(sums: ClusterSums, near: ClusterSums, spots: Spots, largest: float) -> Iterator[Impossible]:
@@ -270,8 +278,8 @@ def _of_classes(sums: ClusterSums, near: ClusterSums, spots: Spots, largest: flo
             ("class_known", "true classes are others than the definition's", np.array(spots.truth)),
             ("class_predicted", "fused classes are others than those of its spots", of_spots),
         ]
-    for name, what, own in compared:
-        a, b = _shares(sums[name].sum(axis=0)), _shares(own)
+    for name, what, expected in compared:
+        a, b = _shares(sums[name].sum(axis=0)), _shares(expected)
         shift = float(np.abs(a - b).sum()) / 2
         yield Impossible(f"{shift:.0%} of its {what}", np.array([not shift <= largest]))
 
@@ -298,32 +306,34 @@ SHARED = ("agreeing", "twice_agreeing")
 
 
 def _completed(part: ClusterSums, spots: Spots) -> ClusterSums:
-    at: Int64 = rows_in(spots.keys, keys_of(part))
-    here = at >= 0
-    columns = np.zeros((len(at), part.columns.shape[1]))
-    columns[here] = part.columns[at[here]]
-    whole = dataclasses.replace(
+    rows: Int64 = rows_in(spots.keys, keys_of(part))
+    here = rows >= 0
+    columns = np.zeros((len(rows), part.columns.shape[1]))
+    columns[here] = part.columns[rows[here]]
+    complete = dataclasses.replace(
         part, cell=spots.keys[:, :3].astype(np.int32), frame=spots.keys[:, 3].astype(np.int32), columns=columns,
         fused=spots.frames,
     )  # fmt: skip
-    n = whole["observations"][:, 0].copy()
+    n = complete["observations"][:, 0].copy()
     missing = np.maximum(spots.table[:, 5] - n, 0)
-    shares = _shares(whole["evidence"].sum(axis=0))
+    shares = _shares(complete["evidence"].sum(axis=0))
     with np.errstate(invalid="ignore"):
         labelled = np.where(n > 0, n / (n + missing), 0.0)
     for name in SHARED:
-        columns[:, whole.layout[name]] *= labelled[:, None]
+        columns[:, complete.layout[name]] *= labelled[:, None]
     for name in ("observations", "own"):
-        columns[:, whole.layout[name]] += missing[:, None]
-    columns[:, whole.layout["evidence"]] += missing[:, None] * shares
-    filled = columns[:, whole.layout["observations"]][:, 0] > 0
-    return dataclasses.replace(whole, cell=whole.cell[filled], frame=whole.frame[filled], columns=columns[filled])
+        columns[:, complete.layout[name]] += missing[:, None]
+    columns[:, complete.layout["evidence"]] += missing[:, None] * shares
+    filled = columns[:, complete.layout["observations"]][:, 0] > 0
+    return dataclasses.replace(
+        complete, cell=complete.cell[filled], frame=complete.frame[filled], columns=columns[filled]
+    )
 
 
 def labelled_share(first: ClusterSums, spots: Spots) -> float:
     """Return the share of the answers that a model has to give that it gives, from sums of first answers."""
-    at: Int64 = rows_in(keys_of(first), spots.keys)
+    rows: Int64 = rows_in(keys_of(first), spots.keys)
     needed = spots.table[:, 5].astype(np.float64)
-    given = np.zeros(len(needed))
-    given[at] = first["observations"][:, 0]
-    return float(np.minimum(given, needed).sum() / needed.sum()) if needed.any() else 1.0
+    answered = np.zeros(len(needed))
+    answered[rows] = first["observations"][:, 0]
+    return float(np.minimum(answered, needed).sum() / needed.sum()) if needed.any() else 1.0

@@ -82,8 +82,8 @@ class Sequence:
         self.count, self.classes, self.of_scans = 0, 0, False
         self.of_features = self.has_features = True
         self.has_truth, times, digest = True, list[float | None](), hashlib.blake2b(digest_size=16)
-        for given in frames:
-            frame, truth = as_frame(given, self.count)
+        for item in frames:
+            frame, truth = as_frame(item, self.count)
             with self._file(self.count).open("wb") as file:
                 pickle.dump((frame, truth), file, protocol=5)
             true = None if truth is None else truth.labels

@@ -65,8 +65,8 @@ class State:
         table, updates = _added(a.table, b.table, a.updates, b.updates)
         flicker = self.flicker[0] + other.flicker[0], self.flicker[1] + other.flicker[1]
         spots = None if a.spots is None or b.spots is None else _joined(a.spots, b.spots)
-        one, two = self.features, other.features
-        features = _with_features(one, two) if one is not None and two is not None else one or two
+        first, second = self.features, other.features
+        features = _with_features(first, second) if first is not None and second is not None else first or second
         return State(self.frames + other.frames, table, updates, spots, flicker, one_in, features)
 
     def _thinned(self, one_in: int) -> State:
@@ -78,17 +78,17 @@ class State:
     def scalars(self) -> dict[str, float]:
         """Return the numbers of `Summary.NAMES`, which `summary` has too, without intervals."""
         table = self._table()
-        whole, sample = summarise(table), MapSample.draw(table).table.measured()
+        map_summary, sample = summarise(table), MapSample.draw(table).table.measured()
         alpha = math.nan
         if self.spots is not None and len(self.spots):
             alpha = value(sums_of_spots(self.spots), "alpha")
         numbers = (
             alpha,
-            whole.recurrent[VSS],
-            whole.recurrent[SBD],
+            map_summary.recurrent[VSS],
+            map_summary.recurrent[SBD],
             mean(psa(sample)),
             self._flicker,
-            whole.recurrent.share,
+            map_summary.recurrent.share,
         )
         scalars = dict(zip(Summary.NAMES, map(float, numbers), strict=True))
         if self.features is not None:
@@ -250,8 +250,8 @@ class TemporalStability:
         names = [sequence] * len(frames) if isinstance(sequence, str | int) else [*sequence]
         if len(names) != len(frames):
             raise DataError(f"sequence: {len(names)} names for {len(frames)} frames; give one name, or one a frame")
-        for given, frame in zip(names, frames, strict=True):
-            name = str(given.item() if hasattr(given, "item") else given)
+        for sequence_name, frame in zip(names, frames, strict=True):
+            name = str(sequence_name.item() if hasattr(sequence_name, "item") else sequence_name)
             if name not in self._maps:
                 self._maps[name] = self._new_map()
             self._maps[name].add(frame)
@@ -277,7 +277,7 @@ class TemporalStability:
 
     def states(self) -> dict[str, State]:
         """Return the state of each sequence, to be sent to another process and merged there."""
-        return _sum(self._merged, {name: own.state() for name, own in self._maps.items()})
+        return _sum(self._merged, {name: sequence_map.state() for name, sequence_map in self._maps.items()})
 
     def merge_state(self, incoming_state: TemporalStability | Mapping[str, State]) -> None:
         """Add the states of another metric, or its `states`; a sequence may have been split between them."""
@@ -303,11 +303,13 @@ class TemporalStability:
             )
         if not isinstance(intrinsics, Intrinsics | list | tuple):
             intrinsics = as_array(intrinsics)
-        own = [*intrinsics] if np.ndim(intrinsics) == 3 or _are_cameras(intrinsics) else [intrinsics] * B
+        cameras = [*intrinsics] if np.ndim(intrinsics) == 3 or _are_cameras(intrinsics) else [intrinsics] * B
         poses = [*T_wc] if T_wc.ndim == 3 else [T_wc] * B
-        if not len(own) == len(poses) == B:
-            raise DataError(f"{len(own)} intrinsics and {len(poses)} poses for {B} frames; give one, or one a frame")
-        return [self._frame(k, predicted[k], depth[k], own[k], poses[k]) for k in range(B)]
+        if not len(cameras) == len(poses) == B:
+            raise DataError(
+                f"{len(cameras)} intrinsics and {len(poses)} poses for {B} frames; give one, or one a frame"
+            )
+        return [self._frame(k, predicted[k], depth[k], cameras[k], poses[k]) for k in range(B)]
 
     def _frame(self, k: int, predicted: npt.NDArray[Any], depth: npt.NDArray[Any], camera: Any, pose: Float64) -> Frame:
         labels = scores = None
@@ -332,15 +334,15 @@ class TemporalStability:
     def _checked(self, k: int, labels: npt.NDArray[Any]) -> npt.NDArray[Any]:
         """Return labels as uint8, or uint16 with more classes; ignored pixels get the highest id."""
         dtype, none = (np.uint8, IGNORE_8BIT) if self.num_classes < IGNORE_8BIT else (np.uint16, IGNORE_16BIT)
-        known = (labels >= 0) & (labels < self.num_classes)
-        if not known.all():
+        valid = (labels >= 0) & (labels < self.num_classes)
+        if not valid.all():
             ignored = labels == IGNORE_16BIT if self.ignore_index is None else labels == self.ignore_index
-            wrong = labels[~known & ~ignored & (labels != IGNORE_16BIT)]
+            wrong = labels[~valid & ~ignored & (labels != IGNORE_16BIT)]
             if len(wrong):
                 raise DataError(f"frame {k}: label {int(wrong[0])} is not below num_classes = {self.num_classes}")
         if self.ignore_index is not None:
-            known &= labels != self.ignore_index
-        return np.where(known, labels, none).astype(dtype)
+            valid &= labels != self.ignore_index
+        return np.where(valid, labels, none).astype(dtype)
 
 
 def _featured(frames: Sequence[Frame], features: npt.NDArray[Any]) -> list[Frame]:
@@ -349,11 +351,11 @@ def _featured(frames: Sequence[Frame], features: npt.NDArray[Any]) -> list[Frame
     if features.ndim != 4 or len(features) != len(frames):
         raise DataError(f"features of shape {features.shape} for {len(frames)} frames; give (D, h, w), or (B, D, h, w)")
     pairs = zip(frames, np.moveaxis(features, 1, -1), strict=True)
-    return [dataclasses.replace(frame, features=own) for frame, own in pairs]
+    return [dataclasses.replace(frame, features=frame_features) for frame, frame_features in pairs]
 
 
 def _are_cameras(intrinsics: Any) -> bool:
-    return isinstance(intrinsics, list | tuple) and all(isinstance(one, Intrinsics) for one in intrinsics)
+    return isinstance(intrinsics, list | tuple) and all(isinstance(camera, Intrinsics) for camera in intrinsics)
 
 
 def _probabilities(logits: npt.NDArray[Any]) -> npt.NDArray[Any]:
@@ -366,34 +368,34 @@ def _probabilities(logits: npt.NDArray[Any]) -> npt.NDArray[Any]:
     return probabilities
 
 
-def _sum(one: Mapping[str, State], other: Mapping[str, State]) -> dict[str, State]:
+def _sum(first: Mapping[str, State], second: Mapping[str, State]) -> dict[str, State]:
     """Return the states of the sequences of both; states of the same sequence are added."""
-    both = dict(one)
-    for name, state in other.items():
-        both[name] = both[name] + state if name in both else state
-    return both
+    total = dict(first)
+    for name, state in second.items():
+        total[name] = total[name] + state if name in total else state
+    return total
 
 
 def _added(a: VoxelTable, b: VoxelTable, updates_a: Int64, updates_b: Int64) -> tuple[VoxelTable, Int64]:
     """Return the map of the frames of two maps, and how often its voxels were moved."""
-    index, of = np.unique(np.concatenate([a.index, b.index]), axis=0, return_inverse=True)
-    n, of = len(index), of.ravel()
+    index, inverse = np.unique(np.concatenate([a.index, b.index]), axis=0, return_inverse=True)
+    n, inverse = len(index), inverse.ravel()
 
     def total(name: str) -> npt.NDArray[Any]:
         sums = np.zeros(n, getattr(a, name).dtype)
-        np.add.at(sums, of, np.concatenate([getattr(a, name), getattr(b, name)]))
+        np.add.at(sums, inverse, np.concatenate([getattr(a, name), getattr(b, name)]))
         return sums
 
     first, last = np.full(n, np.iinfo(np.int32).max, np.int32), np.zeros(n, np.int32)
-    np.minimum.at(first, of, np.concatenate([a.first_frame, b.first_frame]))
-    np.maximum.at(last, of, np.concatenate([a.last_frame, b.last_frame]))
+    np.minimum.at(first, inverse, np.concatenate([a.first_frame, b.first_frame]))
+    np.maximum.at(last, inverse, np.concatenate([a.last_frame, b.last_frame]))
     updates = np.zeros(n, np.int64)
-    np.add.at(updates, of, np.concatenate([updates_a, updates_b]))
+    np.add.at(updates, inverse, np.concatenate([updates_a, updates_b]))
     evidence = Evidence.joined([a.evidence, b.evidence])
-    voxel = np.repeat(of, np.diff(evidence.starts))
-    key, at = np.unique(voxel * a.K + evidence.label, return_inverse=True)
+    voxel = np.repeat(inverse, np.diff(evidence.starts))
+    key, positions = np.unique(voxel * a.K + evidence.label, return_inverse=True)
     starts = np.searchsorted(key, np.arange(n + 1) * a.K)
-    weight = np.bincount(at.ravel(), evidence.weight, len(key)).astype(np.float64, copy=False)
+    weight = np.bincount(positions.ravel(), evidence.weight, len(key)).astype(np.float64, copy=False)
     summed = {name: total(name) for name in ("op", "drift_sum", "pixels", "self_sum", "frame_entropy_sum")}
     return VoxelTable(
         **index_columns(index), **summed, first_frame=first, last_frame=last, voxel_size=a.voxel_size,
@@ -414,8 +416,8 @@ def _with_features(a: FeatureObservations, b: FeatureObservations) -> FeatureObs
     while len(a.vectors) + len(b.vectors) > most:
         share //= 2
         a, b = a.within(share), b.within(share)
-    both = _joined(a.spots, b.spots)
-    return FeatureObservations(both, np.concatenate([a.vectors, b.vectors]), max(a.one_in, b.one_in))
+    spots = _joined(a.spots, b.spots)
+    return FeatureObservations(spots, np.concatenate([a.vectors, b.vectors]), max(a.one_in, b.one_in))
 
 
 def _joined(a: SpotObservations, b: SpotObservations) -> SpotObservations:
@@ -428,9 +430,9 @@ def _joined(a: SpotObservations, b: SpotObservations) -> SpotObservations:
     later = dataclasses.replace(b, spot=b.spot + np.int32(len(a.point)), view=b.view + np.int32(len(a.views)))
     views = Views.joined([a.views, b.views])
     views = dataclasses.replace(views, frame=np.arange(len(views)))
-    both = SpotObservations.stacked([a, later])
-    point, drawn = np.concatenate([a.point, b.point]), np.concatenate([a.drawn, b.drawn])
+    joined = SpotObservations.stacked([a, later])
+    point, cell_hash = np.concatenate([a.point, b.point]), np.concatenate([a.drawn, b.drawn])
     return dataclasses.replace(
-        both, point=point, drawn=drawn, views=views, share=share, spacing=max(a.spacing, b.spacing),
+        joined, point=point, drawn=cell_hash, views=views, share=share, spacing=max(a.spacing, b.spacing),
         frames=a.frames + b.frames,
     )  # fmt: skip

@@ -21,9 +21,9 @@ def depth_edges(depth: Float32) -> Mask:
     """
     import cv2
 
-    known = np.where((depth > 0) & (depth < np.inf), depth, np.float32(0)).astype(np.float32)
+    valid_depth = np.where((depth > 0) & (depth < np.inf), depth, np.float32(0)).astype(np.float32)
     size = 2 * max(3, depth.shape[1] // 100) + 1
-    closed = np.where(known > 0, known, cv2.dilate(known, np.ones((size, size))))
+    closed = np.where(valid_depth > 0, valid_depth, cv2.dilate(valid_depth, np.ones((size, size))))
     with np.errstate(all="ignore"):
         log = np.where(closed > 0, np.log(closed), np.nan)
         return _changes(log, lambda a, b: np.abs(a - b) > JUMP)

@@ -26,7 +26,9 @@ def _seen_at(d: float, ray_x: float, ray_y: float, motion: Any, camera: Any) -> 
 
 
 @serial
-def _look_up_row(depth: Any, ray_x: Any, ray_y: float, motion: Any, camera: Any, shape: Any, at: Any, z: Any) -> None:
+def _look_up_row(
+    depth: Any, ray_x: Any, ray_y: float, motion: Any, camera: Any, shape: Any, index: Any, z: Any
+) -> None:
     """Find the flat index of the other view's pixel in which each point of a row falls, or -1, and its depth there.
 
     There is no branch, so that it runs on vectors.
@@ -36,7 +38,7 @@ def _look_up_row(depth: Any, ray_x: Any, ray_y: float, motion: Any, camera: Any,
         column, row, z[u] = _seen_at(float(depth[u]), ray_x[u], ray_y, motion, camera)
         at_u, at_v = np.floor(column + 0.5), np.floor(row + 0.5)  # integers are pixel centres
         inside = (z[u] > 0.0) & (at_u >= 0.0) & (at_u < W) & (at_v >= 0.0) & (at_v < H)
-        at[u] = np.int32(at_v * W + at_u if inside else -1.0)
+        index[u] = np.int32(at_v * W + at_u if inside else -1.0)
 
 
 @serial
@@ -52,12 +54,16 @@ def look_up(depth: Any, rays: Any, motion: Any, other_depth: Any, camera: Any, t
         tolerance: Tolerance of the occlusion test, relative to the distance from the other camera.
         out: (H, W) int32, is filled.
     """
-    there, z = other_depth.reshape(-1), np.empty(depth.shape[1])
+    other_flat, z = other_depth.reshape(-1), np.empty(depth.shape[1])
     for v in range(depth.shape[0]):
-        at = out[v]
-        _look_up_row(depth[v], rays[0], rays[1][v], motion, camera, other_depth.shape, at, z)
-        for u in range(len(at)):
-            at[u] = at[u] if (at[u] >= 0) & (abs(float(there[max(at[u], 0)]) - z[u]) <= tolerance * z[u]) else -1
+        row_index = out[v]
+        _look_up_row(depth[v], rays[0], rays[1][v], motion, camera, other_depth.shape, row_index, z)
+        for u in range(len(row_index)):
+            row_index[u] = (
+                row_index[u]
+                if (row_index[u] >= 0) & (abs(float(other_flat[max(row_index[u], 0)]) - z[u]) <= tolerance * z[u])
+                else -1
+            )
 
 
 @serial
@@ -102,14 +108,14 @@ CHUNKS = 256
 
 
 @compiled(fastmath={"reassoc", "contract"})
-def _total(scores, at, K, shift, unit):
+def _total(scores, start, K, shift, unit):
     """Return the sum of K scores by their bits.
 
     Moved up by `shift` they are those of a double, the score in that unit.
     """
     total = 0.0
     for c in range(K):
-        total += np.int64(np.int64(scores[at + c]) << shift).view(np.float64)
+        total += np.int64(np.int64(scores[start + c]) << shift).view(np.float64)
     return total * unit
 
 
@@ -132,19 +138,19 @@ def cut(scores, k, retained, shift, unit, infinite, shares):
                 value = scores[i * K + c]
                 if count == k and value <= scores[i * K + largest[k - 1]]:
                     continue
-                at = min(count, k - 1)
-                while at > 0 and scores[i * K + largest[at - 1]] < value:
-                    largest[at] = largest[at - 1]
-                    at -= 1
-                largest[at] = c
+                slot = min(count, k - 1)
+                while slot > 0 and scores[i * K + largest[slot - 1]] < value:
+                    largest[slot] = largest[slot - 1]
+                    slot -= 1
+                largest[slot] = c
                 count = min(count + 1, k)
             for j in range(count):
                 retained[i, largest[j]] = scores[i * K + largest[j]]
             if 0 < scores[i * K + largest[0]] < infinite:
-                left = 0.0
+                retained_total = 0.0
                 for j in range(count):
-                    left += _total(scores, i * K + largest[j], 1, shift, unit)
-                share = max(0.0, 1.0 - left / _total(scores, i * K, K, shift, unit))
+                    retained_total += _total(scores, i * K + largest[j], 1, shift, unit)
+                share = max(0.0, 1.0 - retained_total / _total(scores, i * K, K, shift, unit))
                 shares[chunk, 0] += 1.0
                 shares[chunk, 1] += share
                 shares[chunk, 2] = max(shares[chunk, 2], share)
@@ -164,9 +170,9 @@ def lengthen(labels: Any, before: Any, valid: Any, most: int, length: Any) -> No
 @serial
 def count_long(counted: Any, constant: Any, n: int) -> tuple[int, int]:
     """Return the pixels whose first length is n, and those among them whose second one is too."""
-    pixels = both = 0
+    pixels = constant_long = 0
     for i in range(len(counted)):
         long = counted[i] >= n
         pixels += long
-        both += long & (constant[i] >= n)
-    return pixels, both
+        constant_long += long & (constant[i] >= n)
+    return pixels, constant_long

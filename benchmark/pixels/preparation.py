@@ -118,8 +118,8 @@ def keep_largest(frame: Frame, k: int) -> Frame:
     scores = frame.scores
     if k >= scores.shape[2]:
         return frame
-    known = scores.dtype in (np.float16, np.float32)
-    scores = np.abs(scores if known else scores.astype(np.float64))  # no -0, whose bits are large
+    supported = scores.dtype in (np.float16, np.float32)
+    scores = np.abs(scores if supported else scores.astype(np.float64))  # no -0, whose bits are large
     bits = BITS[scores.dtype.itemsize]
     retained, shares = np.zeros(scores.shape, dtype=bits), np.zeros((CHUNKS, 3))
     infinite = int(np.array(np.inf, dtype=scores.dtype).view(bits))

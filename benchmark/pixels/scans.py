@@ -35,9 +35,9 @@ def dominant_before(previous: Frame, current: Frame, voxel_size: float) -> Int32
     order = np.lexsort((pairs, -count, pairs >> 16))
     pairs = pairs[order]
     first = np.flatnonzero(np.diff(pairs >> 16, prepend=-2))
-    known, label = pairs[first] >> 16, (pairs[first] & 0xFFFF).astype(np.int32)
-    at = np.minimum(np.searchsorted(known, keys), len(known) - 1)
-    return np.where((known[at] == keys) & (keys >= 0), label[at], np.int32(-1))
+    voxels_before, label = pairs[first] >> 16, (pairs[first] & 0xFFFF).astype(np.int32)
+    positions = np.minimum(np.searchsorted(voxels_before, keys), len(voxels_before) - 1)
+    return np.where((voxels_before[positions] == keys) & (keys >= 0), label[positions], np.int32(-1))
 
 
 def _voxels(frame: Frame, origin: Float64, voxel_size: float) -> Int64:
@@ -57,15 +57,15 @@ def pictured(frame: Frame, values: npt.NDArray[Any], fill: float) -> npt.NDArray
     of the nearest point that falls into it, or `fill` without a point.
     """
     assert frame.points is not None
-    there = np.flatnonzero((frame.depth > 0) & (frame.depth < np.inf))
+    valid = np.flatnonzero((frame.depth > 0) & (frame.depth < np.inf))
     picture = np.full((ROWS, WIDTH), fill, dtype=values.dtype)
-    if not len(there):
+    if not len(valid):
         return picture
-    x, y, z = frame.points.reshape(-1, 3)[there].T.astype(np.float64)
+    x, y, z = frame.points.reshape(-1, 3)[valid].T.astype(np.float64)
     elevation = np.arctan2(z, np.hypot(x, y))
     low, high = np.quantile(elevation, [0.001, 0.999])
     row = np.clip((high - elevation) / max(high - low, 1e-6) * ROWS, 0, ROWS - 1).astype(int)
     column = np.clip((math.pi - np.arctan2(y, x)) / (2 * math.pi) * WIDTH, 0, WIDTH - 1).astype(int)
-    far_first = np.argsort(-frame.depth.reshape(-1)[there], kind="stable")
-    picture[row[far_first], column[far_first]] = values.reshape(-1)[there][far_first]
+    far_first = np.argsort(-frame.depth.reshape(-1)[valid], kind="stable")
+    picture[row[far_first], column[far_first]] = values.reshape(-1)[valid][far_first]
     return picture

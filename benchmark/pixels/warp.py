@@ -27,11 +27,11 @@ def density(depth: Float32) -> float:
 
     It is about the chance that a point, seen by two views, meets depth in both. NaN if no pixel has depth.
     """
-    known = (depth > 0) & (depth < np.inf)
-    pairs = ((known[:, 1:], known[:, :-1]), (known[1:], known[:-1]))
-    both = sum(np.count_nonzero(a & b) for a, b in pairs)
-    each = sum(np.count_nonzero(a) + np.count_nonzero(b) for a, b in pairs)
-    return 2 * both / each if each else math.nan
+    has_depth = (depth > 0) & (depth < np.inf)
+    pairs = ((has_depth[:, 1:], has_depth[:, :-1]), (has_depth[1:], has_depth[:-1]))
+    num_pairs = sum(np.count_nonzero(a & b) for a, b in pairs)
+    num_with_depth = sum(np.count_nonzero(a) + np.count_nonzero(b) for a, b in pairs)
+    return 2 * num_pairs / num_with_depth if num_with_depth else math.nan
 
 
 @dataclass(frozen=True, eq=False)
@@ -91,8 +91,8 @@ def warp(
 
     Labels, scores, colours: the nearest pixel's value, never a mixture. See `correspond`.
     """
-    seen = correspond(target, source, depth_tolerance=depth_tolerance)
-    return seen.bring(values, fill), seen.visible
+    correspondence = correspond(target, source, depth_tolerance=depth_tolerance)
+    return correspondence.bring(values, fill), correspondence.visible
 
 
 def motion(frame: Frame, other: Frame) -> Float64:

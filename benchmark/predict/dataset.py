@@ -76,8 +76,8 @@ class PredictedOptions(Settings):
             raise ValueError(f"two models are called '{repeated[0]}'; give one a name")
         models = dict[str, PredictorConfig]()
         for predictor in value:  # labels and scores of one name are of one model: they lie side by side
-            alike = predictor.model_copy(update={"scores": False})
-            if models.setdefault(predictor.label_name, alike) != alike:
+            of_labels = predictor.model_copy(update={"scores": False})
+            if models.setdefault(predictor.label_name, of_labels) != of_labels:
                 raise ValueError(f"two models are called '{predictor.label_name}'; give one a name")
         return [predictor.resolved() for predictor in value]
 
@@ -93,7 +93,9 @@ class PredictedDataset(Dataset):
 
     def __init__(self, options: PredictedOptions) -> None:
         self._dataset = open_dataset(options.dataset.name, options.dataset.options)
-        self.predictors: Mapping[str, PredictorConfig] = {each.source_name: each for each in _with_filters(options)}
+        self.predictors: Mapping[str, PredictorConfig] = {
+            predictor.source_name: predictor for predictor in _with_filters(options)
+        }
         self._hidden: dict[str, PredictorConfig] = {}
         self._options = options
         self._loaded: dict[str, Model] = {}
@@ -157,19 +159,19 @@ class PredictedDataset(Dataset):
         config = self.predictor(source)
         if not config.filters or config.model == STORED:
             return None
-        alike = config.unfiltered.model_copy(update={"scores": False})
+        unfiltered = config.unfiltered.model_copy(update={"scores": False})
         with self.lock:
             for name, other in {**self.predictors, **self._hidden}.items():
-                if not other.filters and other.model_copy(update={"name": None, "scores": False}) == alike:
+                if not other.filters and other.model_copy(update={"name": None, "scores": False}) == unfiltered:
                     return name
-            hidden = alike.model_copy(update={"name": f"{config.label_name}-unfiltered"})
+            hidden = unfiltered.model_copy(update={"name": f"{config.label_name}-unfiltered"})
             self._hidden[hidden.source_name] = hidden
         return hidden.source_name
 
     def wants_scores(self, label_name: str) -> bool:
         """Return whether the scores of that model are read, too: by the run, or by filters."""
-        named = [source for source, config in self.predictors.items() if config.label_name == label_name]
-        if any(self.predictors[source].scores for source in named):
+        sources = [source for source, config in self.predictors.items() if config.label_name == label_name]
+        if any(self.predictors[source].scores for source in sources):
             return True
         over = [base for source in self.predictors if (base := self.without_filters(source)) is not None]
         return any(self.predictor(base).label_name == label_name and self.model(base).gives_scores for base in over)
@@ -199,26 +201,34 @@ class PredictedScene(RelabelledScene):
         self._producers: dict[str, Producer] = {}
         self._digests: dict[int, bytes] = {}
         self.with_features = tuple(
-            name for name, each in dataset.predictors.items()
-            if each.model != STORED and not each.filters and dataset.model(name).gives_features
+            name for name, predictor in dataset.predictors.items()
+            if predictor.model != STORED and not predictor.filters and dataset.model(name).gives_features
         )  # fmt: skip
 
     def missing(self, index: int, sources: Sequence[str] = (), *, color: bool = False) -> list[str]:
         """Return the missing files of the frame; it needs its colour where a model is among the sources."""
-        wanted = [self._dataset.predictors[source].looks_at for source in sources if source in self.models]
-        stored = [*{source: None for each in wanted for source in each["sources"]}]
+        requirements = [self._dataset.predictors[source].looks_at for source in sources if source in self.models]
+        stored = [*{source: None for requirement in requirements for source in requirement["sources"]}]
         truth = [source for source in sources if source == GROUND_TRUTH]
-        return self._inner.missing(index, [*stored, *truth], color=color or any(each["color"] for each in wanted))
+        return self._inner.missing(
+            index, [*stored, *truth], color=color or any(requirement["color"] for requirement in requirements)
+        )
 
     def filtering(self, model: str) -> Filtering:
         """Return what was done to a label source before it is read."""
         if model == GROUND_TRUTH:
             return Filtering(model)
-        known, one = self._dataset.predictors, self._dataset.predictors[model]
-        same = (name for name, other in known.items() if other.model_copy(update={"name": None}) == one.unfiltered)
-        producer = self._producers.get(one.label_name)
+        predictors, predictor = self._dataset.predictors, self._dataset.predictors[model]
+        unfiltered_names = (
+            name
+            for name, other in predictors.items()
+            if other.model_copy(update={"name": None}) == predictor.unfiltered
+        )
+        producer = self._producers.get(predictor.label_name)
         took = producer.model.seconds if producer is not None and isinstance(producer.model, Filtered) else []
-        return Filtering(next(same, model), "+".join(one.filters), 1e3 * float(np.median(took)) if took else 0.0)
+        return Filtering(
+            next(unfiltered_names, model), "+".join(predictor.filters), 1e3 * float(np.median(took)) if took else 0.0
+        )
 
     def prediction_seconds(self, index: int, model: str) -> float:
         """Return the seconds that a model took to predict on a frame since they were last asked for; else NaN."""
@@ -281,14 +291,14 @@ class PredictedScene(RelabelledScene):
         if model == GROUND_TRUTH:
             return self._inner.digest(indices, model)
         producer, config = self._producer(model), self._dataset.predictor(model)
-        shown = producer.shown_for(indices) if producer.model.sequential else None
-        about = [producer.model.identity(), config.scores, *([] if shown is None else [shown])]
+        predicted_frames = producer.shown_for(indices) if producer.model.sequential else None
+        about = [producer.model.identity(), config.scores, *([] if predicted_frames is None else [predicted_frames])]
         digest = hashlib.blake2b(json.dumps(about, sort_keys=True).encode(), digest_size=16)
         if config.model == STORED:
-            digest.update(self._inner.digest(shown or indices, config.options["source"]).encode())
+            digest.update(self._inner.digest(predicted_frames or indices, config.options["source"]).encode())
             if not config.wants_color:
                 return digest.hexdigest()
-        for index in shown or indices:
+        for index in predicted_frames or indices:
             if index not in self._digests:
                 image = self._inner.image(index)
                 nothing = np.full(image.shape[:2], 255, dtype=np.uint8)

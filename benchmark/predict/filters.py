@@ -204,7 +204,7 @@ class Filtered(Wrapped):
         """See `Model`; an image of another size begins a new sequence."""
         predictions = self.ask(images, self.inner.gives_scores, geometry)
         frames: Sequence[Frame | None] = geometry or [None] * len(images)
-        return [self._filtered(*each, scores) for each in zip(predictions, images, frames, strict=True)]
+        return [self._filtered(*inputs, scores) for inputs in zip(predictions, images, frames, strict=True)]
 
     def identity(self) -> dict[str, Any]:
         """Return the identity of the inner model, and the filters."""
@@ -224,9 +224,9 @@ class Filtered(Wrapped):
                 raise DataError(f"{frame.where('depth')}: {reason}")
         started = time.thread_time()
         belief = belief_of(prediction, self.space)
-        said = belief.any(axis=2, keepdims=True)
-        for one in self._chain:
-            belief = one(belief, Shown(image, frame)) * said
+        is_labelled = belief.any(axis=2, keepdims=True)
+        for step in self._chain:
+            belief = step(belief, Shown(image, frame)) * is_labelled
         labels = labels_of(belief, self.space, prediction.labels)
         self.seconds.append(time.thread_time() - started)
         return Prediction(labels, belief if scores else None)
@@ -326,17 +326,17 @@ class Guided(Filter):
         import cv2
 
         grey = cv2.cvtColor(shown.image, cv2.COLOR_RGB2GRAY).astype(np.float32) / np.float32(255)
-        said = belief.any(axis=2).astype(np.float32)
-        count = np.maximum(self._sum(said), 1)
-        mean = self._sum(grey * said) / count
-        variance = self._sum(grey * grey * said) / count - mean * mean
+        labelled = belief.any(axis=2).astype(np.float32)
+        count = np.maximum(self._sum(labelled), 1)
+        mean = self._sum(grey * labelled) / count
+        variance = self._sum(grey * grey * labelled) / count - mean * mean
         filtered = np.empty_like(belief)
         for k in range(belief.shape[2]):
             p = np.ascontiguousarray(belief[..., k])
             mean_p = self._sum(p) / count
             a = (self._sum(grey * p) / count - mean * mean_p) / (variance + EPSILON)
             b = mean_p - a * mean
-            filtered[..., k] = (self._sum(a * said) * grey + self._sum(b * said)) / count
+            filtered[..., k] = (self._sum(a * labelled) * grey + self._sum(b * labelled)) / count
         return normalised(np.maximum(filtered, 0))
 
     def _sum(self, values: Any) -> Grey:
@@ -370,6 +370,6 @@ class Vote(Filter):
         self._last.append(rows)
         counts = np.zeros((rows.size, K + 1), dtype=np.float32)
         pixels = np.arange(rows.size)
-        for age, seen in enumerate(reversed(self._last)):
-            counts[pixels, seen.reshape(-1)] += 1 + (N - age) / (N * (N + 1))  # of all N together less than 1
+        for age, past_rows in enumerate(reversed(self._last)):
+            counts[pixels, past_rows.reshape(-1)] += 1 + (N - age) / (N * (N + 1))  # of all N together less than 1
         return normalised(counts[:, :K].reshape(belief.shape))

@@ -101,14 +101,14 @@ class PredictionFolder:
         self._suffix = WRITTEN[kind]
         self._score_type = None if score_type is None else np.dtype(score_type)
         self._compressed = top_k is not None  # most of it is 0
-        said = dict(settings) | ({"score_type": score_type} if kind == "scores" else {})
+        all_settings = dict(settings) | ({"score_type": score_type} if kind == "scores" else {})
         if top_k is not None and kind == "scores":
-            said["top_k"] = top_k
+            all_settings["top_k"] = top_k
         self._content: dict[str, Any] = {
             "schema": SCHEMA,
             "kind": kind,
-            "key": content_key(said),
-            "settings": said,
+            "key": content_key(all_settings),
+            "settings": all_settings,
             **about,
         }
         self._lock = FolderLock(path, wait=True) if wait else None
@@ -209,19 +209,19 @@ class PredictionFolder:
                 raise ConfigError(f"{self.path}: holds maps that were not predicted here; choose another --name")
             return {}
         try:
-            there = from_json(_Manifest, read_json(manifest), manifest)
+            stored = from_json(_Manifest, read_json(manifest), manifest)
         except DataError as error:
             raise DataError(
                 f"{manifest}: is no manifest of predictions; delete the folder, or choose another --name"
             ) from error
-        if there.key == self._content["key"]:
-            return dict(there.frames)
+        if stored.key == self._content["key"]:
+            return dict(stored.frames)
         if not overwrite:
-            change = _first_change(there.settings, self._content["settings"])
+            change = _first_change(stored.settings, self._content["settings"])
             raise ConfigError(
                 f"{self.path}: holds predictions with other settings ({change}); choose another --name, or --overwrite"
             )
-        for file in (*map(self.file, there.frames), manifest):
+        for file in (*map(self.file, stored.frames), manifest):
             file.unlink(missing_ok=True)
         return {}
 
@@ -234,8 +234,8 @@ def _first_change(old: Mapping[str, Any], new: Mapping[str, Any]) -> str:
     """Return the first setting that differs, with both values, in a few words."""
     for key in [*new, *(key for key in old if key not in new)]:
         if old.get(key) != new.get(key):
-            there, here = (_short(values.get(key)) for values in (old, new))
-            return f"{key}: {there} there, {here} here"
+            old_value, new_value = (_short(values.get(key)) for values in (old, new))
+            return f"{key}: {old_value} there, {new_value} here"
     return "another version"
 
 
@@ -256,7 +256,7 @@ def resized(maps: Maps, shape: tuple[int, ...], where: str) -> Maps:
     Raises:
         DataError: For another view.
     """
-    return lambda: (fitted(each[..., None], shape, where)[..., 0] for each in maps())
+    return lambda: (fitted(values[..., None], shape, where)[..., 0] for values in maps())
 
 
 def largest_only(maps: Maps, count: int) -> Maps:
@@ -264,13 +264,13 @@ def largest_only(maps: Maps, count: int) -> Maps:
 
     def thinned() -> Iterator[Float32]:
         largest: list[Float32] = []  # in falling order, (H, W) each
-        for each in maps():
-            rest = each
+        for values in maps():
+            rest = values
             for k, value in enumerate(largest):
                 largest[k], rest = np.maximum(value, rest), np.minimum(value, rest)
             if len(largest) < count:
                 largest.append(rest)
-        for each in maps():
-            yield np.where(each >= largest[-1], each, np.float32(0))
+        for values in maps():
+            yield np.where(values >= largest[-1], values, np.float32(0))
 
     return thinned

@@ -93,11 +93,11 @@ def shown_digest(pixels: Image, geometry: Sequence[Frame]) -> str:
     """Return a hash of an image and of the geometry that is shown with it."""
     digest = image_digest(pixels)
     for frame in geometry:
-        seen = hashlib.blake2b(repr((digest, frame.intrinsics)).encode(), digest_size=16)
+        hasher = hashlib.blake2b(repr((digest, frame.intrinsics)).encode(), digest_size=16)
         labels = frame.labels if frame.scores is None else frame.scores
         for array in (frame.depth, frame.T_wc, labels):
-            seen.update(np.ascontiguousarray(array).data)
-        digest = seen.hexdigest()
+            hasher.update(np.ascontiguousarray(array).data)
+        digest = hasher.hexdigest()
     return digest
 
 
@@ -119,5 +119,5 @@ def geometry_of(sequence: ImageSequence, index: int, pixels: Image, model: Model
 
 def first_images(sequence: ImageSequence, count: int) -> list[Image]:
     """Return the first images of a sequence that are there, to which a model is fitted whatever frames are selected."""
-    there = (index for index in range(len(sequence)) if not sequence.missing(index, color=True))
-    return [sequence.image(index) for index in itertools.islice(there, count)]
+    existing = (index for index in range(len(sequence)) if not sequence.missing(index, color=True))
+    return [sequence.image(index) for index in itertools.islice(existing, count)]

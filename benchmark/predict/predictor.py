@@ -92,8 +92,8 @@ class StoredSequence:
 
     def __init__(self, scene: Scene, source: str, color: bool) -> None:
         if source not in (*scene.models, *scene.by_name):
-            known = ", ".join(scene.models) or "none"
-            raise ConfigError(f"{scene.name}: there are no labels '{source}' for filters to take; there is {known}")
+            names = ", ".join(scene.models) or "none"
+            raise ConfigError(f"{scene.name}: there are no labels '{source}' for filters to take; there is {names}")
         self.scene, self.source, self.name, self._color = scene, source, scene.name, color
         self._frame = functools.lru_cache(maxsize=NEAR)(partial(scene.frame, model=source, color=False))
 
@@ -143,9 +143,9 @@ def shares(frame: Frame) -> Any:
     """Return scores (H, W, K) float32 that sum to 1 where they can be used, else to 0; None of labels."""
     if frame.scores is None:
         return None
-    said = (frame.predicted != ignore_id(frame.predicted))[..., None]
-    scores = np.where(said, frame.scores, 0).astype(np.float32)
-    return np.divide(scores, scores.sum(axis=2, keepdims=True), out=scores, where=said)
+    labelled = (frame.predicted != ignore_id(frame.predicted))[..., None]
+    scores = np.where(labelled, frame.scores, 0).astype(np.float32)
+    return np.divide(scores, scores.sum(axis=2, keepdims=True), out=scores, where=labelled)
 
 
 class PredictorConfig(Settings):
@@ -284,16 +284,16 @@ def parse_predictor(text: str, more: Mapping[str, Any] | None = None, filters: S
         ConfigError: For anything else.
     """
     model, *settings = _parts(text)
-    own: dict[str, Any] = {}
+    predictor_settings: dict[str, Any] = {}
     options: dict[str, Any] = {**(more or {})}
     for setting in settings:
         key, equals, value = setting.partition("=")
         if not equals:
             raise ConfigError(f"--predict {text}: write NAME,KEY=VALUE,...; '{setting}' has no '='")
-        group = own if key in OWN else options
+        group = predictor_settings if key in OWN else options
         group[key] = parse_yaml(value, f"--predict {text}")
-    own["filters"] = [*own.get("filters", ()), *filters]
-    return validated(PredictorConfig, {"model": model, "options": options, **own}, f"--predict {text}: ")
+    predictor_settings["filters"] = [*predictor_settings.get("filters", ()), *filters]
+    return validated(PredictorConfig, {"model": model, "options": options, **predictor_settings}, f"--predict {text}: ")
 
 
 def parse_predictors(
@@ -308,17 +308,17 @@ def parse_predictors(
     """
     parsed = [parse_predictor(text, more, filters) for text in texts]
     called: dict[str, list[int]] = {}
-    for position, one in enumerate(parsed):
-        called.setdefault(one.source_name, []).append(position)
-    for alike in (group for group in called.values() if len(group) > 1):
-        by_themselves = [position for position in alike if parsed[position].name is None]
+    for position, config in enumerate(parsed):
+        called.setdefault(config.source_name, []).append(position)
+    for same_named in (group for group in called.values() if len(group) > 1):
+        by_themselves = [position for position in same_named if parsed[position].name is None]
         for position, more_name in zip(by_themselves, _differences([texts[p] for p in by_themselves]), strict=True):
-            one = parsed[position]
-            name = " ".join([one.label_name, *more_name])
+            config = parsed[position]
+            name = " ".join([config.label_name, *more_name])
             if not names_a_folder(name):
                 raise ConfigError(f"--predict {texts[position]}: has the name of another one; give it one: name=NAME")
-            parsed[position] = one.model_copy(update={"name": name})
-    names = [one.source_name for one in parsed]
+            parsed[position] = config.model_copy(update={"name": name})
+    names = [config.source_name for config in parsed]
     for name, text in zip(names, texts, strict=True):
         if names.count(name) > 1:
             raise ConfigError(f"--predict {text}: two models are called '{name}'; give one a name: name=NAME")
@@ -333,12 +333,12 @@ def _differences(texts: Sequence[str]) -> list[list[str]]:
     split = [_parts(text) for text in texts]
     files = [_stem(model) for model, *_ in split]
     settings = [dict(part.partition("=")[::2] for part in parts[1:]) for parts in split]
-    keys = dict.fromkeys(key for each in settings for key in each if key != "name")
-    varied = [key for key in keys if len({each.get(key) for each in settings}) > 1]
-    shown = {key: _last_parts([each.get(key) for each in settings]) for key in varied}
+    keys = dict.fromkeys(key for of_text in settings for key in of_text if key != "name")
+    varied = [key for key in keys if len({of_text.get(key) for of_text in settings}) > 1]
+    printed = {key: _last_parts([of_text.get(key) for of_text in settings]) for key in varied}
     return [
-        [*([file] if len(set(files)) > 1 else []), *(f"{key}={shown[key][k]}" for key in varied if key in each)]
-        for k, (file, each) in enumerate(zip(files, settings, strict=True))
+        [*([file] if len(set(files)) > 1 else []), *(f"{key}={printed[key][k]}" for key in varied if key in of_text)]
+        for k, (file, of_text) in enumerate(zip(files, settings, strict=True))
     ]
 
 
@@ -353,9 +353,9 @@ def _stem(model: str) -> str:
 
 def _last_parts(values: Sequence[str | None]) -> list[str]:
     """Return values as a folder's name may hold them, paths by their last part where these tell them apart."""
-    given = ["" if value is None else value for value in values]
-    last = [value.rstrip("/").rpartition("/")[2] for value in given]
-    chosen = last if len(set(last)) == len(set(given)) else given
+    texts = ["" if value is None else value for value in values]
+    last = [value.rstrip("/").rpartition("/")[2] for value in texts]
+    chosen = last if len(set(last)) == len(set(texts)) else texts
     return [re.sub(r'[/\\:*?"<>|\x00-\x1f]+', "-", re.sub(r"\s*,\s*", "x", value.strip("[]{}"))) for value in chosen]
 
 

@@ -154,10 +154,10 @@ class Producer(PredictionObserver):
             missing = [index for index in indices if index not in self._done]
             if not missing:
                 return
-            shown = missing if self._frames is None else self._frames
+            predicted_frames = missing if self._frames is None else self._frames
             try:
-                with contextlib.nullcontext() if self._before is None else self._before.ahead(shown):
-                    predict_sequence(self.sequence, self.model, shown, self._folder, self._options, [self])
+                with contextlib.nullcontext() if self._before is None else self._before.ahead(predicted_frames):
+                    predict_sequence(self.sequence, self.model, predicted_frames, self._folder, self._options, [self])
             finally:
                 if self.model.sequential:
                     self.model.reset()  # its memory of the sequence can be large

@@ -262,10 +262,10 @@ class _Work:
             ]
         seconds = time.perf_counter() - started
         self._model_seconds += seconds
-        for shown, prediction in zip(pictures, predictions, strict=True):
-            self._write(shown, prediction, seconds / len(pictures))
+        for predicted_picture, prediction in zip(pictures, predictions, strict=True):
+            self._write(predicted_picture, prediction, seconds / len(pictures))
             self._predicted += 1
-            self._tell(shown, seconds / len(pictures))
+            self._tell(predicted_picture, seconds / len(pictures))
 
     def close(self) -> None:
         """Write the manifests of what is finished, also after an error or an interruption."""
@@ -292,8 +292,8 @@ class _Work:
 
     def _write(self, picture: Picture, prediction: Streamed, seconds: float) -> None:
         """Write a prediction at the pixels that the scene's label files have."""
-        alike = self.sequence.labels_like_depth and not self.options.at_image
-        frame = self.sequence.predicted(picture.index, labels=prediction.labels) if alike else None
+        at_depth = self.sequence.labels_like_depth and not self.options.at_image
+        frame = self.sequence.predicted(picture.index, labels=prediction.labels) if at_depth else None
         for folder in self.folders:
             if folder.kind == "features":
                 assert prediction.features is not None
@@ -307,9 +307,9 @@ class _Work:
             maps = maps if self.options.top_k is None else largest_only(maps, self.options.top_k)
             folder.write_scores(picture.name, picture.digest, maps(), seconds)
 
-    def _tell(self, shown: Picture, seconds: float) -> None:
+    def _tell(self, predicted_picture: Picture, seconds: float) -> None:
         for observer in self.observers:
-            observer.frame_done(shown, seconds)
+            observer.frame_done(predicted_picture, seconds)
 
 
 def _folders(

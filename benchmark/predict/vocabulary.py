@@ -66,7 +66,7 @@ class VocabularySettings(Settings):
     @classmethod
     def _plain_names(cls, value: Any) -> Any:
         return (
-            [{"name": each} if isinstance(each, str) else each for each in value] if isinstance(value, list) else value
+            [{"name": item} if isinstance(item, str) else item for item in value] if isinstance(value, list) else value
         )
 
     @model_validator(mode="after")
@@ -110,14 +110,14 @@ class Vocabulary:
             MissingDependencyError: If its text encoder needs packages that are not installed.
         """
         settings = validated(VocabularySettings, read_yaml(path), f"{path}: ")
-        words = [word for each in settings.names for word in (each.name, *each.synonyms)]
-        of = np.repeat(np.arange(len(settings.names)), [1 + len(each.synonyms) for each in settings.names])
+        words = [word for entry in settings.names for word in (entry.name, *entry.synonyms)]
+        name_of_word = np.repeat(np.arange(len(settings.names)), [1 + len(entry.synonyms) for entry in settings.names])
         try:
             space = LabelSpace(
                 settings.name or path.stem,
-                tuple(each.name for each in settings.names),
-                members=tuple(tuple(each.synonyms) for each in settings.names),
-                groups=tuple(each.group for each in settings.names),
+                tuple(entry.name for entry in settings.names),
+                members=tuple(tuple(entry.synonyms) for entry in settings.names),
+                groups=tuple(entry.group for entry in settings.names),
             )
         except ConfigError as error:
             raise ConfigError(f"{path}: {str(error).replace('taxonomy', 'vocabulary', 1)}") from error
@@ -133,7 +133,7 @@ class Vocabulary:
         if settings.normalise:
             embeddings = (embeddings / length[:, None]).astype(np.float32)
         models = None if settings.models is None else tuple(settings.models)
-        return cls(space, embeddings, of.astype(np.int64), settings.threshold, str(path), models)
+        return cls(space, embeddings, name_of_word.astype(np.int64), settings.threshold, str(path), models)
 
     def is_for(self, model: str) -> bool:
         """Return whether it is for the features of a model."""
@@ -177,18 +177,18 @@ class Vocabulary:
         for start in range(0, len(vectors), step):
             likeness = vectors[start : start + step].astype(np.float32) @ self.embeddings.T
             best = likeness.argmax(axis=1)
-            own = self.of[best].astype(dtype)
+            name_ids = self.of[best].astype(dtype)
             if self.threshold is not None:
-                own[np.take_along_axis(likeness, best[:, None], axis=1)[:, 0] < self.threshold] = ignored
-            ids[start : start + step] = own
+                name_ids[np.take_along_axis(likeness, best[:, None], axis=1)[:, 0] < self.threshold] = ignored
+            ids[start : start + step] = name_ids
         return ids.reshape(features.vectors.shape[:2])
 
     def frame_labels(self, features: Features, shape: tuple[int, int], where: str) -> UInt8 | UInt16:
         """Return ids (H, W) at the pixels of the depth: each pixel has the label of the cell that it falls into."""
         ids = self.labels(features, where)
         ignored = IGNORE_8BIT if ids.dtype == np.uint8 else IGNORE_16BIT
-        shown: npt.NDArray[Any] = features.image(ids, shape, ignored)
-        return shown
+        image: npt.NDArray[Any] = features.image(ids, shape, ignored)
+        return image
 
 
 def _stored(path: Path, words: list[str]) -> Float32:
@@ -224,10 +224,12 @@ def named(vocabularies: list[Path]) -> dict[str, Vocabulary]:
     Raises:
         ConfigError: If two have one name, and what `Vocabulary.load` raises.
     """
-    found: dict[str, Vocabulary] = {}
+    by_name: dict[str, Vocabulary] = {}
     for path in vocabularies:
-        one = Vocabulary.load(path)
-        if one.space.name in found:
-            raise ConfigError(f"{path}: two vocabularies are called '{one.space.name}'; give one a name (name: NAME)")
-        found[one.space.name] = one
-    return found
+        vocabulary = Vocabulary.load(path)
+        if vocabulary.space.name in by_name:
+            raise ConfigError(
+                f"{path}: two vocabularies are called '{vocabulary.space.name}'; give one a name (name: NAME)"
+            )
+        by_name[vocabulary.space.name] = vocabulary
+    return by_name

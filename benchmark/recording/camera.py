@@ -94,9 +94,9 @@ class SceneLog:
         if self.origin is None:
             steps = np.round(position / ORIGIN_STEP).astype(np.int64)
             self.origin = steps * round(ORIGIN_STEP / voxel_size)
-            at = self._translation = (self.origin * voxel_size).astype(np.float64)
+            translation = self._translation = (self.origin * voxel_size).astype(np.float64)
             if steps.any():
-                where = ", ".join(f"{name} = {value:.3f} m" for name, value in zip("xyz", at, strict=True))
+                where = ", ".join(f"{name} = {value:.3f} m" for name, value in zip("xyz", translation, strict=True))
                 text = f"map coordinates are relative to {where} of the scene's world"
                 stream.log(path(self.name, "log"), rr.TextLog(text))
         return self.origin
@@ -106,8 +106,8 @@ class SceneLog:
         self.legend.see(task.mapping.target, dominant(table))
         self.legend.log(stream, self.name)
         if self.bounds is None and len(table):
-            some = table.index[:: math.ceil(len(table) / SAMPLE)]
-            points = ((some + 0.5) * table.voxel_size - self._translation).astype(np.float64)
+            sample = table.index[:: math.ceil(len(table) / SAMPLE)]
+            points = ((sample + 0.5) * table.voxel_size - self._translation).astype(np.float64)
             self.bounds = SceneBounds(points, np.array([*self._poses.values()]).reshape(-1, 4, 4), task.scene.up)
 
     def log(self, stream: rr.RecordingStream, frame: Frame, background: FrameJobs) -> None:
@@ -129,7 +129,9 @@ class SceneLog:
         if (
             n % (n // 100 + 1) == 0
         ):  # a long track is not logged with every frame: the size would grow with the square of the length
-            track = rr.LineStrips3D([[each[:3, 3] for each in self._poses.values()]], colors=(255, 255, 255))
+            track = rr.LineStrips3D(
+                [[camera_pose[:3, 3] for camera_pose in self._poses.values()]], colors=(255, 255, 255)
+            )
             stream.log(path(self.name, "trajectory"), track)
         background.submit(frame.index, frame.timestamp, functools.partial(self._log_images, stream, frame))
 
@@ -153,8 +155,8 @@ class SceneLog:
         if jpeg is not None:
             (H, W), stride = frame.shape, stride_of(frame.shape)
             image = rr.EncodedImage(contents=jpeg, media_type="image/jpeg", draw_order=-20)
-            whole = rr.Transform3D(scale=[W / -(-W // stride), H / -(-H // stride), 1])
-            stream.log(path(self.name, "camera", "color"), image, whole)
+            scale = rr.Transform3D(scale=[W / -(-W // stride), H / -(-H // stride), 1])
+            stream.log(path(self.name, "camera", "color"), image, scale)
 
 
 def color_of(frame: Frame) -> bytes | None:

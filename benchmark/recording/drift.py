@@ -57,7 +57,7 @@ def contexts(nothing: tuple[int, int, int, int] = OVER_COLOUR) -> dict[str, rr.A
             *((NO_DRIFT + 1 + k, name, (*glow[k], 255)) for k, name in enumerate(names)),
         ],
     }
-    return {name: rr.AnnotationContext(each) for name, each in infos.items()}
+    return {name: rr.AnnotationContext(entries) for name, entries in infos.items()}
 
 
 @dataclass(frozen=True, eq=False)
@@ -204,19 +204,19 @@ class DriftLog:
 
     def follow(self, frame: Frame, changes: Changes) -> FrameChanges:
         """Store the moves of a frame that the map has fused; return its changes, for pictures."""
-        at = np.flatnonzero((changes.before != changes.after) | (changes.drift >= MOVED_BITS))
-        moves = np.zeros(len(at), dtype=MOVE)
-        moves["voxel"], moves["frame"], moves["bits"] = packed(changes.index[at]), frame.index, changes.drift[at]
-        moves["before"], moves["after"] = changes.before[at], changes.after[at]
+        rows = np.flatnonzero((changes.before != changes.after) | (changes.drift >= MOVED_BITS))
+        moves = np.zeros(len(rows), dtype=MOVE)
+        moves["voxel"], moves["frame"], moves["bits"] = packed(changes.index[rows]), frame.index, changes.drift[rows]
+        moves["before"], moves["after"] = changes.before[rows], changes.after[rows]
         self._moves += [moves] if len(moves) else []
         file = PurePath(frame.files.get("labels") or frame.files.get("scores") or "")
         name = file.name if file.suffix else ""
         self._views[frame.index] = View(frame.timestamp, frame.intrinsics, np.array(frame.T_wc), frame.shape, name)
         if sum(map(len, self._moves)) > MAX_MOVES:  # keep half of them: the moves of the voxels that were moved most
-            every = np.concatenate(self._moves)
-            _, voxel = np.unique(every["voxel"], return_inverse=True)
-            order = np.argsort(-np.bincount(voxel, every["bits"])[voxel], kind="stable")[: MAX_MOVES // 2]
-            self._moves = [every[np.sort(order)]]
+            all_moves = np.concatenate(self._moves)
+            _, voxel = np.unique(all_moves["voxel"], return_inverse=True)
+            order = np.argsort(-np.bincount(voxel, all_moves["bits"])[voxel], kind="stable")[: MAX_MOVES // 2]
+            self._moves = [all_moves[np.sort(order)]]
         return FrameChanges(frame, changes, self._voxel_size)
 
     def log(
@@ -254,9 +254,9 @@ class DriftLog:
         bits, op = table.drift_sum[top], table.op[top]
         voxels, centers, first_frame = packed(table.index[top]), table.centers[top], table.first_frame[top]
         class_now, sbd = np.asarray(table.evidence.take(top)).argmax(axis=1), mean_drift(bits, op)
-        every, drifted = np.concatenate([np.zeros(0, dtype=MOVE), *self._moves]), []
+        all_moves, drifted = np.concatenate([np.zeros(0, dtype=MOVE), *self._moves]), []
         for i, voxel in enumerate(voxels):
-            moves = every[every["voxel"] == voxel]
+            moves = all_moves[all_moves["voxel"] == voxel]
             first = int(moves["before"][0]) if len(moves) else int(class_now[i])
             drifted.append(Drifted(i + 1, centers[i], op[i], bits[i], sbd[i], int(first_frame[i]), first, moves))
         return drifted

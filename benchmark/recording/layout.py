@@ -112,8 +112,8 @@ def fit(bounds: SceneBounds, aspect: float) -> tuple[Float64, float]:
     half = MARGIN * math.tan(FIELD_OF_VIEW / 2) * np.array([aspect, 1.0])
 
     def edges(points: Float64, trimmed: float) -> tuple[Any, Any]:
-        at, near = points @ across.T, np.outer(points @ toward, half)
-        return np.quantile(at - near, trimmed, axis=0), np.quantile(at + near, 1 - trimmed, axis=0)
+        projected, near = points @ across.T, np.outer(points @ toward, half)
+        return np.quantile(projected - near, trimmed, axis=0), np.quantile(projected + near, 1 - trimmed, axis=0)
 
     low, high = edges(bounds.points, OUTLIERS)
     if len(bounds.cameras):
@@ -185,10 +185,10 @@ def log_names(stream: rr.RecordingStream, entity: str, entries: Sequence[tuple[s
     """Log dots in the colours of names, in a grid, and the names in white, as a label has its point's colour."""
     names, colors = zip(*entries, strict=True)
     k = np.arange(len(entries))
-    at = np.stack([k % columns * WIDTH / columns + DOT / 2, (k // columns + 0.5) * LINE], axis=1)
-    middle = DOT + LETTER / 2 * np.array([len(each) for each in names])
-    right_of = at + np.stack([middle, np.full(len(entries), LABEL)], axis=1)
-    dots = rr.Points2D(at, colors=colors, radii=rr.Radius.ui_points(5.0))
+    positions = np.stack([k % columns * WIDTH / columns + DOT / 2, (k // columns + 0.5) * LINE], axis=1)
+    middle = DOT + LETTER / 2 * np.array([len(name) for name in names])
+    right_of = positions + np.stack([middle, np.full(len(entries), LABEL)], axis=1)
+    dots = rr.Points2D(positions, colors=colors, radii=rr.Radius.ui_points(5.0))
     words = rr.Points2D(right_of, colors=(255, 255, 255), labels=names, radii=0.0, show_labels=True)
     stream.log(entity, dots, static=True)
     stream.log(f"{entity}/names", words, static=True)
@@ -242,8 +242,8 @@ def blueprint(
 
 def drawn(task: Task) -> str:
     """Return the backend whose map is drawn while it grows: the first that must agree with the others."""
-    alike = [name for name in task.backends if name not in task.apart]
-    return (alike or list(task.backends))[0]
+    agreeing = [name for name in task.backends if name not in task.apart]
+    return (agreeing or list(task.backends))[0]
 
 
 def view_3d(
@@ -334,14 +334,14 @@ def _maps(
 
     mode, scene = mode_of(name), tasks[0].scene.name
     height -= (LINE + TITLE) * (name == OPENED)
-    apart = len(tasks) > SIDE_BY_SIDE
-    columns = 1 if apart else 2 if len(tasks) == SIDE_BY_SIDE else len(tasks)
-    rows = 1 if apart else math.ceil(len(tasks) / columns)
-    aspect = LEFT[0] / columns / ((height - TITLE * apart) / rows - TITLE)
+    in_tabs = len(tasks) > SIDE_BY_SIDE
+    columns = 1 if in_tabs else 2 if len(tasks) == SIDE_BY_SIDE else len(tasks)
+    rows = 1 if in_tabs else math.ceil(len(tasks) / columns)
+    aspect = LEFT[0] / columns / ((height - TITLE * in_tabs) / rows - TITLE)
     views = [_map(title(task), task, drawn(task), bounds, aspect, name) for task in tasks]
     if name != OPENED:
-        return rrb.Tabs(*views, name=mode.tab) if apart else rrb.Grid(*views, grid_columns=columns, name=mode.tab)
-    maps = rrb.Tabs(*views) if apart else rrb.Grid(*views, grid_columns=columns)
+        return rrb.Tabs(*views, name=mode.tab) if in_tabs else rrb.Grid(*views, grid_columns=columns, name=mode.tab)
+    maps = rrb.Tabs(*views) if in_tabs else rrb.Grid(*views, grid_columns=columns)
     legend = _legend(scene, "categories", f"Category (low persistence: OP < {RECURRENT})", LINE)
     return rrb.Vertical(maps, legend, row_shares=[height, LINE + TITLE], name=mode.tab)
 
@@ -356,7 +356,7 @@ def _map(
     """
     scene = task.scene.name
     entity = path(scene, "map", task.model, backend)
-    around = [path(scene, "camera"), path(scene, "trajectory"), *(path(scene, each, task.model) for each in over)]
+    around = [path(scene, "camera"), path(scene, "trajectory"), *(path(scene, part, task.model) for part in over)]
     chunks = [] if name == "class" else [chunk(entity, number) for number in range(CHUNKS)]
     coloring = {"defaults": defaults(name), "overrides": dict.fromkeys(chunks, visualizer(name))}
     return view_3d(scene, [f"{entity}/**", *around], title, bounds, aspect, **coloring)
@@ -370,9 +370,9 @@ def _cameras(scene: str, tasks: list[Task], picture: str) -> rrb.Container:
 
 def _camera(scene: str, task: Task, picture: str, over: list[str]) -> list[rrb.View]:
     origin, color = path(scene, "camera"), path(scene, "camera", "color")
-    labels, shown = (path(scene, "camera", task.model, name) for name in ("labels", picture))
+    labels, picture_path = (path(scene, "camera", task.model, name) for name in ("labels", picture))
     if task.scene.of_scans:
-        titles = {labels: f"{task.model}: labels of the scan", shown: f"{task.model}: {PICTURES[picture]}"}
+        titles = {labels: f"{task.model}: labels of the scan", picture_path: f"{task.model}: {PICTURES[picture]}"}
         return [
             rrb.Spatial3DView(origin=origin, contents=[f"{entity}/points"], background=BACKGROUND, name=title)
             for entity, title in titles.items()
@@ -380,7 +380,7 @@ def _camera(scene: str, task: Task, picture: str, over: list[str]) -> list[rrb.V
     title = f"{task.model}: {PICTURES[picture]}"
     return [
         _labels(scene, task),
-        rrb.Spatial2DView(origin=origin, contents=[color, shown, *over], name=title),
+        rrb.Spatial2DView(origin=origin, contents=[color, picture_path, *over], name=title),
     ]
 
 
@@ -492,8 +492,8 @@ def record_changes(
     stream.log("/results", rr.TextDocument(text, media_type="text/markdown"), static=True)
     tabs = [_log_change(stream, *names, change, up.get(names[0])) for names, change in changes.items()]
     results = rrb.TextDocumentView(origin="/results", name="Results")
-    shown = rrb.Horizontal(rrb.Tabs(*tabs) if len(tabs) > 1 else tabs[0], results, column_shares=[3, 1])
-    stream.send_blueprint(rrb.Blueprint(shown, collapse_panels=True), make_default=True, make_active=True)
+    content = rrb.Horizontal(rrb.Tabs(*tabs) if len(tabs) > 1 else tabs[0], results, column_shares=[3, 1])
+    stream.send_blueprint(rrb.Blueprint(content, collapse_panels=True), make_default=True, make_active=True)
     flush(stream, file)
     stream.disconnect()
 
@@ -520,13 +520,13 @@ def _log_change(
             points[~changed], colors=SAME, radii=rr.Radius.ui_points(1.0)
         )  # small points do not hide the others
         stream.log(f"{entity}/same", rest, static=True)
-        if own := [(label, centre) for where, label, centre in locations if where == name]:
-            labels, centres = zip(*own, strict=True)
-            at = np.array(centres) - origin * table.voxel_size
-            numbers = rr.Points3D(at, labels=labels, colors=WHITE, radii=rr.Radius.ui_points(4.0))
+        if labelled_centres := [(label, centre) for where, label, centre in locations if where == name]:
+            labels, centres = zip(*labelled_centres, strict=True)
+            positions = np.array(centres) - origin * table.voxel_size
+            numbers = rr.Points3D(positions, labels=labels, colors=WHITE, radii=rr.Radius.ui_points(4.0))
             stream.log(f"{entity}/locations", numbers, static=True)
-        shown = f"{what}: orange worse, blue better, grey points as before"
-        views.append(view_3d(scene, [f"{entity}/**"], shown, bounds, CHANGE_ASPECT))
+        caption = f"{what}: orange worse, blue better, grey points as before"
+        views.append(view_3d(scene, [f"{entity}/**"], caption, bounds, CHANGE_ASPECT))
     return rrb.Vertical(*views, name=title)
 
 

@@ -64,16 +64,16 @@ def level_of(drift, edges):
 @serial
 def first_of_blocks(index, shift):
     """Return the first row of each block of 2^shift voxels an axis, ascending, of voxels (n, 3)."""
-    n, found = len(index), 0
+    n, count = len(index), 0
     key, rows, first = np.empty(n, np.int64), make_table(n), np.empty(n, np.int64)
     for row in range(n):
         key[row] = key_of(index[row, 0] >> shift, index[row, 1] >> shift, index[row, 2] >> shift)
-        at = find(key[row], key, rows)
-        if rows[at] < 0:
-            rows[at] = row
-            first[found] = row
-            found += 1
-    return first[:found].copy()
+        place = find(key[row], key, rows)
+        if rows[place] < 0:
+            rows[place] = row
+            first[count] = row
+            count += 1
+    return first[:count].copy()
 
 
 @serial
@@ -95,7 +95,7 @@ def key_of(x, y, z):
 @serial
 def find(wanted, key, rows):
     """Return the place of a key in a table of rows, or the free place for the key."""
-    at = np.int64(mix(wanted) & np.uint64(len(rows) - 1))
-    while rows[at] >= 0 and key[rows[at]] != wanted:
-        at = (at + 1) & (len(rows) - 1)
-    return at
+    place = np.int64(mix(wanted) & np.uint64(len(rows) - 1))
+    while rows[place] >= 0 and key[rows[place]] != wanted:
+        place = (place + 1) & (len(rows) - 1)
+    return place

@@ -108,9 +108,9 @@ class GroupLog:
         }
         if drift is not None:
             pictures |= {name: (picture, coarse) for name, picture in drift.pictures(coarse).items()}
-        for name, (picture, every) in pictures.items():
+        for name, (picture, picture_stride) in pictures.items():
             image = rr.SegmentationImage(picture, draw_order=-10)
-            stream.log(path(self._scene, "camera", self.task.model, name), image, over_camera(every))
+            stream.log(path(self._scene, "camera", self.task.model, name), image, over_camera(picture_stride))
         if frame.features is not None:  # in the colours of the first frame
             self._colours = self._colours or FeatureColours.of(frame.features)
         if frame.features is not None and self._colours is not None and self._colours.fit(frame.features):
@@ -216,7 +216,7 @@ class Recording(Observer):
         if self._background is not None:
             self._background.drain()  # it lets go of the maps before
         self._unfinished = {*backends}
-        self._fused = next((each for unit, each in backends.items() if unit.backend == self._drawn(task)), None)
+        self._fused = next((backend for unit, backend in backends.items() if unit.backend == self._drawn(task)), None)
 
     def frame_fused(self, task: Task, frame: Frame, rows: Mapping[UnitName, FrameRow]) -> None:
         """Log a row of each time series, the camera, and the map."""
@@ -268,10 +268,10 @@ class Recording(Observer):
         for task in self._plan.tasks:
             scene, model = task.scene.name, task.model
             records = [
-                each
+                record
                 for sweep in (BASE, BACKENDS)
-                for each in result.select(sweep, scene=scene, model=model)
-                if each.unit not in self._logged
+                for record in result.select(sweep, scene=scene, model=model)
+                if record.unit not in self._logged
             ]
             if not records:
                 continue
@@ -353,8 +353,8 @@ class Recording(Observer):
 
     def _planned(self, task: Task) -> Task:
         """Return the model on the scene with all backends of the plan."""
-        named = task.scene.name, task.model
-        return next(each for each in self._plan.tasks if (each.scene.name, each.model) == named)
+        key = task.scene.name, task.model
+        return next(planned for planned in self._plan.tasks if (planned.scene.name, planned.model) == key)
 
     def _drawn(self, task: Task) -> str:
         """Return the backend that is drawn among those that are fused now."""
@@ -371,9 +371,9 @@ class Recording(Observer):
             task.indices, threads=config.threads, size=lambda frame: frame.nbytes,
         )  # fmt: skip
         with contextlib.closing(frames):
-            for each in frames:
-                voxels = 0 if self._fused is None else self._fused.integrate(each.item).map_voxels
-                self._log_frame(task, each.item, {}, voxels)
+            for fetched in frames:
+                voxels = 0 if self._fused is None else self._fused.integrate(fetched.item).map_voxels
+                self._log_frame(task, fetched.item, {}, voxels)
         if not fits:
             text = f"{task.model}: drift of frames is left out, because its map would not fit into memory"
             self._opened()[0].log(path(scene, "log"), rr.TextLog(text))
@@ -469,7 +469,9 @@ def _without_code(config: Config) -> Config:
             must_agree(backend.model_copy(update={"check": None}))
         except SemstabError:
             lost.add(backend.name)
-    backends = [each.model_copy(update={"check": True}) if each.name in lost else each for each in config.backends]
+    backends = [
+        backend.model_copy(update={"check": True}) if backend.name in lost else backend for backend in config.backends
+    ]
     return config.model_copy(update={"backends": backends, "check": None if lost else config.check})
 
 

@@ -54,8 +54,8 @@ def record_maps(
     file.unlink(missing_ok=True)
     stream = Target(file).open()
     tabs = [_log(stream, scene, name, views, places[name], size, up) for name, views in maps.items()]
-    shown = rrb.Tabs(*tabs) if len(tabs) > 1 else tabs[0]
-    stream.send_blueprint(rrb.Blueprint(shown, collapse_panels=True), make_default=True, make_active=True)
+    content = rrb.Tabs(*tabs) if len(tabs) > 1 else tabs[0]
+    stream.send_blueprint(rrb.Blueprint(content, collapse_panels=True), make_default=True, make_active=True)
     flush(stream, file)
     stream.disconnect()
 
@@ -69,9 +69,9 @@ def _log(
     size: float,
     up: tuple[float, float, float] | None,
 ) -> rrb.Container:
-    whole = views[0].index.astype(np.int64)
-    origin: Int64 = np.round(whole.mean(axis=0)).astype(np.int64)
-    points = ((whole - origin + 0.5) * size).astype(np.float64)
+    all_voxels = views[0].index.astype(np.int64)
+    origin: Int64 = np.round(all_voxels.mean(axis=0)).astype(np.int64)
+    points = ((all_voxels - origin + 0.5) * size).astype(np.float64)
     bounds = SceneBounds(points, np.zeros((0, 4, 4)), None if up is None else np.array(up))
     made = []
     for k, view in enumerate(views):
@@ -82,8 +82,8 @@ def _log(
         stream.log(entity, grid, static=True)
         if places and not k:
             labels, centres = zip(*places, strict=True)
-            at = np.array(centres) - origin * size
-            numbers = rr.Points3D(at, labels=labels, colors=WHITE, radii=rr.Radius.ui_points(4.0))
+            positions = np.array(centres) - origin * size
+            numbers = rr.Points3D(positions, labels=labels, colors=WHITE, radii=rr.Radius.ui_points(4.0))
             stream.log(f"{entity}/places", numbers, static=True)
         made.append(view_3d(scene, [f"{entity}/**"], view.title, bounds, HALF if k else WIDE))
     return rrb.Vertical(made[0], rrb.Horizontal(*made[1:]), name=name)

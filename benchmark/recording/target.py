@@ -148,8 +148,8 @@ def viewer_command() -> list[str]:
     Raises:
         ConfigError: If it is missing.
     """
-    own = Path(sys.executable).with_name("rerun")
-    program = str(own) if own.exists() else shutil.which("rerun")
+    installed = Path(sys.executable).with_name("rerun")
+    program = str(installed) if installed.exists() else shutil.which("rerun")
     if program is None:
         raise ConfigError("the rerun viewer is not installed; pip install semstab, or record into a file")
     return [program, "--bind", "127.0.0.1"]

@@ -123,13 +123,13 @@ def components(
             voxel_indices=index.astype(np.int32), voxel_size=[size] * 3, colors=packed(classes.colors)[dominant(voxels)]
         ),
         *(
-            rr.DynamicArchetype(name, components={"colors": rr.components.ColorBatch(each)})
-            for name, each in {"category": category, MOVED: states}.items()
-            if each is not None
+            rr.DynamicArchetype(name, components={"colors": rr.components.ColorBatch(column)})
+            for name, column in {"category": category, MOVED: states}.items()
+            if column is not None
         ),
         *(
-            rr.DynamicArchetype(name, components={"values": rr.components.VoxelValueBatch(each.astype(np.float32))})
-            for name, each in {**values, "op": voxels.op}.items()
+            rr.DynamicArchetype(name, components={"values": rr.components.VoxelValueBatch(column.astype(np.float32))})
+            for name, column in {**values, "op": voxels.op}.items()
         ),
     ]
 
@@ -218,13 +218,13 @@ class VoxelLogger:
         moved: UInt8 | None = None,
     ) -> None:
         """Log rows of a table as a chunk, whose voxels stand for blocks with an edge of `factor` voxels."""
-        at = np.s_[rows[0] : rows[-1] + 1] if factor == 1 else rows  # a map that is not thinned is not copied
-        voxels = Voxels(table.op[at], table.evidence.take(at).measured(), table.drift_sum[at])
-        index = (table.index[at] - self._origin) // factor
+        selection = np.s_[rows[0] : rows[-1] + 1] if factor == 1 else rows  # a map that is not thinned is not copied
+        voxels = Voxels(table.op[selection], table.evidence.take(selection).measured(), table.drift_sum[selection])
+        index = (table.index[selection] - self._origin) // factor
         size = table.voxel_size * factor
-        own = None if moved is None else moved[at]
+        states = None if moved is None else moved[selection]
         stream.log(
-            chunk(self._entity, c), *components(index, size, self._classes, voxels, assessed=assessed, moved=own)
+            chunk(self._entity, c), *components(index, size, self._classes, voxels, assessed=assessed, moved=states)
         )
 
     def finish(
@@ -290,10 +290,11 @@ def log_difference(
         cells = (index[rows] // factor).astype(np.int32)
         size = [first.voxel_size * factor] * 3
         stream.log(f"{entity}/{part}", rr.VoxelGridMap(cells, size, **values, **style), static=True)
-    one, other = tables
+    first_name, second_name = tables
     return (
-        f"{len(parts['only_first']):,} voxels in {one} only, {len(parts['only_second']):,} in {other} only; of"
-        f" {len(in_first):,} in both VSS differs in {int(differs.sum()):,}, by {change.max(initial=0.0):.2g} at most"
+        f"{len(parts['only_first']):,} voxels in {first_name} only, {len(parts['only_second']):,} in {second_name}"
+        f" only; of {len(in_first):,} in both VSS differs in {int(differs.sum()):,}, by {change.max(initial=0.0):.2g}"
+        " at most"
     )
 
 

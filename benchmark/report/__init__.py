@@ -52,7 +52,7 @@ class Reporting(Observer):
                     return
         if result.select():
             write_tables(result, self._folder)
-            write_report(result, self._folder, {unit: seen.result() for unit, seen in self._above.items()})
+            write_report(result, self._folder, {unit: future.result() for unit, future in self._above.items()})
 
 
 HEAD = 1000

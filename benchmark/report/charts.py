@@ -47,8 +47,8 @@ class Scale:
         cls, values: Sequence[float], first: float, last: float, *, zero: bool = False, margin: float = 0.0
     ) -> Scale:
         """Build the axis over the finite values, from 0 on where `zero` says so, and a share of it beyond both ends."""
-        known = [value for value in values if math.isfinite(value)] or [0.0, 1.0]
-        low, high = min(0.0, *known) if zero else min(known), max(known)
+        finite = [value for value in values if math.isfinite(value)] or [0.0, 1.0]
+        low, high = min(0.0, *finite) if zero else min(finite), max(finite)
         if not high - low > 1e-9 * max(abs(low), abs(high), 1e-9):
             high = low + max(abs(low), 1e-3)
         beyond = margin * (high - low)
@@ -71,13 +71,13 @@ def line_chart(
     lines: Sequence[Line], x_label: str, y_label: str, *, names: Sequence[str] = (), zero: bool = True
 ) -> str:
     """Return a chart of lines over x; `names` of its ticks where x counts things that have names."""
-    shown = [thinned(line) for line in lines]
-    xs = [x for line in shown for x in line.x]
-    ys = [y for line in shown for y in (*line.y, *(end for pair in line.ends for end in pair))]
+    reduced = [thinned(line) for line in lines]
+    xs = [x for line in reduced for x in line.x]
+    ys = [y for line in reduced for y in (*line.y, *(end for pair in line.ends for end in pair))]
     x, y = Scale.over(xs, LEFT + 8, WIDTH - RIGHT - 8), Scale.over(ys, HEIGHT - BOTTOM, TOP + 4, zero=zero)
     x_ticks = {float(k): name for k, name in enumerate(names)} or {tick: number(tick) for tick in x.ticks(8)}
     parts = [*_frame(x, y, x_ticks, {tick: number(tick) for tick in y.ticks()}, x_label, y_label)]
-    for line in shown:
+    for line in reduced:
         parts += _line(line, x, y)
     return _svg(parts, HEIGHT, f"{y_label} by {x_label}")
 
@@ -98,8 +98,8 @@ def dot_chart(rows: Mapping[str, Sequence[tuple[int, str, Estimate]]], x_label: 
     for middle, row in zip(middles, rows.values(), strict=True):
         for j, (color, name, estimate) in enumerate(row):
             if math.isfinite(estimate.value):
-                at = y(middle) + 10 * (j - (len(row) - 1) / 2)
-                parts += _dot(x, at, estimate, color, name)
+                row_y = y(middle) + 10 * (j - (len(row) - 1) / 2)
+                parts += _dot(x, row_y, estimate, color, name)
     return _svg(parts, height, x_label)
 
 
@@ -116,9 +116,9 @@ def tree_chart(joints: Sequence[Joint], x_label: str, guides: Sequence[float], s
     """Return a tree that grows from its leaves, at `start`, to the right; a lower height is drawn at the one before."""
     place: dict[str, tuple[str, ...]] = {}
     for joint in joints:
-        both = (*place.get(joint.first[0], joint.first), *place.get(joint.second[0], joint.second))
-        place |= dict.fromkeys(both, both)
-    leaves = list(dict.fromkeys(name for both in place.values() for name in both))
+        joined = (*place.get(joint.first[0], joint.first), *place.get(joint.second[0], joint.second))
+        place |= dict.fromkeys(joined, joined)
+    leaves = list(dict.fromkeys(name for leaf_names in place.values() for name in leaf_names))
     left = LEFT + 6 * min(16, max(map(len, leaves)))
     height = TOP + ROW * len(leaves) + BOTTOM
     heights = list(itertools.accumulate((joint.height for joint in joints), max, initial=start))[1:]
@@ -127,13 +127,13 @@ def tree_chart(joints: Sequence[Joint], x_label: str, guides: Sequence[float], s
     names = {row + 0.5: name if len(name) <= 22 else f"{name[:19]}..." for row, name in enumerate(leaves)}
     parts = [*_frame(x, y, {tick: number(tick) for tick in x.ticks(7)}, names, x_label, "", left=left, height=height)]
     parts += [f'<path class="guide" d="M{x(g):.1f} {TOP}V{height - BOTTOM}"/>' for g in guides]
-    at = {name: (start, row + 0.5) for row, name in enumerate(leaves)}
+    position = {name: (start, row + 0.5) for row, name in enumerate(leaves)}
     for joint, end in zip(joints, heights, strict=True):
-        (x0, y0), (x1, y1) = at[joint.first[0]], at[joint.second[0]]
+        (x0, y0), (x1, y1) = position[joint.first[0]], position[joint.second[0]]
         title = html.escape(f"{' + '.join(joint.first)} and {' + '.join(joint.second)}: {joint.height:.3g}")
         way = f"M{x(x0):.1f} {y(y0):.1f}H{x(end):.1f}V{y(y1):.1f}H{x(x1):.1f}"
         parts.append(f'<path class="line c0" d="{way}"><title>{title}</title></path>')
-        at |= dict.fromkeys((*joint.first, *joint.second), (end, (y0 + y1) / 2))
+        position |= dict.fromkeys((*joint.first, *joint.second), (end, (y0 + y1) / 2))
     return _svg(parts, height, x_label)
 
 
@@ -143,7 +143,9 @@ def thinned(line: Line) -> Line:
         return line
     with np.errstate(invalid="ignore"):
         parts = [np.array_split(np.asarray(values, dtype=np.float64), POINTS) for values in (line.x, line.y)]
-        x, y = ([float(np.nanmean(p)) if np.isfinite(p).any() else math.nan for p in own] for own in parts)
+        x, y = (
+            [float(np.nanmean(p)) if np.isfinite(p).any() else math.nan for p in coordinate] for coordinate in parts
+        )
     return Line(line.name, x, y, (), line.color)
 
 
@@ -170,11 +172,11 @@ def _line(line: Line, x: Scale, y: Scale) -> Iterator[str]:
             yield _mark(x(px), y(py), line.color, f"{line.name}: {_with_ends(Estimate(py, *ends))}")
 
 
-def _dot(x: Scale, at: float, estimate: Estimate, color: int, name: str) -> Iterator[str]:
+def _dot(x: Scale, y: float, estimate: Estimate, color: int, name: str) -> Iterator[str]:
     shade = _class(color)
     if math.isfinite(estimate.low) and math.isfinite(estimate.high):
-        yield f'<path class="line {shade}" d="M{x(estimate.low):.1f} {at:.1f}H{x(estimate.high):.1f}"/>'
-    yield _mark(x(estimate.value), at, color, f"{name}: {_with_ends(estimate)}")
+        yield f'<path class="line {shade}" d="M{x(estimate.low):.1f} {y:.1f}H{x(estimate.high):.1f}"/>'
+    yield _mark(x(estimate.value), y, color, f"{name}: {_with_ends(estimate)}")
 
 
 def _with_ends(estimate: Estimate) -> str:

@@ -141,13 +141,13 @@ def filter_studies(result: Result) -> list[FilterStudy]:
 
 def of_interest(result: Result) -> Result:
     """Return the result for tables and figures of maps: a filter study is reduced to models and the filters to use."""
-    wanted = {each.model: {"", each.best.filters if each.best else ""} for each in filter_studies(result)}
-    if not wanted:
+    filters_by_model = {study.model: {"", study.best.filters if study.best else ""} for study in filter_studies(result)}
+    if not filters_by_model:
         return result
 
     def shown(record: Record) -> bool:
         quality = record.quality
-        return quality is None or quality.filters in wanted.get(quality.model, {quality.filters})
+        return quality is None or quality.filters in filters_by_model.get(quality.model, {quality.filters})
 
     names = {record.unit.model for record in result.select() if shown(record)}
     records = tuple(record for record in result.records if record.unit.model in names)

@@ -212,7 +212,7 @@ _SWEEPS = (
 
 def describe(sweep: str) -> Sweep:
     """Return the description of a sweep; one that is not known goes by its name."""
-    return next((known for known in _SWEEPS if known.name == sweep), _unknown(sweep))
+    return next((description for description in _SWEEPS if description.name == sweep), _unknown(sweep))
 
 
 def _unknown(name: str) -> Sweep:
@@ -223,8 +223,8 @@ def _unknown(name: str) -> Sweep:
 def swept(result: Result) -> list[Sweep]:
     """Return the sweeps of a study that have values, in a fixed order."""
     present = result.sweeps()
-    known = [sweep for sweep in _SWEEPS if sweep.name in present]
-    return [*known, *(describe(name) for name in present if describe(name) not in known)]
+    described = [sweep for sweep in _SWEEPS if sweep.name in present]
+    return [*described, *(describe(name) for name in present if describe(name) not in described)]
 
 
 def levels(result: Result, sweep: str, model: str, scene: str | None = None) -> tuple[Level, ...]:
@@ -246,8 +246,8 @@ def complete_scenes(result: Result, sweep: str, model: str) -> tuple[str, ...]:
     points: dict[str, set[Variation]] = {}
     for record in result.select(sweep, model=model):
         points.setdefault(record.unit.scene, set()).add(record.variation)
-    wanted = set().union(*points.values())
-    return tuple(scene for scene, of_scene in points.items() if of_scene == wanted)
+    all_variations = set().union(*points.values())
+    return tuple(scene for scene, of_scene in points.items() if of_scene == all_variations)
 
 
 def by_model(records: Iterable[Record]) -> dict[str, list[Record]]:

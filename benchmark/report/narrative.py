@@ -96,8 +96,8 @@ def _not_counting_frames(result: Result) -> Iterator[str]:
     """Yield which maps have evidence by another rule than the mean, of which what counts frames is not known."""
     units = [record.summary for sweep in (BASE, BACKENDS) for record in result.select(sweep)]
     labelled = [run for run in units if run.taxonomy != OF_FEATURES.name]
-    known = [(run.unit.backend, run.statistics) for run in labelled if run.statistics is not None]
-    names = [name for name, found in known if found.repeated.voxels and math.isnan(found.agreement.psa_op2.value)]
+    assessed = [(run.unit.backend, run.statistics) for run in labelled if run.statistics is not None]
+    names = [name for name, stats in assessed if stats.repeated.voxels and math.isnan(stats.agreement.psa_op2.value)]
     if names:
         yield (
             f"{', '.join(dict.fromkeys(names))}: this rule does not count frames, so that PSA, voxel alpha, consistent"
@@ -108,16 +108,18 @@ def _not_counting_frames(result: Result) -> Iterator[str]:
 def _one_class_covers(runs: Sequence[UnitSummary]) -> Iterator[str]:
     """Yield which classes cover most of a map, so that they determine most of its numbers."""
     covering: dict[str, list[tuple[str, float]]] = {}
-    for run in (each for each in runs if each.taxonomy != OF_FEATURES.name):
+    for run in (summary for summary in runs if summary.taxonomy != OF_FEATURES.name):
         if max(row.share for row in run.table.classes) >= ONE_CLASS:
             largest = max(run.table.classes, key=lambda row: row.voxels)
             covering.setdefault(largest.name, []).append((run.unit.model, largest.share))
     for name, shares in covering.items():
         all_of_them = len(shares) == len(runs)
-        of = "" if all_of_them else f" of {', '.join(dict.fromkeys(model for model, _ in shares))}"
+        of_models = "" if all_of_them else f" of {', '.join(dict.fromkeys(model for model, _ in shares))}"
         more = " or more" if len({f"{share:.0%}" for _, share in shares}) > 1 else ""
         least = min(share for _, share in shares)
-        covers = f"'{name}' covers {round(100 * least)}%{more} of the map{of}, and determines most of its numbers"
+        covers = (
+            f"'{name}' covers {round(100 * least)}%{more} of the map{of_models}, and determines most of its numbers"
+        )
         if least >= NOTHING_ELSE:
             yield f"{covers}; what is left without it is too little to assess: take another model, or another scene"
         else:
@@ -146,12 +148,12 @@ def outlying_line(outlying: OutlyingFrames, of: str = "", *, most: int = MOST_FR
     head = f"frames that stand out{f', {of}' if of else ''}"
     if not outlying.judged:
         return f"{head}: not known, fewer than {LEAST_FRAMES} views share {LEAST_PLACES} places with two others"
-    left = f" ({outlying.unjudged} not judged: they share too few places)" if outlying.unjudged else ""
+    unjudged = f" ({outlying.unjudged} not judged: they share too few places)" if outlying.unjudged else ""
     if not outlying.frames:
-        return f"{head}: none of {outlying.judged}{left}"
-    names = [each.name for each in sorted(outlying.frames, key=lambda each: each.frame)]
+        return f"{head}: none of {outlying.judged}{unjudged}"
+    names = [outlier.name for outlier in sorted(outlying.frames, key=lambda outlier: outlier.frame)]
     more = f" and {len(names) - most} more" if len(names) > most else ""
-    return f"{head}: {len(names)} of {outlying.judged}{left}, {' '.join(names[:most])}{more}"
+    return f"{head}: {len(names)} of {outlying.judged}{unjudged}, {' '.join(names[:most])}{more}"
 
 
 def not_assessed(run: UnitSummary) -> str:
@@ -243,12 +245,13 @@ def _ranking(result: Result) -> Iterator[str]:
         return
     if not means or any(voxels.recurrent.voxels < ENOUGH for voxels in means.values()):
         return
-    every = _order({name: voxels.every[VSS] for name, voxels in means.items()})
+    all_voxels = _order({name: voxels.every[VSS] for name, voxels in means.items()})
     recurrent = _order({name: voxels.recurrent[VSS] for name, voxels in means.items()})
     taxonomy = records[0].summary.taxonomy
-    if every != recurrent:
+    if all_voxels != recurrent:
         yield (
-            f"VSS of all voxels misleads: in one taxonomy ({taxonomy}) its order is {every}, and {recurrent} for OP>=3."
+            f"VSS of all voxels misleads: in one taxonomy ({taxonomy}) its order is {all_voxels}, and {recurrent} for"
+            " OP>=3."
         )
 
 
@@ -277,11 +280,11 @@ def _implementations(result: Result) -> Iterator[str]:
         name: [row.agrees for row in result.agreement if row.backends == (result.backend, name)]
         for name in dict.fromkeys(row.backends[1] for row in result.agreement)
     }
-    if same := [name for name, agrees in rows.items() if all(agrees)]:
-        drawn = one_in([row for row in result.agreement if row.backends[1] in same])
-        sample = f" ({drawn} voxels were compared)" if drawn else ""
-        make = "makes" if len(same) == 1 else "make"
-        yield f"{' and '.join(same)} {make} the same maps as {result.backend}{sample}."
+    if equal := [name for name, agrees in rows.items() if all(agrees)]:
+        sampled = one_in([row for row in result.agreement if row.backends[1] in equal])
+        sample = f" ({sampled} voxels were compared)" if sampled else ""
+        make = "makes" if len(equal) == 1 else "make"
+        yield f"{' and '.join(equal)} {make} the same maps as {result.backend}{sample}."
     for name, agrees in rows.items():
         if not all(agrees):
             yield f"{name} and {result.backend} disagree in {agrees.count(False)} of {len(agrees)} comparisons."

@@ -67,7 +67,7 @@ def render(
         above: The voxels that are seen from above, by the unit's slug; the voxels of other units are read.
     """
     everything, result = result, of_interest(result)
-    shown, views = list(_scenes(result, folder, above)), [table_block(table) for table in tables(everything)]
+    scenes, views = list(_scenes(result, folder, above)), [table_block(table) for table in tables(everything)]
     return filled(
         "report.html.j2",
         kind="Study of temporal semantic stability" if result.sweeps() else "Temporal semantic stability",
@@ -79,11 +79,11 @@ def render(
         cards=[_card(name, records) for name, records in by_model(result.select()).items()],
         answers=[relations(text) for text in answers(result)],
         noted=[relations(text) for text in noted(result)],
-        advice=[sentence for each in filter_studies(everything) for sentence in advice(each)],
+        advice=[sentence for study in filter_studies(everything) for sentence in advice(study)],
         warnings=[relations(text) for text in warnings(result)],
         notes=[relations(text) for text in notes(result)],
-        scenes=shown,
-        maps=_script([_for_script(unit) for scene in shown for unit in scene["maps"]]),
+        scenes=scenes,
+        maps=_script([_for_script(unit) for scene in scenes for unit in scene["maps"]]),
         layers=_script(
             {
                 "categories": CATEGORIES,
@@ -121,13 +121,13 @@ def _legend(names: Sequence[str]) -> list[tuple[str, str]]:
 def _card(model: str, records: Sequence[Record]) -> dict[str, Any]:
     """Return the card of a model: the verdict on it in each scene, and the numbers that the verdict rests on."""
     assessed = [record.statistics for record in records if record.statistics is not None]
-    one = assessed[0] if len(assessed) == 1 else None
+    single = assessed[0] if len(assessed) == 1 else None
     return {
         "model": model,
         "scenes": [_scene_verdict(record) for record in records[:12] if record.pixels is None],
         "more": max(0, len(records) - 12),
-        "reasons": relations(one.verdict.line.partition(": ")[2]) if one is not None else "",
-        "numbers": [(name, value, note) for name, value, note in _numbers(records, assessed, one) if value],
+        "reasons": relations(single.verdict.line.partition(": ")[2]) if single is not None else "",
+        "numbers": [(name, value, note) for name, value, note in _numbers(records, assessed, single) if value],
     }
 
 
@@ -144,7 +144,7 @@ def _scene_verdict(record: Record) -> dict[str, str]:
 
 
 def _numbers(
-    records: Sequence[Record], assessed: Sequence[MapStatistics], one: MapStatistics | None
+    records: Sequence[Record], assessed: Sequence[MapStatistics], single: MapStatistics | None
 ) -> Iterator[tuple[str, str, str]]:
     """Yield rows of a card: name, value, and its interval or unit; macro means over several scenes."""
 
@@ -159,16 +159,20 @@ def _numbers(
             return f"{estimate.of} {short(estimate.low)} to {short(estimate.high)}"
         return f"{estimate.of} {scale * estimate.low:z.0f} to {scale * estimate.high:z.0f}"
 
-    head = None if one is None else one.headline
+    head = None if single is None else single.headline
     alphas = [stats.headline.alpha.value for stats in assessed]
     alpha = macro_mean(alphas)
     yield "alpha", "" if math.isnan(alpha) else short(alpha), interval(None if head is None else head.alpha)
     of_features = [stats.features.alpha for stats in assessed if stats.features is not None]
     one_of_them = of_features[0] if len(of_features) == 1 else None
-    yield "alpha of features", mean([each.value for each in of_features], "{:.2f}").lstrip("0"), interval(one_of_them)
+    yield (
+        "alpha of features",
+        mean([estimate.value for estimate in of_features], "{:.2f}").lstrip("0"),
+        interval(one_of_them),
+    )
     yield "two views agree", mean([stats.agreeing for stats in assessed], "{:.0f} %", 100), "of the spots"
-    if one is not None and one.told_ranges is not None:
-        value, note = one.told_ranges.parts
+    if single is not None and single.told_ranges is not None:
+        value, note = single.told_ranges.parts
         yield "reliable", value, note
     flicker = [record.image_space.compensated_flicker_percent for record in records]
     of_images = all(record.pixels is not None for record in records)
@@ -225,7 +229,7 @@ def _scenes(result: Result, folder: Path, above: Mapping[str, FromAbove]) -> Ite
                 overviews[record.unit.model] = Overview.load(path)
         up, colors = result.up.get(scene), {name: k for k, name in enumerate(result.models)}
         labelled = [record for record in records if record.summary.taxonomy != OF_FEATURES.name]
-        drawn = [] if up is None else [record for record in labelled if record.voxels_file is not None]
+        mapped = [] if up is None else [record for record in labelled if record.voxels_file is not None]
         yield {
             "name": scene,
             "maps": [
@@ -236,7 +240,7 @@ def _scenes(result: Result, folder: Path, above: Mapping[str, FromAbove]) -> Ite
                     result.georeference.get(scene),
                     share,
                 )
-                for record in drawn
+                for record in mapped
             ],
             "unknown_up": up is None,
             "video": all(record.pixels is not None for record in records),
@@ -280,13 +284,13 @@ def _map(
     palette = palette if overview is None else overview.palette
     cell, located = step * above.cell, Located.of(above, georeference)
     size = rows.shape[1] * cell, rows.shape[0] * cell
-    cut = any(all_of_it > 1.02 * own + 2 * cell for all_of_it, own in zip(above.whole, size, strict=True))
-    of = f" of {above.whole[0]:.3g} m by {above.whole[1]:.3g} m (without outlying voxels)" if cut else ""
+    cut = any(all_of_it > 1.02 * extent + 2 * cell for all_of_it, extent in zip(above.whole, size, strict=True))
+    of_whole = f" of {above.whole[0]:.3g} m by {above.whole[1]:.3g} m (without outlying voxels)" if cut else ""
     return {
         "model": record.unit.model,
         "scene": record.unit.scene,
         "size": [rows.shape[1], rows.shape[0]],
-        "text": f"{size[0]:.3g} m by {size[1]:.3g} m{of}, seen {above.view}",
+        "text": f"{size[0]:.3g} m by {size[1]:.3g} m{of_whole}, seen {above.view}",
         "around": map_frame(located),
         "located": {"matrix": located.matrix.tolist(), "size": located.size, "names": located.names},
         "places": described_places(record, located, overview, names),
@@ -324,11 +328,11 @@ def _timeline(records: Sequence[Record], colors: Mapping[str, int]) -> Iterator[
         (("moving_percent",), "What moved", "% of a frame's answers at spots that moved"),
     ):
         lines = []
-        for name, own in series.items():
-            if all(column in own for column in columns):
-                first, *null = (own[column].astype(float) for column in columns)
+        for name, frame_series in series.items():
+            if all(column in frame_series for column in columns):
+                first, *null = (frame_series[column].astype(float) for column in columns)
                 values = first - null[0] if null else first
-                lines.append(Line(name, own["frame"].tolist(), values.tolist(), color=colors[name]))
+                lines.append(Line(name, frame_series["frame"].tolist(), values.tolist(), color=colors[name]))
         if any(np.isfinite(line.y).any() for line in lines):
             yield {"title": title, "chart": line_chart(lines, "frame", unit)}
 
@@ -344,12 +348,12 @@ def _lone(record: Record, overview: Overview | None) -> Iterator[dict[str, Any]]
     outlying = record.outlying_frames
     if overview is None or overview.lone is None or outlying is None:
         return
-    lone, named = overview.lone, {each.frame: each for each in outlying.frames}
-    for k, frame in enumerate(lone.frames.tolist()):
-        outlier, color = named[frame], None if lone.color is None else lone.color[k]
+    lone_frames, outliers = overview.lone, {row.frame: row for row in outlying.frames}
+    for k, frame in enumerate(lone_frames.frames.tolist()):
+        outlier, color = outliers[frame], None if lone_frames.color is None else lone_frames.color[k]
         shares = f"alone at {100 * outlier.share:.0f} % of its places, other frames there at {100 * outlier.null:.0f} %"
         shares = shares if record.pixels is None else f"alone at {100 * outlier.share:.0f} % of its pixels"
-        pictures = lone_pictures(color, lone.labels[k], lone.alone[k], overview.palette)
+        pictures = lone_pictures(color, lone_frames.labels[k], lone_frames.alone[k], overview.palette)
         yield {"title": f"{record.unit.model}, {outlier.name}: {shares}", "pictures": pictures}
 
 
@@ -360,16 +364,18 @@ DISAGREES = 0.02
 def _classes(records: Sequence[Record], colors: Mapping[str, int]) -> str:
     """Return a chart of the classes that count for the verdict or disagree, with their alphas."""
     rows: dict[str, list[tuple[int, str, Estimate]]] = {}
-    shown: dict[str, bool] = {}
+    is_listed: dict[str, bool] = {}
     for record in records:
         statistics, name = record.statistics, record.unit.model
         for of_class in () if statistics is None or statistics.spots is None else statistics.spots.classes:
             if not math.isnan(of_class.alpha.value):
                 rows.setdefault(of_class.name, []).append((colors[name], name, of_class.alpha))
-                shown[of_class.name] = (
-                    shown.get(of_class.name, False) or of_class.counts_for_verdict or of_class.disagreement >= DISAGREES
+                is_listed[of_class.name] = (
+                    is_listed.get(of_class.name, False)
+                    or of_class.counts_for_verdict
+                    or of_class.disagreement >= DISAGREES
                 )
-    rows = {name: alphas for name, alphas in rows.items() if shown[name]}
+    rows = {name: alphas for name, alphas in rows.items() if is_listed[name]}
     if not rows:
         return ""
     ordered = dict(sorted(rows.items(), key=lambda item: min(e.value for _, _, e in item[1])))
@@ -399,7 +405,7 @@ def _distance(records: Sequence[Record], colors: Mapping[str, int]) -> Iterator[
         features = None if statistics is None else statistics.features
         kinds[""].append((record, None if statistics is None else statistics.correlogram))
         kinds[", features"].append((record, None if features is None else features.correlogram))
-    for (axis, title, unit), (of, correlograms) in itertools.product(
+    for (axis, title, unit), (suffix, correlograms) in itertools.product(
         (
             ("time", "In time", "frames apart"),
             ("angle", "In angle", "degrees between the views"),
@@ -411,13 +417,15 @@ def _distance(records: Sequence[Record], colors: Mapping[str, int]) -> Iterator[
         for record, correlogram in correlograms:
             bins = getattr(correlogram, axis) if correlogram else ()
             if bins:
-                name, alphas = record.unit.model, [each.alpha for each in bins]
+                name, alphas = record.unit.model, [lag_bin.alpha for lag_bin in bins]
                 ends = [(alpha.low, alpha.high) for alpha in alphas]
                 lines.append(
-                    Line(name, [each.mean for each in bins], [alpha.value for alpha in alphas], ends, colors[name])
+                    Line(
+                        name, [lag_bin.mean for lag_bin in bins], [alpha.value for alpha in alphas], ends, colors[name]
+                    )
                 )
         if lines:
-            yield {"title": f"{title}{of}", "chart": line_chart(lines, unit, "alpha", zero=True)}
+            yield {"title": f"{title}{suffix}", "chart": line_chart(lines, unit, "alpha", zero=True)}
 
 
 # --- All scenes together ----------------------------------------------------------------------------------------------
@@ -447,10 +455,10 @@ def _sweeps(result: Result) -> Iterator[dict[str, str]]:
         for title, take in (("alpha", lambda p: p.alpha.value), *first):
             lines = []
             for k, model in enumerate(result.models):
-                if own := levels(result, sweep.name, model):
-                    spread = [level.spread(take) for level in own]
+                if sweep_levels := levels(result, sweep.name, model):
+                    spread = [level.spread(take) for level in sweep_levels]
                     ends = [(s.mean - s.sd, s.mean + s.sd) for s in spread]
-                    xs = [level.value * sweep.scale for level in own]
+                    xs = [level.value * sweep.scale for level in sweep_levels]
                     lines.append(Line(model, xs, [s.mean for s in spread], ends, k))
             if any(np.isfinite(line.y).any() for line in lines):
                 label = f"{sweep.title}, {sweep.unit}" if sweep.unit else sweep.title

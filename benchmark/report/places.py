@@ -79,27 +79,27 @@ def _where(place: Place, located: Located) -> str:
 
 def _frames(place: Place, names: Mapping[int, str], classes: Sequence[str]) -> str:
     """Return the frames that see a place, by the class that they give it."""
-    given: dict[str, list[str]] = {}
+    frames_by_class: dict[str, list[str]] = {}
     for view in place.views[:NAMED]:
         label = "no class" if view.label < 0 else classes[view.label]
-        given.setdefault(label, []).append(names.get(view.frame, str(view.frame)))
+        frames_by_class.setdefault(label, []).append(names.get(view.frame, str(view.frame)))
     more = f"; and {len(place.views) - NAMED} more frames" if len(place.views) > NAMED else ""
-    return "; ".join(f"{label}: {', '.join(frames)}" for label, frames in given.items()) + more
+    return "; ".join(f"{label}: {', '.join(frames)}" for label, frames in frames_by_class.items()) + more
 
 
 def _pictures(
     place: Place, pictures: PlacePictures, palette: Any, names: Mapping[int, str], classes: Sequence[str]
 ) -> Iterator[dict[str, Any]]:
     """Yield the pictures of a place, where those that were kept are of it."""
-    given = {view.frame: view.label for view in place.views}
+    labels = {view.frame: view.label for view in place.views}
     for k in np.flatnonzero(pictures.of == place.number):
         if not np.allclose(pictures.centre[k], place.centre):
             continue
         frame, (x, y, radius) = int(pictures.frame[k]), pictures.ring[k].tolist()
-        label = given.get(frame, -1)
-        shown = [] if pictures.color is None else [("image", jpeg(pictures.color[k]))]
+        label = labels.get(frame, -1)
+        images = [] if pictures.color is None else [("image", jpeg(pictures.color[k]))]
         yield {
             "title": f"{names.get(frame, frame)}: {'no class' if label < 0 else classes[label]}",
-            "shown": [*shown, ("labels", label_picture(pictures.labels[k], palette))],
+            "shown": [*images, ("labels", label_picture(pictures.labels[k], palette))],
             "ring": [100 * x, 100 * y, 200 * radius],
         }

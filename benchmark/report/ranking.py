@@ -27,29 +27,31 @@ def answers(result: Result) -> Iterator[str]:
         yield from _by_flicker(result)
         return
     ranked = ranking(result)
-    known = [each for each in ranked.differences if not math.isnan(each.low)]
-    if len(ranked.differences) == 1 and known:
-        (one,) = known
+    defined = [pair for pair in ranked.differences if not math.isnan(pair.low)]
+    if len(ranked.differences) == 1 and defined:
+        (difference,) = defined
         relation = "does not differ significantly from"
-        if one.undecided:
+        if difference.undecided:
             relation = "is not compared with"
-        elif one.shown:
-            relation = "is more stable than" if one.value > 0 else "is less stable than"
-        elif one.silent:
+        elif difference.shown:
+            relation = "is more stable than" if difference.value > 0 else "is less stable than"
+        elif difference.silent:
             relation = "is not shown to differ from"
-        change = Estimate(one.value, one.low, one.high).text("+")
-        scenes = f", {one.scenes} of {len(result.scenes)} scenes" if one.scenes < len(result.scenes) else ""
-        why = f"; {one.undecided}" if one.undecided else ""
-        yield f"{one.model} {relation} {one.other}: alpha {change}{scenes}{why}"
-    elif known:
+        change = Estimate(difference.value, difference.low, difference.high).text("+")
+        scenes = (
+            f", {difference.scenes} of {len(result.scenes)} scenes" if difference.scenes < len(result.scenes) else ""
+        )
+        why = f"; {difference.undecided}" if difference.undecided else ""
+        yield f"{difference.model} {relation} {difference.other}: alpha {change}{scenes}{why}"
+    elif defined:
         ranks = "; ".join(f"{rank}. {', '.join(names)}" for rank, names in ranked.ranks)
         yield f"most stable first: {ranks}"
         yield (
             "rank: 1 plus the number of models with a significantly higher alpha (Holm over"
             f" {len(ranked.differences)} pairs), where all models have a label"
         )
-    for each in (each for each in ranked.differences if each.silent):
-        better, worse = (each.model, each.other) if each.value > 0 else (each.other, each.model)
+    for pair in (pair for pair in ranked.differences if pair.silent):
+        better, worse = (pair.model, pair.other) if pair.value > 0 else (pair.other, pair.model)
         yield (
             f"{better} has a higher alpha than {worse} on what both label, but a lower one if what it leaves out counts"
             " as disagreeing"
@@ -85,9 +87,9 @@ def least_flicker_first(models: Mapping[str, Sequence[Record]]) -> list[str]:
 def _silence(records: Sequence[Record]) -> str:
     """Return why flicker of videos says nothing: nearly all of each is one class; '' if flicker is informative."""
     pixels = [record.pixels for record in records if record.pixels is not None]
-    if not pixels or not all(each.effective_classes < LEAST_CLASSES for each in pixels):
+    if not pixels or not all(video.effective_classes < LEAST_CLASSES for video in pixels):
         return ""
-    least = min(pixels, key=lambda each: each.largest_share)
+    least = min(pixels, key=lambda video: video.largest_share)
     share, model = nearly_all(least.largest_share), records[0].unit.model
     return f"uninformative: {share} of the labels of {model} are {least.largest_class}"
 
@@ -104,40 +106,44 @@ def contradictions(result: Result, ranked: Ranking) -> Iterator[str]:
     """
     models = by_model(result.select())
     opposed = []
-    for each in sorted((each for each in ranked.differences if each.shown), key=lambda each: -abs(each.value)):
-        better, worse = (each.model, each.other) if each.value > 0 else (each.other, each.model)
+    for pair in sorted((pair for pair in ranked.differences if pair.shown), key=lambda pair: -abs(pair.value)):
+        better, worse = (pair.model, pair.other) if pair.value > 0 else (pair.other, pair.model)
         if against := _against(models[better], models[worse]):
             opposed.append((better, worse, against))
     if not opposed:
         return
     better, worse, against = opposed[0]
-    *others, last = against
-    listed = f"{', '.join(others)} and {last}" if others else last
+    *earlier, last = against
+    listed = f"{', '.join(earlier)} and {last}" if earlier else last
     more = "; ".join(f"{first} above {second}" for first, second, _ in opposed[1:4])
     rest = f"; so it is for {more}{', ...' if len(opposed) > 4 else ''}" if more else ""
     yield (
         f"measures disagree: alpha is better for {better}, but {listed}"
-        f" {'are' if others else 'is'} better for {worse}{rest}; compare the classes before you choose"
+        f" {'are' if earlier else 'is'} better for {worse}{rest}; compare the classes before you choose"
     )
 
 
 def _against(better: Sequence[Record], worse: Sequence[Record]) -> list[str]:
     """Return the measures that are clearly better for the second model: 'VSS (OP>=3) (.942 against .863)'."""
-    found = []
+    clearly_better = []
     of_both = (_measured(worse), _measured(better))
     for name, (least, share) in CLEAR.items():
         higher, lower = (values[name] for values in of_both)
         gain = lower - higher if name == "SBD" else higher - lower  # less drift is better
         if gain >= max(least, share * max(abs(higher), abs(lower))):
-            found.append(f"{name} ({short(higher, digits=3)} against {short(lower, digits=3)})")
-    return found
+            clearly_better.append(f"{name} ({short(higher, digits=3)} against {short(lower, digits=3)})")
+    return clearly_better
 
 
 def _measured(records: Sequence[Record]) -> dict[str, float]:
     """Return the measures of a model other than alpha, over its scenes; NaN if unknown."""
     recurrent = pooled(records).recurrent
     enough = recurrent.voxels >= ENOUGH
-    known = [record.statistics.correctness for record in records if record.statistics is not None]
-    miou = macro_mean([right.miou_op2.value for right in known if right is not None]) if any(known) else math.nan
+    correctness = [record.statistics.correctness for record in records if record.statistics is not None]
+    miou = (
+        macro_mean([right.miou_op2.value for right in correctness if right is not None])
+        if any(correctness)
+        else math.nan
+    )
     vss, sbd = (recurrent[measure] if enough else math.nan for measure in (VSS, SBD))
     return {"VSS (OP>=3)": vss, "SBD": sbd, "mIoU": miou}

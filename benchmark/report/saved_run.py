@@ -49,7 +49,7 @@ class Run:
         `unstable` is the probability that alpha of the class is below the level 'usable'.
         """
         rows: list[dict[str, Any]] = []
-        for unit in (each for each in self.result.runs if each.statistics is not None):
+        for unit in (run for run in self.result.runs if run.statistics is not None):
             spots = None if unit.statistics is None else unit.statistics.spots
             rows += [
                 {

@@ -87,34 +87,34 @@ class Recorded:
         self._content = content
         self._options = options
         chosen, streams = content.chosen, content.streams
-        seen = chosen.depth or chosen.color
-        assert seen is not None
-        self._seen = seen
+        primary = chosen.depth or chosen.color
+        assert primary is not None
+        self._seen = primary
         self.sources: list[str] = []
-        if chosen.color is not None and chosen.color.frame != seen.frame:
+        if chosen.color is not None and chosen.color.frame != primary.frame:
             logger.warning(
                 "%s: depth is of the frame '%s', colour of '%s': labels are looked up as if both saw from one point;"
                 " set depth to a topic that is registered to colour",
-                content.bag.path, seen.frame, chosen.color.frame,
+                content.bag.path, primary.frame, chosen.color.frame,
             )  # fmt: skip
-        at, to = self._pairs()
-        named = streams[(chosen.color or seen).topic]
-        self._stamps = streams[seen.topic].stamps[at]
-        self._names = [seconds(int(stamp)) for stamp in named.stamps[to]]
+        primary_rows, named_rows = self._pairs()
+        name_stream = streams[(chosen.color or primary).topic]
+        self._stamps = streams[primary.topic].stamps[primary_rows]
+        self._names = [seconds(int(stamp)) for stamp in name_stream.stamps[named_rows]]
         self._poses = self._posed()
         bag, folders = content.bag, []
         if chosen.depth is not None:
-            places = [streams[chosen.depth.topic].place(k) for k in at]
+            places = [streams[chosen.depth.topic].place(k) for k in primary_rows]
             folders.append(Folder.of_images(bag, chosen.depth, places, color=False))
         if chosen.color is not None:
-            folders.append(Folder.of_images(bag, chosen.color, [named.place(k) for k in to], color=True))
+            folders.append(Folder.of_images(bag, chosen.color, [name_stream.place(k) for k in named_rows], color=True))
         for source, images in chosen.labels.items():
             stream = streams[images.topic]
-            near = stream.near(named.stamps[to], options.max_difference)
+            near = stream.near(name_stream.stamps[named_rows], options.max_difference)
             label_places = [None if k is None else stream.place(k) for k in near]
             folders.append(Folder.of_images(bag, images, label_places, color=False))
             count = len(near) - near.count(None)
-            self.sources.append(f"labels   {source}: {images}, of {count} of {len(at)} frames")
+            self.sources.append(f"labels   {source}: {images}, of {count} of {len(primary_rows)} frames")
         self.messages = Messages(bag, folders, self._names)
         self.label_folders = {source: self.messages.folder(images) for source, images in chosen.labels.items()}
         self.sources += [text for topic, stream in streams.items() for text in stream.notes(topic)]
@@ -134,31 +134,31 @@ class Recorded:
             return np.arange(len(base)), np.arange(len(base))
         other, start = self._content.streams[color.topic], int(base.stamps[0])
         partners = mutual_nearest(base.since(start), other.since(start), limit).astype(np.int64)
-        at = np.flatnonzero(partners >= 0)
-        if not len(at):
+        paired = np.flatnonzero(partners >= 0)
+        if not len(paired):
             raise DataError(
                 f"{bag.path}: no image of {depth.topic} is within {limit:g} s of one of {color.topic}; set"
                 " max_difference, or stamps: bag"
             )
-        said = f"{len(at)} of {len(base)} depth and {len(other)} colour images are within {limit:g} s"
-        self.sources.append(f"frames   {said}")
-        if len(at) < len(base):
+        counts = f"{len(paired)} of {len(base)} depth and {len(other)} colour images are within {limit:g} s"
+        self.sources.append(f"frames   {counts}")
+        if len(paired) < len(base):
             logger.warning(
                 "%s: %d depth images have no colour image within %g s (max_difference); left out",
-                bag.path, len(base) - len(at), limit,
+                bag.path, len(base) - len(paired), limit,
             )  # fmt: skip
-        return at, partners[at]
+        return paired, partners[paired]
 
     def _posed(self) -> Float64:
         """Return (n, 4, 4) poses of the frames, NaN for a frame without a pose."""
         frame = self._options.camera_frame or self._seen.frame
-        poses, said = self._content.poses.around(self._stamps.tolist(), frame, "frame")
-        self.sources.append(said)
+        poses, summary = self._content.poses.around(self._stamps.tolist(), frame, "frame")
+        self.sources.append(summary)
         return poses
 
     def frames(self) -> list[FrameSource]:
         """Return the frames, in the order of their stamps."""
-        return [self._frame(*each) for each in zip(self._names, self._stamps.tolist(), self._poses, strict=True)]
+        return [self._frame(*row) for row in zip(self._names, self._stamps.tolist(), self._poses, strict=True)]
 
     def _frame(self, name: str, stamp: int, pose: Float64) -> FrameSource:
         chosen, options, messages = self._content.chosen, self._options, self.messages

@@ -81,5 +81,5 @@ def field_of(message: Any, name: str, where: str) -> npt.NDArray[Any]:
     return values.reshape(-1).astype(dtype.newbyteorder("="))
 
 
-def _hint(name: str, known: Sequence[str]) -> str:
-    return nearest(name, known) if known else "it has none at all; record the bag again"
+def _hint(name: str, names: Sequence[str]) -> str:
+    return nearest(name, names) if names else "it has none at all; record the bag again"

@@ -62,15 +62,15 @@ def find_bags(root: Path) -> list[tuple[SceneEntry, tuple[Path, ...]]]:
         raise DataError(f"{root}: no bag here, nor {DEEPEST} folders deep; expected {CONTENTS}")
     bags, entries = dict[Path, Path](), []
     alone = Counter(paths[0].parent for paths in groups)
-    for path, *others in groups:
+    for path, *further in groups:
         folder = path if path.is_dir() else path.with_suffix("")
-        if others:  # a rosbag2 whose metadata.yaml is lost is its folder, as with it
+        if further:  # a rosbag2 whose metadata.yaml is lost is its folder, as with it
             folder = path.parent if alone[path.parent] == 1 else path.with_name(path.stem.rpartition("_")[0])
         if folder in bags:
             raise DataError(f"{path}: {bags[folder].name} would be a scene of the same name; rename one")
         bags[folder] = path
         parts = (folder.resolve().name or "scene",) if root in (folder, path) else folder.relative_to(root).parts
-        entries.append((SceneEntry("-".join(parts), folder, "/".join(parts)), (path, *others)))
+        entries.append((SceneEntry("-".join(parts), folder, "/".join(parts)), (path, *further)))
     return entries
 
 

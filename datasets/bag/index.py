@@ -34,12 +34,12 @@ class Stream:
     """
 
     def __init__(self, stamps: array[int], times: array[int], ranks: array[int]) -> None:
-        own = np.frombuffer(stamps, dtype=np.int64)
-        order = np.argsort(own, kind="stable")
-        order = order[np.append(True, np.diff(own[order]) > 0)[: len(order)]]
-        self.stamps: Int64 = own[order]
-        self.unsorted = int(np.count_nonzero(np.diff(own) < 0))
-        self.repeated = len(own) - len(order)
+        all_stamps = np.frombuffer(stamps, dtype=np.int64)
+        order = np.argsort(all_stamps, kind="stable")
+        order = order[np.append(True, np.diff(all_stamps[order]) > 0)[: len(order)]]
+        self.stamps: Int64 = all_stamps[order]
+        self.unsorted = int(np.count_nonzero(np.diff(all_stamps) < 0))
+        self.repeated = len(all_stamps) - len(order)
         self._times: Int64 = np.frombuffer(times, dtype=np.int64)[order]
         self._ranks: Int64 = np.frombuffer(ranks, dtype=np.int64)[order]
 
@@ -59,11 +59,11 @@ class Stream:
         """Return for each stamp the message nearest to it, or None if `max_difference` seconds hold no message."""
         if not len(self):
             return [None] * len(stamps)
-        wanted = (stamps - self.stamps[0]) / NANOSECONDS
-        own = self.since(int(self.stamps[0]))
-        at = nearest(wanted, own)
-        close = np.abs(own[at] - wanted) <= max_difference
-        return [int(k) if there else None for k, there in zip(at, close, strict=True)]
+        requested = (stamps - self.stamps[0]) / NANOSECONDS
+        message_times = self.since(int(self.stamps[0]))
+        rows = nearest(requested, message_times)
+        close = np.abs(message_times[rows] - requested) <= max_difference
+        return [int(k) if is_close else None for k, is_close in zip(rows, close, strict=True)]
 
     def notes(self, topic: str) -> Iterator[str]:
         """Yield a line for each thing that is not in order."""
@@ -134,7 +134,11 @@ def read_once(bag: OpenBag, options: BagOptions) -> Content:
         DataError: If the bag lacks a part or is damaged.
     """
     chosen, poses = choose(bag, options), SensorPoses(bag, options)
-    pictures = {each.topic: each for each in (chosen.depth, chosen.color, *chosen.labels.values()) if each is not None}
+    pictures = {
+        picture.topic: picture
+        for picture in (chosen.depth, chosen.color, *chosen.labels.values())
+        if picture is not None
+    }
     arrivals = {topic: Arrivals(topic, options.stamps) for topic in pictures}
     infos = [(chosen.depth_info, chosen.depth or chosen.color), (chosen.color_info, chosen.color)]
     cameras = {images.topic: Cameras() for _, images in infos if images is not None}
@@ -148,7 +152,7 @@ def read_once(bag: OpenBag, options: BagOptions) -> Content:
             if topic == info and images is not None:
                 stamp = place.time if options.stamps == "bag" else stamp_of(message)
                 cameras[images.topic].add(stamp, _camera(bag, options, topic, message, images))
-    streams = {topic: each.stream(bag.path) for topic, each in arrivals.items()}
+    streams = {topic: arrival.stream(bag.path) for topic, arrival in arrivals.items()}
     return Content(bag, chosen, streams, poses, cameras)
 
 

@@ -63,11 +63,11 @@ class Messages(Folders):
 
     def __init__(self, bag: OpenBag, folders: Sequence[Folder], frames: Sequence[str]) -> None:
         super().__init__()
-        topics = [each.topic for each in folders]
+        topics = [folder.topic for folder in folders]
         self._shared = {topic for topic in topics if topics.count(topic) > 1}
         self._last = threading.local()
         self._bag = bag
-        self._topics = {str(each.path): each for each in folders}
+        self._topics = {str(folder.path): folder for folder in folders}
         self._index: Mapping[str, int] = {name: k for k, name in enumerate(frames)}
 
     def folder(self, images: Images) -> Path:
@@ -113,6 +113,6 @@ class Messages(Folders):
         if topic is None:
             return None
         frame, suffix = os.path.splitext(name)  # noqa: PTH122
-        at = self._index.get(frame) if suffix == topic.suffix else None
-        place = None if at is None else topic.places[at]
+        index = self._index.get(frame) if suffix == topic.suffix else None
+        place = None if index is None else topic.places[index]
         return None if place is None else (topic, place)

@@ -43,9 +43,9 @@ SAME = 1000
 
 def numbers_of(pose: Any) -> tuple[float, ...]:
     """Return x y z qx qy qz qw of a Pose or a Transform."""
-    at = pose.position if hasattr(pose, "position") else pose.translation
+    position = pose.position if hasattr(pose, "position") else pose.translation
     turn = pose.orientation if hasattr(pose, "orientation") else pose.rotation
-    return at.x, at.y, at.z, turn.x, turn.y, turn.z, turn.w
+    return position.x, position.y, position.z, turn.x, turn.y, turn.z, turn.w
 
 
 class SensorPoses:
@@ -70,10 +70,10 @@ class SensorPoses:
         self._options = options
         self._transforms = Transforms()
         self._tf = bag.of_types(*TF_TYPE)
-        named = None if options.pose == TF else options.pose
+        pose_topic = None if options.pose == TF else options.pose
         topics = [name for kind in POSES for name in sorted(bag.of_types(kind), key=lambda k: -bag.topics[k].count)]
-        wanted = options.trajectory is None and options.pose != TF
-        self._topic = named or (topics[0] if topics and wanted else None)
+        finds_topic = options.trajectory is None and options.pose != TF
+        self._topic = pose_topic or (topics[0] if topics and finds_topic else None)
         self._read = None if self._topic is None else POSES[bag.topics[self._topic].type]
         self._own, self._of = Trajectory(), ""
         self._frame = ""
@@ -87,10 +87,10 @@ class SensorPoses:
             self._own.add(self._stamp(message, time), numbers_of(pose))
             return
         fixed = topic.rstrip("/").endswith("tf_static")
-        for each in message.transforms:
-            stamp = self._stamp(each, time)
+        for transform in message.transforms:
+            stamp = self._stamp(transform, time)
             self._transforms.add(
-                each.header.frame_id, each.child_frame_id, stamp, numbers_of(each.transform), fixed=fixed
+                transform.header.frame_id, transform.child_frame_id, stamp, numbers_of(transform.transform), fixed=fixed
             )
 
     def _stamp(self, message: Any, time: int) -> int:
@@ -104,13 +104,13 @@ class SensorPoses:
         """
         offset, limit = round(self._options.time_offset * NANOSECONDS), self._options.max_pose_gap
         poses, where = self.at([stamp + offset for stamp in stamps], sensor)
-        known = int(np.count_nonzero(np.isfinite(poses).all(axis=(1, 2))))
-        if not known:
+        num_posed = int(np.count_nonzero(np.isfinite(poses).all(axis=(1, 2))))
+        if not num_posed:
             raise DataError(
                 f"{self._path}: no {what} lies between two poses of {where} that are at most {limit:g} s apart; set"
                 " max_pose_gap, or stamps: bag"
             )
-        return poses, f"poses    {where}; around {known} of {len(poses)} {what}s, at most {limit:g} s apart"
+        return poses, f"poses    {where}; around {num_posed} of {len(poses)} {what}s, at most {limit:g} s apart"
 
     def at(self, stamps: Sequence[int], sensor: str) -> tuple[Poses, str]:
         """Return poses (n, 4, 4) of the sensor at stamps, NaN if unknown, and the source of the poses.
@@ -173,11 +173,11 @@ class SensorPoses:
         if not self._tf:
             return [], "there is no /tf; set trajectory: FILE, or pose: TOPIC"
         if len(chain) == 1:
-            known, option = self._transforms.frames(), f"{self._sensor}_frame"
-            of_sensor = [frame for frame in known if _OF_SENSOR[self._sensor].search(frame.lower())]
+            frames, option = self._transforms.frames(), f"{self._sensor}_frame"
+            of_sensor = [frame for frame in frames if _OF_SENSOR[self._sensor].search(frame.lower())]
             hint = f"{option}: one of {', '.join(of_sensor[:8])}, or " if of_sensor else ""
             return [], (
-                f"'{sensor}', the frame of its {self._seen}, is not in /tf, which has {', '.join(known[:8])}"
+                f"'{sensor}', the frame of its {self._seen}, is not in /tf, which has {', '.join(frames[:8])}"
                 f" ({hint}record /tf_static, too, or give {option}: FRAME with extrinsics: [x, y, z, qx, qy, qz, qw] of"
                 f" the {self._sensor} in it)"
             )
@@ -191,15 +191,15 @@ class SensorPoses:
         moving = [frame for k, frame in enumerate(chain) if self._transforms.moves(chain[: k + 1])]
         if not moving:
             return [], f"no transform moves between '{sensor}' and '{chain[-1]}', from which it hangs"
-        named = (f for word in WORLDS for f in moving if word in f.rpartition("/")[2].lower())
-        topmost = next(named, moving[-1])
+        world_like = (f for word in WORLDS for f in moving if word in f.rpartition("/")[2].lower())
+        topmost = next(world_like, moving[-1])
         return chain[: chain.index(topmost) + 1], ""
 
 
-def _snapped(stamps: Sequence[int], others: Sequence[int]) -> list[int]:
-    """Return stamps, each as the nearest of the others where a file with six digits of a second cannot tell them."""
-    own, theirs = np.array(stamps, dtype=np.int64), np.sort(np.array(others, dtype=np.int64))
-    after = np.searchsorted(theirs, own).clip(max=len(theirs) - 1)
-    for near in (theirs[after], theirs[np.maximum(after - 1, 0)]):
-        own = np.where(np.abs(near - own) <= SAME, near, own)
-    return [int(stamp) for stamp in own]
+def _snapped(stamps: Sequence[int], targets: Sequence[int]) -> list[int]:
+    """Return stamps, each as the nearest of the targets where a file with six digits of a second cannot tell them."""
+    snapped, sorted_targets = np.array(stamps, dtype=np.int64), np.sort(np.array(targets, dtype=np.int64))
+    after = np.searchsorted(sorted_targets, snapped).clip(max=len(sorted_targets) - 1)
+    for near in (sorted_targets[after], sorted_targets[np.maximum(after - 1, 0)]):
+        snapped = np.where(np.abs(near - snapped) <= SAME, near, snapped)
+    return [int(stamp) for stamp in snapped]

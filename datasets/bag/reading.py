@@ -72,31 +72,31 @@ def recordings(paths: Sequence[Path]) -> list[list[Path]]:
     Parts are numbered, each goes on in time where the one before ends, and they have topics in common.
     """
     groups: dict[tuple[str, str], dict[int, Path]] = {}
-    found: list[list[Path]] = []
+    sequences: list[list[Path]] = []
     for path in paths:
         match = SPLIT.fullmatch(path.stem)
         if match is None:
-            found.append([path])
+            sequences.append([path])
         else:
             groups.setdefault((match[1], path.suffix.lower()), {}).setdefault(int(match[2]), path)
     for numbered in groups.values():
         for number in sorted(numbered):
             before = numbered.get(number - 1)
-            if before is not None and found[-1][-1] == before and _goes_on(before, numbered[number]):
-                found[-1].append(numbered[number])
+            if before is not None and sequences[-1][-1] == before and _goes_on(before, numbered[number]):
+                sequences[-1].append(numbered[number])
             else:
-                found.append([numbered[number]])
-    known = {path for group in found for path in group}
-    return found + [[path] for path in paths if path not in known]
+                sequences.append([numbered[number]])
+    grouped = {path for group in sequences for path in group}
+    return sequences + [[path] for path in paths if path not in grouped]
 
 
 def _goes_on(first: Path, second: Path) -> bool:
     """Return whether the second file goes on where the first one ends; not if one cannot be read."""
     try:
-        (_, end, topics), (start, _, others) = (_extent(path) for path in (first, second))
+        (_, end, topics), (start, _, next_topics) = (_extent(path) for path in (first, second))
     except (DataError, MissingDependencyError):
         return False
-    return -MOST_OVERLAP <= start - end <= MOST_BETWEEN and bool(topics & others)
+    return -MOST_OVERLAP <= start - end <= MOST_BETWEEN and bool(topics & next_topics)
 
 
 def _extent(path: Path) -> tuple[int, int, set[str]]:
@@ -162,13 +162,15 @@ class OpenBag:
                 self._readers.append(reader)
         with self._one_line():
             self._connections: dict[str, list[tuple[Any, Any]]] = {}
-            for of, connection in ((one, each) for one in self._readers for each in one.connections):
+            for owner, connection in ((opened, link) for opened in self._readers for link in opened.connections):
                 if not isinstance(connection.topic, str):  # a database holds any type in any column
                     raise DataError(f"{path}: damaged: a topic is called {connection.topic!r}; record the bag again")
-                self._connections.setdefault(connection.topic, []).append((of, connection))
+                self._connections.setdefault(connection.topic, []).append((owner, connection))
             self.topics: Mapping[str, Topic] = {
-                name: Topic(name, same[0][1].msgtype.replace("/msg/", "/"), sum(int(each.msgcount) for _, each in same))
-                for name, same in self._connections.items()
+                name: Topic(
+                    name, links[0][1].msgtype.replace("/msg/", "/"), sum(int(link.msgcount) for _, link in links)
+                )
+                for name, links in self._connections.items()
             }
 
     @property
@@ -238,11 +240,11 @@ class OpenBag:
 
     def _messages(self, topics: Sequence[str], **times: int) -> Iterator[tuple[Any, int, bytes]]:
         """Return connection, time and bytes of the messages of topics, in order of bag time over all parts."""
-        known = [each for name in topics for each in self._connections.get(name, ())]
+        connections = [pair for name in topics for pair in self._connections.get(name, ())]
         streams = []
         for reader in self._readers:
-            wanted = [connection for of, connection in known if of is reader]
-            streams += [reader.messages(wanted, **times)] if wanted else []
+            of_reader = [connection for owner, connection in connections if owner is reader]
+            streams += [reader.messages(of_reader, **times)] if of_reader else []
         return heapq.merge(*streams, key=lambda item: item[1]) if len(streams) > 1 else iter(*streams or [()])
 
     @contextmanager

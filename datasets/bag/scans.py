@@ -121,7 +121,7 @@ class RecordedScans:
 
     def __init__(self, bag: OpenBag, options: BagScanOptions) -> None:
         self._bag, self._options = bag, options
-        self._topic, others = _topic_of(bag, options)
+        self._topic, other_topics = _topic_of(bag, options)
         if (first := bag.first(self._topic)) is None:
             raise DataError(f"{bag.path}, {self._topic}: holds no message that can be read; record the bag again")
         self._field = self._field_of(first)
@@ -134,23 +134,25 @@ class RecordedScans:
         folders = [Folder(folder, self._topic, ".npy", lambda cloud, where: npy(points_of(cloud, where)), places)]
         self.labels: dict[str, Path] = {}
         if field := self._field:
-            own = Path(f"{folder}.{field}")
-            self.labels = {options.label_source or field: own}
+            class_folder = Path(f"{folder}.{field}")
+            self.labels = {options.label_source or field: class_folder}
             folders.append(
-                Folder(own, self._topic, ".npy", lambda cloud, where: npy(classes_of(cloud, field, where)), places)
+                Folder(
+                    class_folder, self._topic, ".npy", lambda cloud, where: npy(classes_of(cloud, field, where)), places
+                )
             )
         self.messages = Messages(bag, folders, names)
         self.scans = self._scans(stream, names)
         self.sources += stream.notes(self._topic)
-        if others:
-            self.sources.append(f"others   {', '.join(others)} (set points)")
+        if other_topics:
+            self.sources.append(f"others   {', '.join(other_topics)} (set points)")
 
     def _field_of(self, first: Any) -> str | None:
         """Return the field of classes; raises DataError if an option names one that is not there."""
-        named = self._options.label_field
-        if named:
-            field_of(first, named, f"{self._bag.path}, {self._topic}, option label_field")
-        return label_field_of(first) if named is None else named or None
+        field_name = self._options.label_field
+        if field_name:
+            field_of(first, field_name, f"{self._bag.path}, {self._topic}, option label_field")
+        return label_field_of(first) if field_name is None else field_name or None
 
     def _stream(self) -> Stream:
         """Return the clouds that have points, and read the poses."""
@@ -170,8 +172,8 @@ class RecordedScans:
         if not names:
             return []
         stamps, folder = stream.stamps.tolist(), topic_path(self._bag, self._topic)
-        poses, said = self._poses.around(stamps, self._frame, "scan")
-        self.sources.append(said)
+        poses, summary = self._poses.around(stamps, self._frame, "scan")
+        self.sources.append(summary)
         return [
             ScanSource(
                 name, folder / f"{name}.npy", pose, self._bag.path, stamp / NANOSECONDS,

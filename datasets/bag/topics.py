@@ -74,16 +74,20 @@ def choose(bag: OpenBag, options: BagOptions) -> Chosen:
         require(bag, name, topic, types)
     images = dict(_images(bag, options))
     labels = _labels(images, options)
-    left = [each for each in images.values() if each not in labels.values() and not LABELS.search(each.topic.lower())]
-    depths = [each for each in left if is_depth(each)]
-    colors = [each for each in left if is_color(each)]
-    depth = _one(options.depth, images, depths, lambda each: _depth_rank(each, bag))
-    color = _one(options.color, images, colors, lambda each: _color_rank(each, depth))
+    unlabelled = [
+        candidate
+        for candidate in images.values()
+        if candidate not in labels.values() and not LABELS.search(candidate.topic.lower())
+    ]
+    depths = [candidate for candidate in unlabelled if is_depth(candidate)]
+    colors = [candidate for candidate in unlabelled if is_color(candidate)]
+    depth = _one(options.depth, images, depths, lambda candidate: _depth_rank(candidate, bag))
+    color = _one(options.color, images, colors, lambda candidate: _color_rank(candidate, depth))
     cast = options.surface is not None
     if cast and options.depth is None:
         depth = None
-    seen = depth or color
-    depth_info = None if seen is None else options.camera_info or _info_of(bag, seen)
+    primary = depth or color
+    depth_info = None if primary is None else options.camera_info or _info_of(bag, primary)
     color_info = None if color is None else options.color_info or _info_of(bag, color)
     lacks = []
     if depth is None and not cast:
@@ -94,9 +98,9 @@ def choose(bag: OpenBag, options: BagOptions) -> Chosen:
         lacks.append("camera info")
     if options.trajectory is None and not bag.of_types(*TF_TYPE, *POSES):
         lacks.append("poses")
-    if not lacks and depth_info is None and options.intrinsics is None and seen is not None:
+    if not lacks and depth_info is None and options.intrinsics is None and primary is not None:
         raise DataError(
-            f"{bag.path}: no camera info is of {seen.topic}; set camera_info: TOPIC, one of"
+            f"{bag.path}: no camera info is of {primary.topic}; set camera_info: TOPIC, one of"
             f" {', '.join(bag.of_types(INFO))}"
         )
     if lacks:
@@ -105,14 +109,14 @@ def choose(bag: OpenBag, options: BagOptions) -> Chosen:
             f"{bag.path}: holds no {held}; record these, too, or use images in folders with the bag's poses"
             f" (docs/datasets.md, TUM RGB-D); its topics: {bag.listed()}"
         )
-    others = [each.topic for each in depths + colors if each not in (depth, color)]
-    return Chosen(depth, color, labels, depth_info, color_info, tuple(others))
+    other_topics = [candidate.topic for candidate in depths + colors if candidate not in (depth, color)]
+    return Chosen(depth, color, labels, depth_info, color_info, tuple(other_topics))
 
 
 def has_depth(bag: OpenBag) -> bool:
     """Return whether a bag has a topic that is taken for depth; raises DataError for a damaged one."""
     images = dict(_images(bag, BagOptions(root=bag.path)))
-    return any(is_depth(each) and not LABELS.search(each.topic.lower()) for each in images.values())
+    return any(is_depth(candidate) and not LABELS.search(candidate.topic.lower()) for candidate in images.values())
 
 
 def is_depth(images: Images) -> bool:
@@ -131,7 +135,7 @@ def is_color(images: Images) -> bool:
 
 def _named(options: BagOptions) -> dict[str, tuple[str, tuple[str, ...]]]:
     """Return the topics that options name, with the types that each may have."""
-    named = {
+    topics = {
         "depth": (options.depth, IMAGES),
         "color": (options.color, IMAGES),
         "camera_info": (options.camera_info, (INFO,)),
@@ -139,7 +143,7 @@ def _named(options: BagOptions) -> dict[str, tuple[str, tuple[str, ...]]]:
         "pose": (None if options.pose == TF else options.pose, tuple(POSES)),
     }
     labels = {f"label_topics.{name}": (topic, IMAGES) for name, topic in (options.label_topics or {}).items()}
-    return {name: (topic, types) for name, (topic, types) in (named | labels).items() if topic is not None}
+    return {name: (topic, types) for name, (topic, types) in (topics | labels).items() if topic is not None}
 
 
 def require(bag: OpenBag, option: str, name: str, types: tuple[str, ...]) -> None:
@@ -154,7 +158,7 @@ def require(bag: OpenBag, option: str, name: str, types: tuple[str, ...]) -> Non
 
 def _images(bag: OpenBag, options: BagOptions) -> Iterable[tuple[str, Images]]:
     """Yield the topics of images that can be read; of a named one that cannot be an error is raised."""
-    named = {topic for topic, _ in _named(options).values()}
+    requested = {topic for topic, _ in _named(options).values()}
     for name in bag.of_types(RAW, COMPRESSED):
         try:
             message = bag.first(name)
@@ -162,7 +166,7 @@ def _images(bag: OpenBag, options: BagOptions) -> Iterable[tuple[str, Images]]:
                 raise DataError(f"{bag.path}, {name}: holds no message that can be read; record the bag again")
             kind = kind_of(message, bag.topics[name].type, f"{bag.path}, {name}")
         except DataError:
-            if name in named:
+            if name in requested:
                 raise
         else:
             yield name, Images(name, kind, bare(message.header.frame_id))
@@ -172,15 +176,16 @@ def _labels(images: dict[str, Images], options: BagOptions) -> dict[str, Images]
     if options.label_topics is not None:
         return {name: images[topic] for name, topic in options.label_topics.items()}
     label_maps = [
-        each
-        for each in images.values()
-        if LABELS.search(each.topic.lower())
-        and each.kind.encoding in ID_ENCODINGS
-        and (each.kind.transport == "raw" or each.kind.suffix == ".png")
-        and each.topic not in (options.depth, options.color)
+        candidate
+        for candidate in images.values()
+        if LABELS.search(candidate.topic.lower())
+        and candidate.kind.encoding in ID_ENCODINGS
+        and (candidate.kind.transport == "raw" or candidate.kind.suffix == ".png")
+        and candidate.topic not in (options.depth, options.color)
     ]
     return {
-        _source_name(each.base): each for each in sorted(label_maps, key=lambda each: each.kind.transport, reverse=True)
+        _source_name(candidate.base): candidate
+        for candidate in sorted(label_maps, key=lambda candidate: candidate.kind.transport, reverse=True)
     }
 
 
@@ -194,10 +199,10 @@ Rank = tuple[bool | int | str, ...]
 
 
 def _one(
-    named: str | None, images: dict[str, Images], candidates: list[Images], rank: Callable[[Images], Rank]
+    topic: str | None, images: dict[str, Images], candidates: list[Images], rank: Callable[[Images], Rank]
 ) -> Images | None:
     """Return the images of a named topic, else the candidate of the lowest rank, or None without candidates."""
-    return images[named] if named is not None else min(candidates, key=rank, default=None)
+    return images[topic] if topic is not None else min(candidates, key=rank, default=None)
 
 
 def _depth_rank(images: Images, bag: OpenBag) -> Rank:
@@ -224,9 +229,11 @@ def _color_rank(images: Images, depth: Images | None) -> Rank:
 def _info_of(bag: OpenBag, images: Images) -> str | None:
     """Return the CameraInfo topic of images: the topic of their namespace, else of their frame, else None."""
     infos = bag.of_types(INFO)
-    own = f"{images.base.rpartition('/')[0]}/camera_info"
-    if own in infos:
-        return own
+    sibling = f"{images.base.rpartition('/')[0]}/camera_info"
+    if sibling in infos:
+        return sibling
     firsts = ((name, bag.first(name)) for name in infos)
-    same = [name for name, message in firsts if message is not None and bare(message.header.frame_id) == images.frame]
-    return min(same, default=None)
+    of_frame = [
+        name for name, message in firsts if message is not None and bare(message.header.frame_id) == images.frame
+    ]
+    return min(of_frame, default=None)

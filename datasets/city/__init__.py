@@ -199,6 +199,6 @@ class CityScene(Scene):
         if model == GROUND_TRUTH:
             return None
         if model not in self._options.models:
-            known = (*self.models, *self.by_name)
-            raise ConfigError(f"city: model '{model}' is not known; {nearest(model, known)}")
+            names = (*self.models, *self.by_name)
+            raise ConfigError(f"city: model '{model}' is not known; {nearest(model, names)}")
         return self._options.models[model]

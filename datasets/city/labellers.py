@@ -41,8 +41,8 @@ def _without_borders(predicted: UInt8, _view: View, _model: Simulation) -> UInt8
 
 def _without_doubt(predicted: UInt8, view: View, model: Simulation) -> UInt8:
     """Return labels without the pixels that the model would label otherwise in another frame from the same position."""
-    again = [model.labels(dataclasses.replace(view, frame=view.frame + 10**6 * k)) for k in range(1, DRAWS)]
-    sure = np.all([other == predicted for other in again], axis=0) & (view.rendered.incidence > 0.5)
+    redrawn = [model.labels(dataclasses.replace(view, frame=view.frame + 10**6 * k)) for k in range(1, DRAWS)]
+    sure = np.all([other == predicted for other in redrawn], axis=0) & (view.rendered.incidence > 0.5)
     return np.where(sure, predicted, np.uint8(IGNORE_8BIT))
 
 

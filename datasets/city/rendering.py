@@ -103,8 +103,8 @@ class Caster:
         hit = np.flatnonzero(face >= 0)
         normal = self.normals[face[hit]]
         with np.errstate(divide="ignore", invalid="ignore"):
-            found = (self.offsets[face[hit]] - normal @ origin) / np.einsum("ij,ij->i", normal, directions[hit])
-        depth[hit] = np.where(np.isfinite(found) & (found > 0), found, np.inf)
+            distance = (self.offsets[face[hit]] - normal @ origin) / np.einsum("ij,ij->i", normal, directions[hit])
+        depth[hit] = np.where(np.isfinite(distance) & (distance > 0), distance, np.inf)
         return depth
 
 
@@ -140,19 +140,19 @@ def _cast(
     classes = np.full(n, IGNORE_8BIT, dtype=np.uint8)
     for caster in casters:
         face = caster.first(np.broadcast_to(origin, directions.shape), directions)
-        found = caster.depth(face, origin, directions)
-        nearer = np.flatnonzero(found < depth)
+        distance = caster.depth(face, origin, directions)
+        nearer = np.flatnonzero(distance < depth)
         hit = face[nearer]
-        depth[nearer], normals[nearer] = found[nearer], caster.normals[hit]
+        depth[nearer], normals[nearer] = distance[nearer], caster.normals[hit]
         classes[nearer], material[nearer] = caster.surface.classes[hit], caster.surface.colors[hit]
-    seen = np.isfinite(depth)
-    depth[~seen] = 0.0
+    on_surface = np.isfinite(depth)
+    depth[~on_surface] = 0.0
     towards = np.einsum("ij,ij->i", normals, directions)
     normals[towards > 0] *= -1
     incidence = np.minimum(1.0, np.abs(towards) / np.sqrt(np.einsum("ij,ij->i", directions, directions)))
     color = material * _brightness(casters, origin + directions * depth[:, None], normals, classes, light)
-    color = np.clip(np.where(seen[:, None], color, light.sky) * 255, 0, 255)
-    return depth, np.where(seen, incidence, 0.0), classes, color.astype(np.uint8)
+    color = np.clip(np.where(on_surface[:, None], color, light.sky) * 255, 0, 255)
+    return depth, np.where(on_surface, incidence, 0.0), classes, color.astype(np.uint8)
 
 
 def _brightness(

@@ -70,13 +70,13 @@ class Simulation:
         scores = np.zeros((*predicted.shape, len(self._weights)), dtype=np.float32)
         for rows in row_chunks(predicted.shape):
             true = view.rendered.classes[rows]
-            seen = true != IGNORE_8BIT
-            rest = self.model.softness * uniform(self._of_frame(self._spots(view, rows)[0], view, "soft"))[seen]
-            best, other = predicted[rows][seen], true[seen]
+            labelled = true != IGNORE_8BIT
+            rest = self.model.softness * uniform(self._of_frame(self._spots(view, rows)[0], view, "soft"))[labelled]
+            best, other = predicted[rows][labelled], true[labelled]
             spread = np.where((best == other)[:, None], self._weights[best], np.eye(len(self._weights))[other])
             spread *= rest[:, None]
             spread[np.arange(len(best)), best] = 1 - rest
-            scores[rows][seen] = spread
+            scores[rows][labelled] = spread
         return scores
 
     def _put_errors(self, view: View, rows: slice, predicted: UInt8) -> None:
@@ -93,10 +93,10 @@ class Simulation:
             self._strike(predicted, true, hash_integers(self._salts["view"], spot.view(np.int64), *seen_from), chance)
         self._strike(predicted, true, self._of_frame(spot, view, "flicker"), model.flicker * factor)
 
-    def _strike(self, predicted: UInt8, true: UInt8, drawn: UInt64, chance: Float64) -> None:
-        """Replace predictions by a wrong class for the true one, with a probability each, by drawn hashes."""
-        struck = uniform(drawn) < chance
-        u = uniform(rehash(drawn[struck], 1))
+    def _strike(self, predicted: UInt8, true: UInt8, hashes: UInt64, chance: Float64) -> None:
+        """Replace predictions by a wrong class for the true one, with a probability each, by hashes."""
+        struck = uniform(hashes) < chance
+        u = uniform(rehash(hashes[struck], 1))
         predicted[struck] = (u[:, None] >= np.cumsum(self._weights, axis=1)[true[struck]]).sum(axis=1)
 
     def _spots(self, view: View, rows: slice) -> tuple[UInt64, Int64]:
@@ -123,8 +123,8 @@ class Simulation:
     def _field(self, frame: int, axis: int, H: int, W: int) -> Float32:
         """Return random numbers within +-border on a grid of BORDER_SCALE pixels, interpolated to each pixel."""
         v, u = np.indices((H // BORDER_SCALE + 2, W // BORDER_SCALE + 2))
-        drawn = hash_integers(self._salts["border"], v, u, np.full_like(v, axis), np.full_like(v, frame))
-        nodes = (self.model.border * (2 * uniform(drawn) - 1)).astype(np.float32)
+        hashes = hash_integers(self._salts["border"], v, u, np.full_like(v, axis), np.full_like(v, frame))
+        nodes = (self.model.border * (2 * uniform(hashes) - 1)).astype(np.float32)
         size = (nodes.shape[1] * BORDER_SCALE, nodes.shape[0] * BORDER_SCALE)
         return np.asarray(cv2.resize(nodes, size, interpolation=cv2.INTER_LINEAR), dtype=np.float32)[:H, :W]
 

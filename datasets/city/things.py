@@ -63,15 +63,15 @@ def _buildings(
 def trees(rows: Float64, ground: Ground, rng: np.random.Generator) -> list[Surface]:
     """Return trees of four forms; rows (n, 3) are s, t and a size, 1 for 9 m."""
     surfaces = []
-    for own in np.array_split(rows, 4):
+    for form_rows in np.array_split(rows, 4):
         parts = [box(TREE, (-0.25, 0.25), (-0.25, 0.25), (-0.5, 4), color=BARK)]
         parts += [blob(TREE, (0, 0, 5.6), (2.9, 2.9, 3.1), 1, rng)]
         for _ in range(3):
             centre = (*rng.uniform(-1.7, 1.7, 2), rng.uniform(4.6, 6.8))
             parts.append(blob(TREE, centre, rng.uniform(1.5, 2), 0, rng))
-        size = own[:, 2:] * rng.uniform(0.8, 1.15, size=(len(own), 3))
-        spots = np.c_[own[:, :2], rng.uniform(0, 2 * np.pi, len(own))]
-        surfaces.append(ground.stand(join(parts), spots, size, choose(LEAVES, len(own), rng), 0.1))
+        size = form_rows[:, 2:] * rng.uniform(0.8, 1.15, size=(len(form_rows), 3))
+        spots = np.c_[form_rows[:, :2], rng.uniform(0, 2 * np.pi, len(form_rows))]
+        surfaces.append(ground.stand(join(parts), spots, size, choose(LEAVES, len(form_rows), rng), 0.1))
     return surfaces
 
 

@@ -50,7 +50,10 @@ def build_town(seed: int, flight: Flight) -> Town:
     ground = Ground.random(rng)
     path = np.stack(ground.plan(*flight.path(np.linspace(0, 1, 60))), axis=1)
     s, t = (_streets(low - REACH, high + REACH, rng) for low, high in zip(path.min(0), path.max(0), strict=True))
-    streets = [*(Street(False, at, t[0], t[-1]) for at in s), *(Street(True, at, s[0], s[-1]) for at in t)]
+    streets = [
+        *(Street(False, position, t[0], t[-1]) for position in s),
+        *(Street(True, position, s[0], s[-1]) for position in t),
+    ]
     area = Rectangle(s[0], s[-1], t[0], t[-1]).within(-STREET / 2)
     site = _Site(ground, rng, [ground.land(area), *(_dashes(street, ground) for street in streets)])
     for (s0, s1), (t0, t1) in product(pairwise(s), pairwise(t)):
@@ -71,8 +74,8 @@ def _dashes(street: Street, ground: Ground) -> Surface:
     """Return the marking in the middle of a street: every second cell of a narrow strip."""
     ends, sides = (street.low, street.high), (street.at - 0.08, street.at + 0.08)
     strip = Rectangle(*ends, *sides) if street.along_s else Rectangle(*sides, *ends)
-    whole = ground.drape(strip, MARKING_ABOVE, ROAD, MARKING)
-    return surface(whole.vertices, whole.faces.reshape(-1, 2, 3)[::2].reshape(-1, 3), ROAD, MARKING)
+    full_strip = ground.drape(strip, MARKING_ABOVE, ROAD, MARKING)
+    return surface(full_strip.vertices, full_strip.faces.reshape(-1, 2, 3)[::2].reshape(-1, 3), ROAD, MARKING)
 
 
 class _Lot(NamedTuple):
@@ -186,6 +189,6 @@ class _Site:
 def _around(block: Rectangle, outside: float, step: float) -> Float64:
     """Return (n, 3) plan coordinates and headings every `step` metres along a block's sides, `outside` metres off."""
     s, t = np.arange(block.s0 + 5, block.s1 - 5, step), np.arange(block.t0 + 5, block.t1 - 5, step)
-    rows = [(x, at, 0.0) for at in (block.t0 - outside, block.t1 + outside) for x in s]
-    rows += [(at, x, np.pi / 2) for at in (block.s0 - outside, block.s1 + outside) for x in t]
+    rows = [(x, edge, 0.0) for edge in (block.t0 - outside, block.t1 + outside) for x in s]
+    rows += [(edge, x, np.pi / 2) for edge in (block.s0 - outside, block.s1 + outside) for x in t]
     return np.array(rows)

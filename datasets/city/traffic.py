@@ -59,18 +59,18 @@ class Movers:
             length = street.high - street.low
             count = max(1, round(length / kind.spacing))
             for direction in (-1.0, 1.0):
-                at = street.at + kind.offset * (-direction if street.along_s else direction)  # on the right
+                across = street.at + kind.offset * (-direction if street.along_s else direction)  # on the right
                 speed = direction * rng.uniform(*kind.speeds)
                 starts = (np.arange(count) + rng.uniform(0.15, 0.85, count)) * length / count
-                rows += [(street.along_s, at, street.low, length, start, speed) for start in starts]
+                rows += [(street.along_s, across, street.low, length, start, speed) for start in starts]
         return cls(kind, np.array(rows).T, rng.uniform(0.9, 1.1, size=(len(rows), 3)), choose(PAINT, len(rows), rng))
 
     def spots(self, seconds: float) -> Float64:
         """Return (n, 3) the plan coordinates s, t and the heading in the plan, at a time."""
-        along_s, at, low, length, start, speed = self.lanes
+        along_s, across, low, length, start, speed = self.lanes
         along = low + np.mod(start + speed * seconds, length)
         heading = np.where(along_s, 0.0, np.pi / 2) + np.where(speed < 0, np.pi, 0.0)
-        return np.stack([np.where(along_s, along, at), np.where(along_s, at, along), heading], axis=1)
+        return np.stack([np.where(along_s, along, across), np.where(along_s, across, along), heading], axis=1)
 
     def at(self, seconds: float, camera: Float64, ground: Ground) -> Surface:
         """Return the things at a time, those within SIGHT of the camera at (x, y, z)."""

@@ -86,17 +86,17 @@ def dmap_header(path: Path, data: bytes) -> DmapHeader:
         raise DataError(f"{path}: not an OpenMVS depth map (it begins with {magic!r}); {AGAIN}")
     _, holds, exponent, _, _, width, height, _, _ = DMAP_HEADER.unpack_from(data)
     new = magic == b"D2"
-    at = DMAP_HEADER.size + (4 if new else 0)  # after the scale of confidences
+    offset = DMAP_HEADER.size + (4 if new else 0)  # after the scale of confidences
     try:
-        (length,) = struct.unpack_from("<H", data, at)
-        name = data[at + 2 : at + 2 + length].decode(errors="replace")
-        at += 2 + length
-        (views,) = struct.unpack_from("<I", data, at)
+        (length,) = struct.unpack_from("<H", data, offset)
+        name = data[offset + 2 : offset + 2 + length].decode(errors="replace")
+        offset += 2 + length
+        (views,) = struct.unpack_from("<I", data, offset)
     except struct.error as error:
         raise DataError(f"{path}: the depth map is truncated after {len(data)} bytes; {AGAIN}") from error
     if not holds & 1:
         raise DataError(f"{path}: holds no depth; {AGAIN}")
-    start = at + 4 + 4 * views + DMAP_CAMERA  # beyond the file where that is damaged, which `_metres` says
+    start = offset + 4 + 4 * views + DMAP_CAMERA  # beyond the file where that is damaged, which `_metres` says
     return DmapHeader(name, (height, width), SAMPLES[magic], exponent if new else 0, start)
 
 
@@ -188,9 +188,9 @@ def stored_depth(
     return planar(depth, camera((depth.shape[0], depth.shape[1]))) if options.depth_kind == "ray" else depth
 
 
-def _reader(frame: FrameSource, own: FrameSize = ANY_SIZE) -> DepthReader:
+def _reader(frame: FrameSource, sizes: FrameSize = ANY_SIZE) -> DepthReader:
     """Return what reads a frame's depth: its own reader, or the one of the file's suffix."""
-    return frame.depth_reader or FORMATS.get(frame.depth.suffix.lower(), partial(read_depth, own=own))
+    return frame.depth_reader or FORMATS.get(frame.depth.suffix.lower(), partial(read_depth, own=sizes))
 
 
 def shape_of(frame: FrameSource, options: FileOptions) -> tuple[int, int]:

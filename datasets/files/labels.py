@@ -94,8 +94,8 @@ class LabelSource:
     def of(cls, kind: Kind, base: Path, template: str, frames: Sequence[Named], folders: Folders) -> LabelSource:
         """Return one source, with the first frame that has a file."""
         source = cls(kind, base, template, folders)
-        there = ((frame.name, file) for frame in frames if (file := source.file(frame)) is not None)
-        return replace(source, first=next(there, None))
+        files = ((frame.name, file) for frame in frames if (file := source.file(frame)) is not None)
+        return replace(source, first=next(files, None))
 
     def file(self, frame: Named) -> Path | None:
         """Return the file of a frame, under its own name or another that it has."""
@@ -142,7 +142,7 @@ def find_sources(
         DataError: For a folder that cannot be listed.
     """
     sources: dict[str, LabelSource] = {}
-    told: list[str] = []
+    notes: list[str] = []
     base = options.labels_root or entry.folder
     if options.labels_root is not None and not os.path.isdir(base):  # noqa: PTH112  Path.is_dir raises where the name is too long
         raise ConfigError(f"{base}: there is no such folder; correct labels_root")
@@ -164,8 +164,8 @@ def find_sources(
             if source.first is not None:
                 sources[name] = source
             elif frames:
-                told.append(f"{name}: {source.why_none(frames)}; left out")
-    for line in told if sources or unread_labels(options, entry, frames) is None else ():
+                notes.append(f"{name}: {source.why_none(frames)}; left out")
+    for line in notes if sources or unread_labels(options, entry, frames) is None else ():
         logger.warning("%s", line)
     if not sources and (options.labels or options.scores or options.labels_root):
         logger.warning(
@@ -201,19 +201,22 @@ def unread_labels(options: LabelOptions, entry: SceneEntry, frames: Sequence[Nam
         )
         if not files:
             continue
-        known = [frame.name.rpartition("/")[2] for frame in frames[:MOST_FRAMES]]
-        first, pattern = files[0], next(filter(None, (_pattern(path, known) for path in files[:MOST_FRAMES])), None)
+        frame_names = [frame.name.rpartition("/")[2] for frame in frames[:MOST_FRAMES]]
+        first, pattern = (
+            files[0],
+            next(filter(None, (_pattern(path, frame_names) for path in files[:MOST_FRAMES])), None),
+        )
         if pattern is None:
             return (
-                f"{first}: is of no frame (these are called {', '.join(known[:2])}, ...), nor is another image in"
+                f"{first}: is of no frame (these are called {', '.join(frame_names[:2])}, ...), nor is another image in"
                 f" {place.relative_to(entry.folder)}; call them as the frames, {template}/{{name}}.png"
             )
         if first.suffix.lower() in LOSSY_SUFFIXES:
             return f"{first} is a JPEG, which changes class ids; write label maps as PNG"
         if first.suffix.lower() in OTHER_SUFFIXES:
             return f"{first}: label maps are read as {', '.join(images.LABEL_SUFFIXES)}; write them as PNG"
-        said = f"{template}/{pattern}"
-        text = f"{{net: '{said}'}}" if template == "labels" else f"'{said}'"
+        setting = f"{template}/{pattern}"
+        text = f"{{net: '{setting}'}}" if template == "labels" else f"'{setting}'"
         return (
             f"{first}: is read as the label map of no frame, nor is another of the {len(files)} images in"
             f' {place.relative_to(entry.folder)}; set labels: {text} (--option "labels={text}")'
@@ -227,8 +230,8 @@ OTHER_SUFFIXES = (".tif", ".tiff", ".bmp", ".webp", ".gif")
 
 def _pattern(path: Path, names: Sequence[str]) -> str | None:
     """Return the name of a file with {name} for the longest name of a frame in it, or None without such a name."""
-    there = [name for name in names if name in path.stem]
-    return path.stem.replace(max(there, key=len), "{name}", 1) if there else None
+    contained = [name for name in names if name in path.stem]
+    return path.stem.replace(max(contained, key=len), "{name}", 1) if contained else None
 
 
 def label_paths(options: LabelOptions, entry: SceneEntry, frames: Sequence[Named]) -> list[str]:
@@ -289,8 +292,10 @@ class LabelMaps:
             name: LabelSource.of("labels", base, filled, frames, folders)
             for name, filled in matching_folders(base, template, "model", scene=entry.below_root).items()
         }
-        if both := next((name for name in regions if name in labels), None):
-            raise DataError(f"{base / 'regions' / both}: labels/{both} is called '{both}' too; rename one")
+        if duplicate := next((name for name in regions if name in labels), None):
+            raise DataError(
+                f"{base / 'regions' / duplicate}: labels/{duplicate} is called '{duplicate}' too; rename one"
+            )
         regions = {name: source for name, source in regions.items() if source.first is not None}
         template = Template("features", FEATURES, ("model", "name"), ("model", "name"))
         features = {
@@ -321,11 +326,13 @@ class LabelMaps:
         Raises:
             ConfigError: If no label source has this name.
         """
-        known = self._sources
-        if model not in known:
-            hint = nearest(model, [*known]) if known else "put its label maps into labels/NAME/, or set option labels"
+        sources = self._sources
+        if model not in sources:
+            hint = (
+                nearest(model, [*sources]) if sources else "put its label maps into labels/NAME/, or set option labels"
+            )
             raise ConfigError(f"{self._folder}: model '{model}' is not there; {hint}")
-        return known[model]
+        return sources[model]
 
     def file(self, frame: Named, model: str) -> Path:
         """Return the file of a frame.
@@ -335,7 +342,7 @@ class LabelMaps:
         """
         source = self.source(model)
         if (file := source.file(frame)) is None:
-            lost = [path for each in self._frames for path in source.missing(each)]
+            lost = [path for other in self._frames for path in source.missing(other)]
             raise DataError(
                 f"{self._folder}: {listed(lost, str(self._folder))}; choose frames that have them, or add them"
             )
@@ -449,8 +456,8 @@ class LabelMaps:
         Raises:
             DataError: If that fails; the message names it.
         """
-        known = self.space(model)
-        classes = None if known is None else len(known)
+        label_space = self.space(model)
+        classes = None if label_space is None else len(label_space)
         scores = images.read_scores(path, self._options.scores_layout or "KHW", size, read, own, classes)
         if void := self._options.void_ids.get(model):
             space = self.space(model)

@@ -169,13 +169,13 @@ class Template:
 
     def __post_init__(self) -> None:
         names, where = PLACEHOLDER.findall(self.text), f"{self.option}: {self.text[:200]!r}"
-        known = ", ".join(f"{{{name}}}" for name in self.known)
+        placeholders = ", ".join(f"{{{name}}}" for name in self.known)
         if unknown := next((name for name in names if name not in self.known), None):
-            raise ConfigError(f"{where}: unknown {{{unknown}}}; known: {known}")
+            raise ConfigError(f"{where}: unknown {{{unknown}}}; known: {placeholders}")
         if lacking := next((name for name in self.required if name not in names), None):
             raise ConfigError(f"{where}: needs {{{lacking}}}")
         if any(brace in PLACEHOLDER.sub("", self.text) for brace in "{}"):
-            raise ConfigError(f"{where}: a brace is not closed; placeholders are {known}")
+            raise ConfigError(f"{where}: a brace is not closed; placeholders are {placeholders}")
         path = PurePosixPath(self.text)
         if path.is_absolute() or ".." in path.parts or UNSAFE.search(self.text) or not path.parts:
             raise ConfigError(
@@ -265,9 +265,9 @@ class Folders:
             return path
         folder, name = os.path.split(path)
         if folder not in self._small:
-            self._small[folder] = {_small_suffix(each): each for each in self._names.get(folder, ())}
-        there = self._small[folder].get(_small_suffix(name))
-        return None if there is None else path.with_name(there)
+            self._small[folder] = {_small_suffix(entry): entry for entry in self._names.get(folder, ())}
+        match = self._small[folder].get(_small_suffix(name))
+        return None if match is None else path.with_name(match)
 
 
 def _small_suffix(name: str) -> str:

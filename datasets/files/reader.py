@@ -158,10 +158,10 @@ class FileDataset(ScenesBelow[OwnOptions]):
             after: Part of the file's name after the name of the frame.
             instead: Names of frames with a pose or an image, which get depth from a surface without a depth image.
         """
-        there = files_named(folder, before, after)
+        files = files_named(folder, before, after)
         if self.options.surface is None:
-            return there
-        return {name: folder / f"{before}{name}{after}" for name in sorted({*there, *instead}, key=natural)}
+            return files
+        return {name: folder / f"{before}{name}{after}" for name in sorted({*files, *instead}, key=natural)}
 
     def has_depth(self, folder: Path) -> bool:
         """Return whether a folder of depth images is there, or is not needed, as a surface gives the depth."""
@@ -191,9 +191,9 @@ def with_poses_of(frames: tuple[FrameSource, ...], shift: int) -> tuple[FrameSou
     lost = np.full((4, 4), np.nan)
     shifted = []
     for k, frame in enumerate(frames):
-        there = 0 <= k + shift < len(frames)
-        other = frames[k + shift] if there else frame
-        shifted.append(replace(frame, pose=other.pose if there else lost, pose_file=other.pose_file))
+        exists = 0 <= k + shift < len(frames)
+        other = frames[k + shift] if exists else frame
+        shifted.append(replace(frame, pose=other.pose if exists else lost, pose_file=other.pose_file))
     return tuple(shifted)
 
 

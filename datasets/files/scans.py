@@ -188,11 +188,13 @@ class ScanScene(Scene):
             self._truth = None if truth.first is None else truth
         templates = dataset.labels if self.options.labels_root is None else (SEPARATE, *dataset.labels)
         templates = templates if self.options.labels is None else (self.options.labels,)
-        shown = {"scene": entry.below_root, "model": "MODEL", "name": scans[0].name}
-        known = [Template("labels", text, ("scene", "model", "name"), ("model", "name")) for text in templates]
-        self.label_paths = tuple(str(base / template.filled(**shown)) for template in known)
+        example = {"scene": entry.below_root, "model": "MODEL", "name": scans[0].name}
+        label_templates = [
+            Template("labels", text, ("scene", "model", "name"), ("model", "name")) for text in templates
+        ]
+        self.label_paths = tuple(str(base / template.filled(**example)) for template in label_templates)
         self._sources = dict[str, LabelSource]()
-        for template in known:
+        for template in label_templates:
             sources = {
                 model: LabelSource.of("points", base, filled, scans, self._files)
                 for model, filled in matching_folders(base, template, "model", scene=entry.below_root).items()
@@ -310,8 +312,8 @@ class ScanScene(Scene):
             digest.update(scan.name.encode() + b"\0" + scan.pose.tobytes() + self._files.digest(scan.points))
             if self.options.deskew is not None:
                 digest.update(self._motion(index).tobytes())
-            for each in (source, self._truth):
-                file = None if each is None else each.file(scan)
+            for label_source in (source, self._truth):
+                file = None if label_source is None else label_source.file(scan)
                 digest.update(b"" if file is None else self._files.digest(file))
         return digest.hexdigest()
 
@@ -374,10 +376,10 @@ class ScanScene(Scene):
             depth = np.where((depth > near) & (depth < far), depth, np.float32(0))
         if labels is None:
             labels = np.zeros(len(points), np.uint8)
-        known = {"points": str(scan.points), "depth": str(scan.points), "pose": str(scan.pose_file)}
+        default_files = {"points": str(scan.points), "depth": str(scan.points), "pose": str(scan.pose_file)}
         return Frame(
             index=int(index), points=points, depth=depth, T_wc=scan.pose, labels=labels, mask=moving,
-            timestamp=scan.timestamp, files=known | dict(files),
+            timestamp=scan.timestamp, files=default_files | dict(files),
         )  # fmt: skip
 
     def _motion(self, index: int) -> Float64:
@@ -387,11 +389,11 @@ class ScanScene(Scene):
 
     def _source(self, model: str) -> LabelSource:
         """Return the files of a label source; raises ConfigError if no label source has this name."""
-        known = self._sources | ({} if self._truth is None else {GROUND_TRUTH: self._truth})
-        if model not in known:
-            hint = nearest(model, [*known]) if self._sources else f"put its files into {self.label_paths[0]}"
+        sources = self._sources | ({} if self._truth is None else {GROUND_TRUTH: self._truth})
+        if model not in sources:
+            hint = nearest(model, [*sources]) if self._sources else f"put its files into {self.label_paths[0]}"
             raise ConfigError(f"{self.folder}: model '{model}' is not there; {hint}")
-        return known[model]
+        return sources[model]
 
     def _scan(self, index: int) -> ScanSource:
         if not 0 <= index < len(self):
@@ -407,8 +409,8 @@ def as_poses(T: Float64, convention: str, path: Path) -> Float64:
     """
     if T.shape[1:] == (3, 4):
         T = np.concatenate([T, np.tile([0.0, 0.0, 0.0, 1.0], (len(T), 1, 1))], axis=1)
-    each = [to_camera_to_world(pose, convention, "opencv", f"{path}: pose {k}") for k, pose in enumerate(T, start=1)]
-    return np.array(each, np.float64).reshape(-1, 4, 4)
+    poses = [to_camera_to_world(pose, convention, "opencv", f"{path}: pose {k}") for k, pose in enumerate(T, start=1)]
+    return np.array(poses, np.float64).reshape(-1, 4, 4)
 
 
 def rigid_inverse(T: Float64, where: str) -> Float64:

@@ -192,12 +192,12 @@ class FileScene(Scene):
         if kind == "features":
             return self._framed(index, depth, None, None, color=color, features=features, files={"features": file})
         if kind != "scores":
-            own = self._sizes(index, depth.shape, file, "labels are")
-            ids = self._maps.labels(model, file, read, own, self._frame(index))
+            sizes = self._sizes(index, depth.shape, file, "labels are")
+            ids = self._maps.labels(model, file, read, sizes, self._frame(index))
             labels = self._stored(index, ids, depth.shape, file, "labels are")
         else:
-            own = self._sizes(index, depth.shape, file, "scores are")
-            stored = self._maps.scores(model, file, (depth.shape[0], depth.shape[1]), read, own)
+            sizes = self._sizes(index, depth.shape, file, "scores are")
+            stored = self._maps.scores(model, file, (depth.shape[0], depth.shape[1]), read, sizes)
             scores = self._stored(index, stored, depth.shape, file, "scores are")
         what = "labels" if scores is None else "scores"
         return self._framed(index, depth, labels, scores, color=color, features=features, files={what: file})
@@ -259,8 +259,8 @@ class FileScene(Scene):
     def _read_depth(self, index: int) -> Float32:
         if self._surface is None:
             source, read = self._frame(index), self._reader(index, DEPTH)
-            own = FrameSize(lambda: self._image_pixels(index, of_depth=True))
-            depth = stored_depth(source, self.options, read, lambda shape: self.intrinsics(index, shape), own)
+            sizes = FrameSize(lambda: self._image_pixels(index, of_depth=True))
+            depth = stored_depth(source, self.options, read, lambda shape: self.intrinsics(index, shape), sizes)
             self._require_one_size(source, depth)
             return depth if source.confidence is None else self._confident(index, depth, source.confidence)
         depth = self._surface.depth(self._view(index))
@@ -294,10 +294,10 @@ class FileScene(Scene):
         """Raise DataError with the first of a camera's frames whose size is not the usual one, or with that other."""
         if camera.size is not None or self.options.intrinsics_size is not None:
             return
-        own = [frame for frame in frames if frame.camera is camera or frame.camera == camera]
-        sizes = [(frame, size) for frame in own if (size := depth_size(frame.depth)) is not None]
-        known = [size for _, size in sizes]
-        usual = max(dict.fromkeys(known), key=known.count, default=None)
+        of_camera = [frame for frame in frames if frame.camera is camera or frame.camera == camera]
+        sizes = [(frame, size) for frame in of_camera if (size := depth_size(frame.depth)) is not None]
+        measured = [size for _, size in sizes]
+        usual = max(dict.fromkeys(measured), key=measured.count, default=None)
         if other is not None and usual is None:
             H, W = self._shapes[camera]
             usual, sizes = (W, H), [(other, (shape[1], shape[0]))]
@@ -383,15 +383,15 @@ class FileScene(Scene):
         if (table := self._maps.class_ids(model)) is not None:
             digest.update(table.tobytes())
         files = [self._images(index, model) for index in indices]
-        unread = [k for k, own in enumerate(files) if own.keys() - self._digests.keys()]
+        unread = [k for k, paths in enumerate(files) if paths.keys() - self._digests.keys()]
         for fetched in prefetch(lambda k: {key: self._folders.digest(path) for key, path in files[k].items()}, unread):
             self._digests = fetched.item | self._digests
-        for index, own in zip(indices, files, strict=True):
+        for index, paths in zip(indices, files, strict=True):
             source = self._frame(index)
             cameras = (source.camera, source.label_camera, source.depth_scale, source.label_lens, source.depth_lens)
             digest.update(source.name.encode() + b"\0" + self._stored_pose(source).tobytes() + repr(cameras).encode())
             digest.update(b"" if self._surface is None else self._surface.digest)
-            for key in own:
+            for key in paths:
                 digest.update(self._digests[key])
         return digest.hexdigest()
 
@@ -447,17 +447,17 @@ class FileScene(Scene):
         image = self._color_file(source)  # named also if it is not read: a recording takes the file as it is
         mask, masked = self._maps.mask_file(source), None
         if mask is not None:  # outside of the mask's view nothing is masked
-            own = self._sizes(index, depth.shape, mask, "the mask is")
-            values = self._maps.mask(source, mask, self._reader(index, MASK), own).astype(np.uint8)
+            sizes = self._sizes(index, depth.shape, mask, "the mask is")
+            values = self._maps.mask(source, mask, self._reader(index, MASK), sizes).astype(np.uint8)
             masked = self._stored(index, values, depth.shape, mask, "the mask is") == 1
-        shown = image if source.color_lens is None else None  # a distorted one shows another view than the depth
-        known = {"depth": self.surface or source.depth, "pose": source.pose_file, "color": shown, "mask": mask}
-        known |= dict(files or {})
+        color_file = image if source.color_lens is None else None  # a distorted one shows another view than the depth
+        paths = {"depth": self.surface or source.depth, "pose": source.pose_file, "color": color_file, "mask": mask}
+        paths |= dict(files or {})
         return Frame(
             index=int(index), depth=depth, intrinsics=self.intrinsics(index, depth.shape), T_wc=self.T_wc(index),
             labels=labels, scores=scores, features=features, color=self.color(index) if color else None, mask=masked,
             timestamp=None if timestamps is None else float(timestamps[index]),
-            files={what: str(path) for what, path in known.items() if path is not None},
+            files={what: str(path) for what, path in paths.items() if path is not None},
         )  # fmt: skip
 
     def _stored(self, index: int, values: Pixels, shape: tuple[int, ...], path: Path, what: str) -> Pixels:
@@ -495,18 +495,18 @@ class FileScene(Scene):
         What an image's header claims counts as far as its file has bytes for it.
         """
         source = self._frame(index)
-        lenses = (each.camera for each in (source.label_lens, source.color_lens) if each is not None)
+        lenses = (lens.camera for lens in (source.label_lens, source.color_lens) if lens is not None)
         cameras = [*lenses, *([] if source.label_camera is None else [source.label_camera])]
-        sizes = [each.size for each in [*cameras, *([source.camera] if of_depth else [])]]
+        sizes = [camera.size for camera in [*cameras, *([source.camera] if of_depth else [])]]
         sizes += [self.options.intrinsics_size] if of_depth else []
-        known = [min(size[0] * size[1], MAX_PHOTOGRAPH) for size in sizes if size is not None]
+        areas = [min(size[0] * size[1], MAX_PHOTOGRAPH) for size in sizes if size is not None]
         for file in (self._color_file(source), source.photograph):
             if file is not None and self._folders.has(file):
                 with contextlib.suppress(DataError, OSError):
                     width, height = color_size(file)
                     likely = max(MAX_PIXELS, DENSEST * file.stat().st_size)
-                    known.append(min(width * height, likely, MAX_PHOTOGRAPH))
-        return max(known, default=0)
+                    areas.append(min(width * height, likely, MAX_PHOTOGRAPH))
+        return max(areas, default=0)
 
     def _reader(self, index: int, what: str) -> Read:
         """Give the content of a frame's file; its digest is remembered, so that `digest` need not read it again."""

@@ -101,8 +101,8 @@ def require_same_projection(path: Path, crs: str, georeference: Georeference) ->
     """Raise ConfigError where a file's reference system is known to be another one than the scene's."""
     from pyproj import CRS
 
-    theirs, ours = (CRS.from_user_input(text).to_2d() for text in (crs, georeference.crs))
-    numbers = theirs.to_epsg(), ours.to_epsg()
+    file_crs, scene_crs = (CRS.from_user_input(text).to_2d() for text in (crs, georeference.crs))
+    numbers = file_crs.to_epsg(), scene_crs.to_epsg()
     if None not in numbers and numbers[0] != numbers[1]:
         raise ConfigError(
             f"{path}: lies in EPSG:{numbers[0]}, the scene in EPSG:{numbers[1]}; reproject it (gdalwarp or pdal)"
@@ -206,9 +206,9 @@ def _of_heights(heights: Heights, what: str) -> Triangles:
     rows, columns = z.shape
     corner = np.arange(z.size, dtype=np.int32).reshape(z.shape)
     a, b, c, d = corner[:-1, :-1], corner[:-1, 1:], corner[1:, 1:], corner[1:, :-1]
-    known = np.isfinite(z)
-    whole = known[:-1, :-1] & known[:-1, 1:] & known[1:, 1:] & known[1:, :-1]
-    faces = np.concatenate([np.stack([a, b, c], axis=-1)[whole], np.stack([a, c, d], axis=-1)[whole]])
+    has_height = np.isfinite(z)
+    complete = has_height[:-1, :-1] & has_height[:-1, 1:] & has_height[1:, 1:] & has_height[1:, :-1]
+    faces = np.concatenate([np.stack([a, b, c], axis=-1)[complete], np.stack([a, c, d], axis=-1)[complete]])
     x = heights.x0 + heights.dx * np.arange(columns)
     y = heights.y0 + heights.dy * np.arange(rows)
     X, Y = np.meshgrid(x, y)
@@ -476,10 +476,13 @@ class Surface:
     def digest(self) -> bytes:
         """Return the bytes that are equal where the surface is."""
         offset = None if self._georeference is None else self._georeference.offset
-        said: tuple[object, ...] = (self._cell, offset)
+        content: tuple[object, ...] = (self._cell, offset)
         if self._georeference is not None and self._georeference.turned:
-            said = (*said, self._georeference.linear)
-        return file_digest(self.path) + repr(said if self._mesh_origin is None else (*said, self._mesh_origin)).encode()
+            content = (*content, self._georeference.linear)
+        return (
+            file_digest(self.path)
+            + repr(content if self._mesh_origin is None else (*content, self._mesh_origin)).encode()
+        )
 
     @cached_property
     def triangles(self) -> Triangles:

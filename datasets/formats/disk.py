@@ -100,13 +100,13 @@ def files_named(folder: Path, before: str, after: str) -> dict[str, Path]:
     Raises:
         DataError: If the folder cannot be listed.
     """
-    end, found = after.lower(), dict[str, str]()
+    end, matches = after.lower(), dict[str, str]()
     for entry in _entries(folder):
         name = entry.name[len(before) : len(entry.name) - len(after)]
         fits = entry.name.startswith(before) and entry.name.lower().endswith(end)
-        if name and fits and (name not in found or entry.name.endswith(after)):
-            found[name] = entry.name
-    return {name: folder / found[name] for name in sorted(found, key=natural)}
+        if name and fits and (name not in matches or entry.name.endswith(after)):
+            matches[name] = entry.name
+    return {name: folder / matches[name] for name in sorted(matches, key=natural)}
 
 
 def _entries(folder: Path) -> Iterator[os.DirEntry[str]]:
@@ -156,9 +156,9 @@ def names_in(data: bytes) -> list[str]:
 def _decode_npy(where: str, data: bytes | bytearray, claimed: Claimed | None = None) -> npt.NDArray[Any]:
     """Return the array; numpy itself would evaluate the header as Python, and allocate the claimed size."""
     sizes, kind, order, start = _claims(where, data)
-    needed, there = math.prod(sizes) * kind.itemsize, len(data) - start
-    if there != needed:
-        raise DataError(f"{where}: the array {sizes} of {kind} needs {needed} bytes, the file has {there}; {AGAIN}")
+    needed, available = math.prod(sizes) * kind.itemsize, len(data) - start
+    if available != needed:
+        raise DataError(f"{where}: the array {sizes} of {kind} needs {needed} bytes, the file has {available}; {AGAIN}")
     if claimed is not None:
         claimed(sizes, kind)
     array = np.frombuffer(data, kind, offset=start)
@@ -216,13 +216,13 @@ def _decode_npz(path: Path, data: bytes, key: str, claimed: Claimed | None) -> n
 
 def _unpacked(member: IO[bytes], head: bytes, size: int) -> bytearray:
     """Return a member of an archive, piece by piece: `read` would hold it twice."""
-    content, at = bytearray(size), len(head)
-    content[:at] = head
+    content, filled = bytearray(size), len(head)
+    content[:filled] = head
     with memoryview(content) as view:
         while piece := member.read(2**20):
-            view[at : at + len(piece)] = piece
-            at += len(piece)
-    return content if at == size else content[:at]
+            view[filled : filled + len(piece)] = piece
+            filled += len(piece)
+    return content if filled == size else content[:filled]
 
 
 # JSON files of datasets: an object with numbers where numbers are expected, or one DataError with the file.

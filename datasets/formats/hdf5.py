@@ -60,11 +60,11 @@ def numbers(records: Any, name: str, shape: tuple[int | None, ...], most: int, p
         if not isinstance(records.get("/".join(parts[:k]), getlink=True), h5py.HardLink):
             raise DataError(f"{path}: has no {name}; download it again")
     table = records[name]
-    own = isinstance(table, h5py.Dataset) and not table.external and not table.is_virtual
-    if own and table.dtype.kind in "fiu" and len(table.shape) == len(shape):
+    is_stored = isinstance(table, h5py.Dataset) and not table.external and not table.is_virtual
+    if is_stored and table.dtype.kind in "fiu" and len(table.shape) == len(shape):
         if table.size > most:
             raise DataError(f"{path}: {name} claims {len(table)} rows; is it damaged?")
-        if all(wanted in (None, there) for wanted, there in zip(shape, table.shape, strict=True)):
+        if all(expected in (None, actual) for expected, actual in zip(shape, table.shape, strict=True)):
             return np.asarray(table[()])
-    wanted = " x ".join("N" if side is None else str(side) for side in shape)
-    raise DataError(f"{path}: {name} is no table of {wanted} numbers; download it again")
+    form = " x ".join("N" if side is None else str(side) for side in shape)
+    raise DataError(f"{path}: {name} is no table of {form} numbers; download it again")

@@ -139,8 +139,8 @@ NEAREST = 1e-4
 def _unpacked(samples: npt.NDArray[Any]) -> Float32 | None:
     """Return float32 depth that TartanAir V2 packs into the channels blue, green, red, alpha; None for a picture."""
     depth: Float32 = np.ascontiguousarray(samples[..., [2, 1, 0, 3]]).view("<f4")[..., 0]
-    known = depth[depth != 0]  # an opaque picture is all NaN or negative, a transparent one tiny
-    return depth if len(known) and bool(((known >= NEAREST) & np.isfinite(known)).all()) else None
+    nonzero = depth[depth != 0]  # an opaque picture is all NaN or negative, a transparent one tiny
+    return depth if len(nonzero) and bool(((nonzero >= NEAREST) & np.isfinite(nonzero)).all()) else None
 
 
 def read_labels(
@@ -200,7 +200,7 @@ def read_scores(
         (H, W), K = sizes[layout], shape[0 if layout == "KHW" else 2]
         if (classes or MOST_SCORES) < K:
             raise DataError(f"{path}: has scores of {K} classes, but there are {classes or f'at most {MOST_SCORES}'}")
-        _check_pixels(path, W, H, own=own)
+        _check_pixels(path, W, H, sizes=own)
         taken = math.prod(shape) * dtype.itemsize
         if sizes[layout] != size and taken > max(MAX_IMAGE_BYTES // 2, DENSEST * len(data)):
             raise DataError(
@@ -325,18 +325,18 @@ def _narrow(path: Path, ids: npt.NDArray[Any], space: LabelSpace | None, void: C
         raise DataError(f"{path}: labels must be integer ids (H, W), got {ids.dtype} of shape {ids.shape}")
     if ids.dtype in (np.uint8, np.uint16):
         return ids
-    known, bounds = np.ones(ids.shape, np.bool_), np.iinfo(ids.dtype)
+    valid, bounds = np.ones(ids.shape, np.bool_), np.iinfo(ids.dtype)
     for value in void:  # without copies of wide ids, which isin makes
-        known &= ids != value
-    low, high = int(ids.min(where=known, initial=bounds.max)), int(ids.max(where=known, initial=bounds.min))
+        valid &= ids != value
+    low, high = int(ids.min(where=valid, initial=bounds.max)), int(ids.max(where=valid, initial=bounds.min))
     low, high = (low, high) if low <= high else (0, 0)
     if low < 0 or high > IGNORE_16BIT:
-        outside = np.unique(ids[known & ((ids < 0) | (ids > IGNORE_16BIT))])
+        outside = np.unique(ids[valid & ((ids < 0) | (ids > IGNORE_16BIT))])
         mend = f"; if {outside[0]} is 'ignore', set void_ids: {{MODEL: [{outside[0]}]}}" if len(outside) == 1 else ""
         raise DataError(f"{path}: label ids from {low} to {high}{mend}; store ids from 0, and 255 (65535) for 'ignore'")
     fits = high <= IGNORE_8BIT and (space is None or max(space.ids) < IGNORE_8BIT)
     narrowed: Labels = ids.astype(np.uint8) if fits else ids.astype(np.uint16)
-    narrowed[~known] = IGNORE_8BIT if fits else IGNORE_16BIT
+    narrowed[~valid] = IGNORE_8BIT if fits else IGNORE_16BIT
     return narrowed
 
 
@@ -390,7 +390,7 @@ def _is_mixed(image: UInt8, unknown: Mask) -> Mask:
     after = np.minimum.accumulate(np.where(unknown, 2 * W, u)[:, ::-1], axis=1)[:, ::-1]
     near = unknown & (u - before <= NEIGHBOURS) & (after - u <= NEIGHBOURS)
     rows = np.arange(H)[:, None]
-    a, b = (image[rows, at.clip(0, W - 1)].astype(np.int16) for at in (before, after))
+    a, b = (image[rows, column.clip(0, W - 1)].astype(np.int16) for column in (before, after))
     between = (image >= np.minimum(a, b) - 1) & (image <= np.maximum(a, b) + 1)
     mixed: Mask = near & between.all(axis=2)
     return mixed
@@ -460,7 +460,7 @@ def _critical_chunks(data: bytes) -> bytes:
 
 @contextmanager
 def _whole_png(
-    path: Path, data: bytes, own: FrameSize | None = None, more: Mapping[str, int] = MappingProxyType({})
+    path: Path, data: bytes, sizes: FrameSize | None = None, more: Mapping[str, int] = MappingProxyType({})
 ) -> Iterator[Png]:
     """Yield a PNG that is whole; it is decoded within the context.
 
@@ -471,10 +471,10 @@ def _whole_png(
     if not data.startswith(PNG_SIGNATURE) or data[12:16] != b"IHDR":
         raise DataError(f"{path}: not a PNG image (it begins with {data[:8]!r}); {AGAIN}")
     with _one_line(path, "PNG"):
-        if own is not None and len(data) > 26:
+        if sizes is not None and len(data) > 26:
             width, height, bits, colors = struct.unpack_from(">IIBB", data, 16)
             stored = PNG_CHANNELS.get(colors, 4) * max(1, bits // 8)
-            _check_pixels(path, width, height, stored + more.get(PNG_KINDS.get(colors, ""), 0), own)
+            _check_pixels(path, width, height, stored + more.get(PNG_KINDS.get(colors, ""), 0), sizes)
         PngImagePlugin.PngImageFile(io.BytesIO(data)).verify()  # while it decodes, Pillow leaves out the checksums
         image = PngImagePlugin.PngImageFile(io.BytesIO(data))
         yield Png(path, data, PNG_KINDS[data[25]], data[24], image)
@@ -513,7 +513,7 @@ def _decode_color_tiff(path: Path, data: bytes) -> UInt8:
     return np.ascontiguousarray(_imdecode(path, data, "IMREAD_COLOR")[..., ::-1])
 
 
-def _decode_tiff(path: Path, data: bytes, own: FrameSize) -> npt.NDArray[Any]:
+def _decode_tiff(path: Path, data: bytes, sizes: FrameSize) -> npt.NDArray[Any]:
     """Return one channel (H, W), of the type it was stored in."""
     tags = _tags(path, data)
     bits, channels, sample = tags.get(258, 1), tags.get(277, 1), tags.get(339, 1)
@@ -522,7 +522,7 @@ def _decode_tiff(path: Path, data: bytes, own: FrameSize) -> npt.NDArray[Any]:
     if (sample, bits) not in ((3, 32), (3, 64), (1, 16)):
         kind = {1: "unsigned", 2: "signed", 3: "float"}.get(sample, "other")
         raise DataError(f"{path}: expected 32-bit float metres, got {bits}-bit {kind}; convert it")
-    _check_pixels(path, tags[256], tags[257], bits // 8 + (0 if bits == 32 else 4), own)
+    _check_pixels(path, tags[256], tags[257], bits // 8 + (0 if bits == 32 else 4), sizes)
     return _imdecode(path, data, "IMREAD_UNCHANGED")
 
 
@@ -544,13 +544,13 @@ def _tags(path: Path, data: bytes) -> dict[int, int]:
     return tags
 
 
-def _decode_exr(path: Path, data: bytes, own: FrameSize) -> npt.NDArray[Any]:
+def _decode_exr(path: Path, data: bytes, sizes: FrameSize) -> npt.NDArray[Any]:
     """Return one channel (H, W), where the installed OpenCV reads EXR at all (the wheels of OpenCV 5 do not)."""
     window = data.find(b"dataWindow\0box2i\0")
     if not data.startswith(b"v/1\x01") or window < 0 or len(data) < window + 37:
         raise DataError(f"{path}: not a whole EXR image; {AGAIN}")
     left, top, right, bottom = struct.unpack_from("<4i", data, window + 21)
-    _check_pixels(path, right - left + 1, bottom - top + 1, 4, own)
+    _check_pixels(path, right - left + 1, bottom - top + 1, 4, sizes)
     if not reads_exr():
         raise DataError(
             f"{path}: the installed OpenCV cannot read EXR; convert the depth to .npy (float32 metres),"
@@ -567,20 +567,20 @@ def _decode_exr(path: Path, data: bytes, own: FrameSize) -> npt.NDArray[Any]:
 PFM_HEADER = re.compile(rb"P([Ff])\s+(\d{1,9})\s+(\d{1,9})\s+([-+.\deE]{1,40})\s")
 
 
-def _decode_pfm(path: Path, data: bytes, own: FrameSize) -> npt.NDArray[Any]:
+def _decode_pfm(path: Path, data: bytes, sizes: FrameSize) -> npt.NDArray[Any]:
     """Return one channel (H, W) of a portable float map, whose rows go from the bottom to the top."""
     header = PFM_HEADER.match(data)
     if header is None:
         raise DataError(f"{path}: not a PFM image (it begins with {data[:8]!r}); {AGAIN}")
     width, height, channels = int(header[2]), int(header[3]), 1 if header[1] == b"f" else 3
-    _check_pixels(path, width, height, 4 * channels + 4, own)
+    _check_pixels(path, width, height, 4 * channels + 4, sizes)
     try:
         order = "<" if float(header[4]) < 0 else ">"
     except ValueError as error:
         raise DataError(f"{path}: not a whole PFM image; {AGAIN}") from error
-    needed, there = 4 * width * height * channels, len(data) - header.end()
-    if there < needed:
-        raise DataError(f"{path}: truncated: {width}x{height} pixels need {needed} bytes, it has {there}; {AGAIN}")
+    needed, available = 4 * width * height * channels, len(data) - header.end()
+    if available < needed:
+        raise DataError(f"{path}: truncated: {width}x{height} pixels need {needed} bytes, it has {available}; {AGAIN}")
     stored = np.frombuffer(data, f"{order}f4", width * height * channels, header.end())
     bits = stored.view(np.uint32).reshape(-1, channels)  # NaN, too, is what it is in the other channels
     if channels > 1 and (bits != bits[:, :1]).any():
@@ -614,32 +614,32 @@ def _imdecode(path: Path, data: bytes, mode: str) -> npt.NDArray[Any]:
     return image
 
 
-def _claimed(path: Path, own: FrameSize, more: int) -> Claimed:
+def _claimed(path: Path, sizes: FrameSize, more: int) -> Claimed:
     """Check the size of an array (H, W) before it is unpacked; a pixel takes `more` bytes beyond the file's."""
 
     def check(shape: tuple[int, ...], dtype: np.dtype[Any]) -> None:
         if len(shape) == 2:  # others are refused by what they are for
-            _check_pixels(path, shape[1], shape[0], dtype.itemsize + more, own)
+            _check_pixels(path, shape[1], shape[0], dtype.itemsize + more, sizes)
         elif math.prod(shape) * dtype.itemsize > MAX_IMAGE_BYTES:
             raise DataError(f"{path}: claims an array of shape {shape}; expected (H, W)")
 
     return check
 
 
-def _check_pixels(path: Path, width: int, height: int, pixel_bytes: int = 1, own: FrameSize = ANY_SIZE) -> None:
+def _check_pixels(path: Path, width: int, height: int, pixel_bytes: int = 1, sizes: FrameSize = ANY_SIZE) -> None:
     """Check an image's size before memory is allocated for the size that a header claims, by its frame's image."""
     pixels = width * height
     _check_sides(path, width, height)
     most = min(MAX_PIXELS, MAX_IMAGE_BYTES // pixel_bytes)
-    if pixels > ORDINARY and (image := own.pixels()):
+    if pixels > ORDINARY and (image := sizes.pixels()):
         most = max(ORDINARY, image, min(most, BEYOND_IMAGE * image))
         if pixels > most:
             raise DataError(f"{path}: claims {width}x{height} pixels, but the image has {image}; export them again")
     if pixels > most:
         raise DataError(f"{path}: claims {width}x{height} pixels (at most {most} are read); is it damaged?")
-    own.require((height, width))
-    if own.depth is not None and pixels > max(ORDINARY, BEYOND_DEPTH * math.prod(own.depth)) and not own.pixels():
-        H, W = own.depth
+    sizes.require((height, width))
+    if sizes.depth is not None and pixels > max(ORDINARY, BEYOND_DEPTH * math.prod(sizes.depth)) and not sizes.pixels():
+        H, W = sizes.depth
         raise DataError(
             f"{path}: claims {width}x{height} pixels, but depth is {W}x{H} (without an image, {BEYOND_DEPTH} times the"
             " pixels of the depth are read at most); bring them to one size"

@@ -155,13 +155,13 @@ def at_times(
     position is linear and the rotation spherically linear (slerp). Before the first pose and after the last pose, the
     pose is constant.
     """
-    known = np.isfinite(poses).all(axis=(1, 2))
-    times, poses = times[known], poses[known]
+    finite = np.isfinite(poses).all(axis=(1, 2))
+    times, poses = times[finite], poses[finite]
     if not len(times):
         return np.full((len(wanted), 4, 4), np.nan)
-    at = nearest(wanted, times)
-    T = poses[at] if method == "nearest" or len(times) == 1 else _between(times, poses, wanted)
-    T[np.abs(times[at] - wanted) > max_gap] = np.nan
+    rows = nearest(wanted, times)
+    T = poses[rows] if method == "nearest" or len(times) == 1 else _between(times, poses, wanted)
+    T[np.abs(times[rows] - wanted) > max_gap] = np.nan
     return T
 
 
@@ -171,8 +171,8 @@ def between_times(times: Float64, poses: Poses, wanted: Float64, max_gap: float)
     As `at_times` between two poses; NaN before the first, after the last one, and between two that are more than
     `max_gap` seconds apart.
     """
-    known = np.isfinite(poses).all(axis=(1, 2))
-    times, poses = times[known], poses[known]
+    finite = np.isfinite(poses).all(axis=(1, 2))
+    times, poses = times[finite], poses[finite]
     T = np.full((len(wanted), 4, 4), np.nan)
     if not len(times):
         return T
@@ -200,14 +200,14 @@ def mutual_nearest(times: Float64, others: Float64, max_difference: float) -> np
     return np.where(mutual, to_other, -1)
 
 
-def _between(times: Float64, poses: Poses, wanted: Float64) -> Poses:
+def _between(times: Float64, poses: Poses, query: Float64) -> Poses:
     from scipy.spatial.transform import Rotation, Slerp
 
-    at = wanted.clip(times[0], times[-1])
-    T = np.tile(np.eye(4), (len(at), 1, 1))
-    T[:, :3, :3] = Slerp(times, Rotation.from_matrix(poses[:, :3, :3]))(at).as_matrix()
+    clipped = query.clip(times[0], times[-1])
+    T = np.tile(np.eye(4), (len(clipped), 1, 1))
+    T[:, :3, :3] = Slerp(times, Rotation.from_matrix(poses[:, :3, :3]))(clipped).as_matrix()
     for axis in range(3):
-        T[:, axis, 3] = np.interp(at, times, poses[:, axis, 3])
+        T[:, axis, 3] = np.interp(clipped, times, poses[:, axis, 3])
     return T
 
 

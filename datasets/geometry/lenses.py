@@ -44,8 +44,8 @@ def fit(values: Pixels, K: Intrinsics, K_fit: Intrinsics, shape: tuple[int, int]
     v, u = _positions(K, K_fit, shape)
     wide = values.astype(np.result_type(values.dtype, np.float32), copy=False)
     mixed = _linear(_linear(wide, v, axis=0), u, axis=1)
-    seen = _within(v, values.shape[0])[:, None] & _within(u, values.shape[1])
-    return cast(Pixels, np.where(seen[..., None], mixed, wide.dtype.type(0)))
+    inside = _within(v, values.shape[0])[:, None] & _within(u, values.shape[1])
+    return cast(Pixels, np.where(inside[..., None], mixed, wide.dtype.type(0)))
 
 
 def _nearest(values: Pixels, K: Intrinsics, K_fit: Intrinsics, shape: tuple[int, int], fill: int) -> Pixels:
@@ -69,10 +69,10 @@ def _within(positions: npt.NDArray[Any], length: int) -> Mask:
     return (positions >= -0.5 - TIE) & (positions < length - 0.5 + TIE)
 
 
-def _linear(values: npt.NDArray[Any], at: Float64, axis: int) -> npt.NDArray[Any]:
+def _linear(values: npt.NDArray[Any], positions: Float64, axis: int) -> npt.NDArray[Any]:
     """Return values between the pixel centres of one axis."""
     last = values.shape[axis] - 1
-    x = at.clip(0, last)
+    x = positions.clip(0, last)
     low = np.floor(x).astype(np.intp)
     share = (x - low).astype(values.dtype).reshape([-1 if k == axis else 1 for k in range(values.ndim)])
     below, above = values.take(low, axis), values.take(np.minimum(low + 1, last), axis)

@@ -64,5 +64,5 @@ def seen_points(points: npt.NDArray[np.floating[Any]], T_cl: Float64, K: Intrins
     nearest, last = np.full(shape, np.inf), np.full(shape, -1, np.intp)
     nearest[v, u], last[v, u] = z, np.arange(len(z))
     hidden = z > BEHIND * minimum_filter(nearest, size=AROUND)[v, u] + BEHIND_METRES
-    kept = (last[v, u] == np.arange(len(z))) & ~hidden
-    return Seen(v[kept], u[kept], z[kept], inside[kept], shape)
+    visible = (last[v, u] == np.arange(len(z))) & ~hidden
+    return Seen(v[visible], u[visible], z[visible], inside[visible], shape)

@@ -26,12 +26,12 @@ def motion_in_sweep(before: Float64 | None, now: Float64, after: Float64 | None)
     """
     from scipy.spatial.transform import Rotation
 
-    known = [pose for pose in (before, now, after) if pose is not None and np.isfinite(pose).all()]
-    if len(known) < 2:
+    poses = [pose for pose in (before, now, after) if pose is not None and np.isfinite(pose).all()]
+    if len(poses) < 2:
         return np.zeros(6)
-    step = np.linalg.inv(known[0]) @ known[-1]
+    step = np.linalg.inv(poses[0]) @ poses[-1]
     turn = Rotation.from_matrix(step[:3, :3]).as_rotvec()
-    return np.asarray(np.concatenate([turn, step[:3, 3]]) / (len(known) - 1), np.float64)
+    return np.asarray(np.concatenate([turn, step[:3, 3]]) / (len(poses) - 1), np.float64)
 
 
 def share_of_sweep(points: Float64, sweep: Sweep) -> Float64:

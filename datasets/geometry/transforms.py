@@ -50,12 +50,12 @@ class Trajectory:
         poses = from_quaternions(numbers[:, :3], numbers[:, 3:], path)
         if self.fixed:
             return np.repeat(poses[-1:], len(stamps), axis=0)
-        own = np.frombuffer(self.stamps, dtype=np.int64)
-        order = np.argsort(own, kind="stable")
-        last = np.append(np.diff(own[order]) > 0, True)
-        times, start = own[order][last], int(own.min())
-        wanted = np.array([stamp - start for stamp in stamps], dtype=np.int64)
-        return between_times(_seconds(times - start), poses[order][last], _seconds(wanted), max_gap)
+        all_stamps = np.frombuffer(self.stamps, dtype=np.int64)
+        order = np.argsort(all_stamps, kind="stable")
+        last = np.append(np.diff(all_stamps[order]) > 0, True)
+        times, start = all_stamps[order][last], int(all_stamps.min())
+        queries = np.array([stamp - start for stamp in stamps], dtype=np.int64)
+        return between_times(_seconds(times - start), poses[order][last], _seconds(queries), max_gap)
 
 
 def _seconds(stamps: np.ndarray[tuple[int], np.dtype[np.int64]]) -> Float64:

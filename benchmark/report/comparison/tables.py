@@ -97,8 +97,8 @@ def _others(comparison: RunComparison) -> str:
     return comparison.runs[1].name if len(comparison.runs) == 2 else "Other"
 
 
-def _rows(against: Against, shown: Sequence[Quantity]) -> tuple[Row, ...]:
-    keys = by_name(shown)
+def _rows(against: Against, quantities: Sequence[Quantity]) -> tuple[Row, ...]:
+    keys = by_name(quantities)
     return tuple(
         (_titled(keys[row.measure]), row.base, row.other, row.difference, row.p_holm, scope(row), _change(row))
         for row in against.contrasts
@@ -121,11 +121,12 @@ def _titled(quantity: Quantity) -> str:
 
 def _by_class(comparison: RunComparison) -> Table:
     measured = {row.measure for _, against in scopes(comparison) for row in against.by_class}
-    shown = [quantity for quantity in IN_CLASSES if quantity.name in measured]
-    columns = (Column("class", "Class"), *(Column(q.name, q.named, 3, q.better, signed=True) for q in shown))
+    quantities = [quantity for quantity in IN_CLASSES if quantity.name in measured]
+    columns = (Column("class", "Class"), *(Column(q.name, q.named, 3, q.better, signed=True) for q in quantities))
     worse = Column("worse", "Worse"), Column("better", "Better")
     groups = tuple(
-        Group(heading(comparison, scope, against), _class_rows(against, shown)) for scope, against in scopes(comparison)
+        Group(heading(comparison, scope, against), _class_rows(against, quantities))
+        for scope, against in scopes(comparison)
     )
     caption = (
         "The measures are alpha of the class against all others, PSA of its locations (by the ground truth, or else by"
@@ -135,16 +136,16 @@ def _by_class(comparison: RunComparison) -> Table:
     return Table("comparison_classes", "By class", caption, (columns[0], *worse, *columns[1:]), groups, "scope")
 
 
-def _class_rows(against: Against, shown: Sequence[Quantity]) -> tuple[Row, ...]:
+def _class_rows(against: Against, quantities: Sequence[Quantity]) -> tuple[Row, ...]:
     words = by_name(BY_CLASS)
     rows = []
     for name in dict.fromkeys(row.of for row in against.by_class):
-        mine = {row.measure: row for row in against.by_class if row.of == name}
-        cells = [mine[q.name].difference if q.name in mine else math.nan for q in shown]
+        by_measure = {row.measure: row for row in against.by_class if row.of == name}
+        cells = [by_measure[q.name].difference if q.name in by_measure else math.nan for q in quantities]
         changed = {
             change: ", ".join(
                 words[row.measure].symbol if row.measure in words else row.measure
-                for row in mine.values()
+                for row in by_measure.values()
                 if row.change == change
             )
             for change in ("worse", "better")
@@ -195,7 +196,7 @@ def _frames(comparison: RunComparison) -> Table:
     groups = tuple(
         Group(
             heading(comparison, scene.scene, against),
-            tuple((each.name or str(each.frame), 100 * each.share) for each in against.top_frames),
+            tuple((frame.name or str(frame.frame), 100 * frame.share) for frame in against.top_frames),
         )
         for scene in comparison.scenes
         for against in scene.against
@@ -341,13 +342,13 @@ def _of_run(comparison: RunComparison, against: Against) -> Iterator[str]:
     }
     notes = {name: _changes(rows, by_name(BY_CLASS)) for name, rows in classes.items()}
     if listed := [f"{name} ({text})" for name, text in notes.items() if text]:
-        left = len(listed) - MOST_CLASSES
-        more = f" and {left} more {'class' if left == 1 else 'classes'}" if len(listed) > MOST_CLASSES else ""
+        unlisted = len(listed) - MOST_CLASSES
+        more = f" and {unlisted} more {'class' if unlisted == 1 else 'classes'}" if len(listed) > MOST_CLASSES else ""
         yield f"{against.other} by class: {', '.join(listed[:MOST_CLASSES])}{more}."
     for scene in comparison.scenes:
-        mine = next(each for each in scene.against if each.other == against.other)
+        of_scene = next(row for row in scene.against if row.other == against.other)
         for what in ("agreement", "truth"):
-            if areas := [area for area in mine.areas if area.what == what]:
+            if areas := [area for area in of_scene.areas if area.what == what]:
                 yield f"{against.other} in {scene.scene}: {_of_areas(areas, scene.crs)}."
 
 
@@ -405,10 +406,10 @@ def _coverage(comparison: RunComparison, against: Against) -> Iterator[str]:
             yield f"{against.other} covers {abs(change):.1%} {more} voxels than {comparison.base}."
 
 
-def _changes(rows: Sequence[Contrast], known: Mapping[str, Quantity]) -> str:
+def _changes(rows: Sequence[Contrast], quantities: Mapping[str, Quantity]) -> str:
     """Return 'worse in mIoU, recall; better in flicker'."""
     listed = {
-        change: [known[row.measure].word for row in rows if row.change == change and row.measure in known]
+        change: [quantities[row.measure].word for row in rows if row.change == change and row.measure in quantities]
         for change in ("worse", "better")
     }
     return "; ".join(f"{change} in {', '.join(names)}" for change, names in listed.items() if names)
@@ -418,13 +419,13 @@ def _of_areas(areas: Sequence[Area], crs: str) -> str:
     first = areas[0]
     lost = "whose frames agree less" if first.what == "agreement" else "that are wrong now"
     count = f"{MOST} or more areas" if len(areas) == MOST else f"{len(areas)} area{'s' if len(areas) > 1 else ''}"
-    alike = f"{first.improved_alike or 'none'} improved by as much as the largest"
+    improved_text = f"{first.improved_alike or 'none'} improved by as much as the largest"
     confused_with = f", confused with {first.confused_with}" if first.confused_with else ""
     x, y, z = first.centre
     system = f" of {crs}" if crs else ""
     frames = f"; the top contributing frames are {top_frames(first.frames)}" if first.frames else ""
     return (
-        f"{count} {lost} ({alike}); the largest is {first.voxels:,} voxels of"
+        f"{count} {lost} ({improved_text}); the largest is {first.voxels:,} voxels of"
         f" {first.of}{confused_with}, at ({x:.2f}, {y:.2f}, {z:.2f}) m{system}{frames}"
     )
 
@@ -474,6 +475,6 @@ def _fitting(table: Table, comparison: RunComparison) -> Table:
     if max(map(len, heads.values()), default=0) <= LONGEST_NAME:
         return table
     short = {"base": "Base", "other": "Other"}
-    columns = (dataclasses.replace(each, header=short.get(each.key, each.header)) for each in table.columns)
+    columns = (dataclasses.replace(column, header=short.get(column.key, column.header)) for column in table.columns)
     other = f", other: {heads['other']}" if heads["other"] != short["other"] else ""
     return dataclasses.replace(table, title=f"{table.title} (base: {comparison.base}{other})", columns=tuple(columns))

@@ -38,8 +38,8 @@ def write_figures(result: Result, folder: str | Path, out: Path | None = None, *
     Without `out` they are written into FOLDER/figures, where earlier figures are removed.
     """
     target = out or Path(folder) / "figures"
-    drawn = sorted(figures(result, folder), key=lambda figure: figure.unit)  # a unit's figures read its voxels once
-    written = [path for figure in drawn for path in figure.save(target, svg=svg)]
+    ordered = sorted(figures(result, folder), key=lambda figure: figure.unit)  # a unit's figures read its voxels once
+    written = [path for figure in ordered for path in figure.save(target, svg=svg)]
     if out is None:
         keep_only(written, target)
     return written

@@ -51,14 +51,14 @@ def distance(measure: Measure, value: Float64) -> Float64:
 
 def histograms(table: VoxelTable) -> Histograms:
     """Return the histograms of a unit, without undefined values."""
-    seen, bounds = op(table), np.append(OP_BOUNDS, np.inf)
+    persistence, bounds = op(table), np.append(OP_BOUNDS, np.inf)
     shares = {m: distance(m, m.of(table)) / m.largest for m in measures()}
-    return {m: np.histogram2d(seen, share, [bounds, EDGES])[0] for m, share in shares.items()}
+    return {m: np.histogram2d(persistence, share, [bounds, EDGES])[0] for m, share in shares.items()}
 
 
 def together(units: Iterable[Histograms]) -> Histograms:
     """Return the voxels of several units pooled."""
-    return reduce(lambda a, b: {measure: one + b[measure] for measure, one in a.items()}, units)
+    return reduce(lambda a, b: {measure: counts + b[measure] for measure, counts in a.items()}, units)
 
 
 def upper_ends(measure: Measure) -> Float64:
@@ -99,17 +99,17 @@ def draw_ecdf(scenes: Mapping[str, Histograms], ends: Mapping[Measure, float]) -
 
     `ends` are the ends of the x axes.
     """
-    shown = measures()
-    figure = canvas(PAGE, 2.4 * math.ceil(len(shown) / 2))
-    panels = figure.subplots(math.ceil(len(shown) / 2), 2, squeeze=False).ravel()
+    panel_measures = measures()
+    figure = canvas(PAGE, 2.4 * math.ceil(len(panel_measures) / 2))
+    panels = figure.subplots(math.ceil(len(panel_measures) / 2), 2, squeeze=False).ravel()
     everything = together(scenes.values())
-    for axes, letter, measure in zip(panels, LETTERS, shown, strict=False):
+    for axes, letter, measure in zip(panels, LETTERS, panel_measures, strict=False):
         _draw_curves(axes, measure, {name: counts[measure] for name, counts in scenes.items()}, everything[measure])
         label = measure.title if measure.better == "lower" else f"{measure.largest:g} - {measure.title}"
         unit = f" ({measure.unit})" if measure.unit else ""
         axes.set(xlabel=label + unit, ylabel="share of voxels", xlim=(0, 1.03 * ends[measure]), ylim=(0.0, 1.02))
         mark_panel(axes, letter, f"{label}, voxels with OP ≥ {measure.lowest_op}" if measure.lowest_op > 1 else label)
-    for axes in panels[len(shown) :]:
+    for axes in panels[len(panel_measures) :]:
         axes.set_axis_off()
     handles, labels = panels[0].get_legend_handles_labels()
     figure.legend(handles, labels, loc="outside lower center", ncols=legend_columns(labels, figure.get_figwidth()))
@@ -143,15 +143,15 @@ def draw_persistence(models: Mapping[str, Histograms]) -> Figure:
     from matplotlib.lines import Line2D
     from matplotlib.patches import Patch
 
-    columns, shown = len(models), measures()
-    figure = canvas(COLUMN if columns == 1 else PAGE, 1.2 + 1.5 * len(shown))
-    ratios = (*[3.0] * len(shown), 1.6)
+    columns, panel_measures = len(models), measures()
+    figure = canvas(COLUMN if columns == 1 else PAGE, 1.2 + 1.5 * len(panel_measures))
+    ratios = (*[3.0] * len(panel_measures), 1.6)
     grid = figure.subplots(len(ratios), columns, sharex=True, sharey="row", squeeze=False, height_ratios=ratios)
     for k, (name, histogram) in enumerate(models.items()):
         _draw_column(grid[:, k], histogram, color(k))
         grid[0, k].set_title(name)
         grid[-1, k].set_xlabel("OP (frames)")
-    labels = (f"{m.title} ({m.unit})" if m.unit else m.title for m in shown)
+    labels = (f"{m.title} ({m.unit})" if m.unit else m.title for m in panel_measures)
     for axes, label in zip(grid[:, 0], (*labels, "voxels"), strict=True):
         axes.set_ylabel(label)
     band = Patch(facecolor=FAINT, alpha=0.4, label="interquartile range")
@@ -200,8 +200,8 @@ looks small. The axes of measures that are good when low (SBD, entropy), and of 
 
 def draw_sweep(sweep: Sweep, models: Mapping[str, tuple[Level, ...]]) -> Figure:
     """Return the recurrent share and every measure along a sweep; the values are drawn in order, at equal distances."""
-    shown = measures()
-    rows = math.ceil((1 + len(shown)) / 3)
+    panel_measures = measures()
+    rows = math.ceil((1 + len(panel_measures)) / 3)
     figure = canvas(PAGE, 2.5 if rows == 1 else 2.1 * rows)
     share, *panels = figure.subplots(rows, 3, squeeze=False).ravel()
     values = sorted({level.value for levels in models.values() for level in levels})
@@ -209,17 +209,17 @@ def draw_sweep(sweep: Sweep, models: Mapping[str, tuple[Level, ...]]) -> Figure:
         x = positions(values, levels, k, len(models))
         draw_line(share, x, levels, lambda p: 100 * p.recurrent.share, color(k), marker="s")
         enough = [level for level in levels if level.mean(lambda p: p.recurrent.voxels) >= ENOUGH]
-        at = positions(values, enough, k, len(models))
-        for axes, measure in zip(panels, shown, strict=False):
+        enough_x = positions(values, enough, k, len(models))
+        for axes, measure in zip(panels, panel_measures, strict=False):
             draw_line(axes, x, levels, over_all(measure), color(k))
-            draw_line(axes, at, enough, over_recurrent(measure), color(k), open_=True)
-    titles = ("recurrent share (%)", *(f"{m.title} ({m.unit})" if m.unit else m.title for m in shown))
+            draw_line(axes, enough_x, enough, over_recurrent(measure), color(k), open_=True)
+    titles = ("recurrent share (%)", *(f"{m.title} ({m.unit})" if m.unit else m.title for m in panel_measures))
     for axes, letter, title in zip((share, *panels), LETTERS, titles, strict=False):
         mark_values(axes, sweep, values)
         mark_panel(axes, letter, title)
-    for axes in panels[len(shown) :]:
+    for axes in panels[len(panel_measures) :]:
         axes.set_axis_off()
-    for axes, better in zip((share, *panels), ("lower", *(m.better for m in shown)), strict=False):
+    for axes, better in zip((share, *panels), ("lower", *(m.better for m in panel_measures)), strict=False):
         settle_scale(axes, from_zero=better == "lower")
     columns = legend_columns([*models, "all voxels", "OP ≥ 3"], PAGE)
     figure.legend(handles=_legend(list(models)), loc="outside lower center", ncols=columns)
@@ -296,6 +296,6 @@ def _error(
 def _legend(models: list[str]) -> list[object]:
     from matplotlib.lines import Line2D
 
-    every = Line2D([], [], color=INK, marker="o", label="all voxels")
+    all_voxels = Line2D([], [], color=INK, marker="o", label="all voxels")
     recurrent = Line2D([], [], color=INK, marker="o", linestyle="--", markerfacecolor="white", label="OP ≥ 3")
-    return [*(Line2D([], [], color=color(k), label=name) for k, name in enumerate(models)), every, recurrent]
+    return [*(Line2D([], [], color=color(k), label=name) for k, name in enumerate(models)), all_voxels, recurrent]

@@ -57,8 +57,8 @@ class Located:
     def of(cls, above: FromAbove, georeference: Georeference | None = None) -> Located:
         """Locate the picture of the voxels that are seen."""
         H, W = above.rows.shape
-        seen = above.table.centers
-        return cls.seen_along(above.axis, above.corner, (W * above.cell, H * above.cell), seen, georeference)
+        centers = above.table.centers
+        return cls.seen_along(above.axis, above.corner, (W * above.cell, H * above.cell), centers, georeference)
 
     @classmethod
     def seen_along(
@@ -81,8 +81,10 @@ class Located:
     def coordinates(self, point: npt.ArrayLike) -> list[float]:
         """Return a point (3,) of the scene in the coordinates of the exports, metres."""
         points = np.asarray(point, np.float64).reshape(1, 3)
-        found: list[float] = (points if self.georeference is None else self.georeference.projected(points))[0].tolist()
-        return found
+        projected: list[float] = (points if self.georeference is None else self.georeference.projected(points))[
+            0
+        ].tolist()
+        return projected
 
     @property
     def names(self) -> tuple[str, str, str]:

@@ -51,14 +51,14 @@ WIDE = 1.4
 def draw_stability(above: FromAbove, georeference: Georeference | None = None) -> Figure:
     """Return the stability category of the topmost voxels and the measures that have a panel, with coordinates."""
     table, rows, located = above.table, above.rows, Located.of(above, georeference)
-    shown = [measure for measure in measures() if measure.panel]
-    figure, (kind, *panels) = map_panels(rows, 1 + len(shown))
+    panel_measures = [measure for measure in measures() if measure.panel]
+    figure, (kind, *panels) = map_panels(rows, 1 + len(panel_measures))
     draw_kinds(figure, kind, rows, categories(table), CATEGORY_COLORS, CATEGORIES)
-    for axes, measure in zip(panels, shown, strict=True):
+    for axes, measure in zip(panels, panel_measures, strict=True):
         values = np.where(table.op > 1, measure.of(table), np.nan)
         _draw_measure(figure, axes, rows, values, measure.range, best_first=measure.better == "lower")
     where = "" if above.view == "from above" else f", {above.view}"
-    titles = (f"stability{where}", *(f"{m.title}, {m.unit}" if m.unit else m.title for m in shown))
+    titles = (f"stability{where}", *(f"{m.title}, {m.unit}" if m.unit else m.title for m in panel_measures))
     for axes, letter, title in zip((kind, *panels), LETTERS, titles, strict=False):
         mark_panel(axes, letter, title)
         framed(axes)
@@ -137,12 +137,12 @@ class Overview:
             with zipfile.ZipFile(io.BytesIO(data)) as archive:
                 arrays = {name: decode_array(path, data, name[:-4]) for name in archive.namelist()}
             content = {name.removesuffix(".npy"): value for name, value in arrays.items()}
-            lone: list[Any] = [content.get(f"lone_{name}") for name in ("frames", "labels", "alone", "color")]
+            lone_arrays: list[Any] = [content.get(f"lone_{name}") for name in ("frames", "labels", "alone", "color")]
             names = ("of", "centre", "frame", "labels", "ring", "color")
             places: list[Any] = [content.get(f"place_{name}") for name in names]
             return cls(
                 int(content["frame"]), content["labels"], content.get("color"), content["palette"],
-                None if lone[0] is None else LoneFrames(*lone),
+                None if lone_arrays[0] is None else LoneFrames(*lone_arrays),
                 None if places[0] is None else PlacePictures(*places),
             )  # fmt: skip
         except (ValueError, TypeError, KeyError, RuntimeError, zipfile.BadZipFile) as error:
@@ -172,8 +172,8 @@ def draw_overview(above: FromAbove, overview: Overview, georeference: Georeferen
         framed(panel)
     locate(axes[-1], Located.of(above, georeference), rows.shape)
     names = table.classes or tuple(str(k) for k in range(table.K))
-    shown = sorted({int(k) for k in np.unique(label)} | {int(k) for k in np.unique(overview.labels) if k < table.K})
-    entries = [(names[k], tuple(channel / 255 for channel in palette[k])) for k in shown]
+    class_ids = sorted({int(k) for k in np.unique(label)} | {int(k) for k in np.unique(overview.labels) if k < table.K})
+    entries = [(names[k], tuple(channel / 255 for channel in palette[k])) for k in class_ids]
     columns = legend_columns([name for name, _ in entries])
     figure.set_figheight(figure.get_figheight() + LEGEND_LINE * math.ceil(len(entries) / columns))
     figure.legend(handles=_handles(entries), loc="outside lower center", ncols=columns)
@@ -395,16 +395,16 @@ def draw_changes(
 ) -> Figure:
     """Return the largest change in each column of voxels, worse in orange, better in blue."""
     axis, view = best_view(table, up)[1:]
-    seen = [top_down(table.centers, table.voxel_size, axis, np.abs(panel.values)) for panel in panels]
-    figure, axes = map_panels(seen[0].rows, len(panels))
-    for own, letter, panel, (rows, cell, corner) in zip(axes, LETTERS, panels, seen, strict=False):
+    pictures = [top_down(table.centers, table.voxel_size, axis, np.abs(panel.values)) for panel in panels]
+    figure, axes = map_panels(pictures[0].rows, len(panels))
+    for panel_axes, letter, panel, (rows, cell, corner) in zip(axes, LETTERS, panels, pictures, strict=False):
         size = rows.shape[1] * cell, rows.shape[0] * cell
         located = Located.seen_along(axis, corner, size, table.centers, georeference)
-        _draw(figure, own, panel, rows)
-        mark_panel(own, letter, f"{panel.title}, {view.partition(',')[0]}")
-        framed(own)
-        locate(own, located, rows.shape, named=own is axes[0])
-        number_places(own, panel.numbers, panel.centres, panel.links, located, rows.shape)
+        _draw(figure, panel_axes, panel, rows)
+        mark_panel(panel_axes, letter, f"{panel.title}, {view.partition(',')[0]}")
+        framed(panel_axes)
+        locate(panel_axes, located, rows.shape, named=panel_axes is axes[0])
+        number_places(panel_axes, panel.numbers, panel.centres, panel.links, located, rows.shape)
     return figure
 
 

@@ -56,13 +56,13 @@ def best_view(table: VoxelTable, up: npt.ArrayLike) -> tuple[Mask, Float64, str]
 def best_view_of(centers: Float64, voxel_size: float, up: npt.ArrayLike) -> tuple[Mask, Float64, str]:
     """Return the same of voxels with these centres (n, 3)."""
     right, ahead, up_axis = level_axes(up)
-    every = np.ones(len(centers), dtype=np.bool_)
+    all_voxels = np.ones(len(centers), dtype=np.bool_)
     column, count = _numbered(_columns(centers, up_axis, voxel_size))
     areas = [count, *(_numbered(_columns(centers, axis, voxel_size))[1] for axis in (right, ahead))]
     if max(areas[1:]) > SLENDER * areas[0]:
         side = right if areas[1] > areas[2] else ahead
         upright = max((-side, side), key=lambda axis: float(level_axes(axis)[1] @ up_axis))
-        return every, upright, "from the side"
+        return all_voxels, upright, "from the side"
     heights = centers @ up_axis
     low, high = np.quantile(heights, [OUTLIERS, 1 - OUTLIERS])
     cut = high - LID * (high - low)
@@ -71,7 +71,7 @@ def best_view_of(centers: Float64, voxel_size: float, up: npt.ArrayLike) -> tupl
     np.minimum.at(bottom, column, heights)
     covered_columns = (top > cut) & (bottom < high - 0.5 * (high - low))
     if np.mean(covered_columns) <= LIDDED or high - low < 4 * voxel_size:
-        return every, up_axis, "from above"
+        return all_voxels, up_axis, "from above"
     return heights <= cut, up_axis, f"cut open at {cut:.2g} m"
 
 
@@ -86,11 +86,11 @@ def _columns(centers: Float64, axis: Float64, voxel_size: float) -> Int64:
 def _numbered(columns: Int64) -> tuple[Int64, int]:
     """Return the numbers of columns (n,) without gaps, and how many columns there are."""
     if columns.max() > SPARSE * len(columns):
-        numbers, own = np.unique(columns, return_inverse=True)
-        return own, len(numbers)
-    there = np.zeros(columns.max() + 1, np.int64)
-    there[columns] = 1
-    number = np.cumsum(there)
+        numbers, inverse = np.unique(columns, return_inverse=True)
+        return inverse, len(numbers)
+    occupied = np.zeros(columns.max() + 1, np.int64)
+    occupied[columns] = 1
+    number = np.cumsum(occupied)
     return number[columns] - 1, int(number[-1])
 
 
@@ -126,8 +126,8 @@ class FromAbove:
         rows, cell, corner = top_down(centers, table.voxel_size, axis)
         width, height = (float(np.ptp(centers @ along)) + table.voxel_size for along in level_axes(axis)[:2])
         rows = np.where(rows == EMPTY, EMPTY, np.flatnonzero(selected)[rows])
-        shown = np.zeros(len(table), dtype=np.bool_)
-        shown[rows[rows != EMPTY]] = True
-        renumbered: npt.NDArray[Any] = np.where(rows == EMPTY, EMPTY, (np.cumsum(shown) - 1)[rows])
+        visible = np.zeros(len(table), dtype=np.bool_)
+        visible[rows[rows != EMPTY]] = True
+        renumbered: npt.NDArray[Any] = np.where(rows == EMPTY, EMPTY, (np.cumsum(visible) - 1)[rows])
         x, y, z = axis.tolist()
-        return cls(rows_of(table, shown), shown, renumbered, cell, view, (width, height), (x, y, z), corner)
+        return cls(rows_of(table, visible), visible, renumbered, cell, view, (width, height), (x, y, z), corner)

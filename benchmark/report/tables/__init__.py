@@ -72,9 +72,9 @@ FORMATS = (*(f".{suffix}" for suffix in TEXT_WRITERS), ".json")
 
 def tables(result: Result) -> list[Table]:
     """Return every table that the study has records for, in the paper's order."""
-    shown = of_interest(result)
-    maps = shown.maps
-    built = (table for build in BUILDERS for table in build(shown if build in OF_IMAGES else maps))
+    relevant = of_interest(result)
+    maps = relevant.maps
+    built = (table for build in BUILDERS for table in build(relevant if build in OF_IMAGES else maps))
     made = [*filter_tables(result), *built]
     words = f" Benchmark {result.benchmark}." if result.benchmark else ""
     if n := len(result.failures):
@@ -85,8 +85,8 @@ def tables(result: Result) -> list[Table]:
 def write_tables(result: Result, folder: str | Path) -> list[Path]:
     """Write the tables that users of a run open, at most MOST_WRITTEN, as `save_tables` does; return the paths."""
     made = tables(result)
-    wanted = dict.fromkeys(table.name for name in WRITTEN for table in made if table.name.startswith(name))
-    names = [*wanted][:MOST_WRITTEN]
+    selected = dict.fromkeys(table.name for name in WRITTEN for table in made if table.name.startswith(name))
+    names = [*selected][:MOST_WRITTEN]
     return save_tables([table for table in made if table.name in names], folder)
 
 

@@ -47,12 +47,12 @@ def fusion(result: Result) -> list[Table]:
 
 
 def _group(result: Result, model: str) -> Group | None:
-    others = result.select(BACKENDS, model=model)
+    other_records = result.select(BACKENDS, model=model)
     by_backend: dict[str, dict[str, Record]] = {}
-    for record in (*result.select(model=model), *others):
+    for record in (*result.select(model=model), *other_records):
         by_backend.setdefault(record.unit.backend, {})[record.unit.scene] = record
     scenes = set.intersection(*(set(rows) for rows in by_backend.values()))
-    if not others or not scenes:
+    if not other_records or not scenes:
         return None
     means = {name: pooled([row for scene, row in rows.items() if scene in scenes]) for name, rows in by_backend.items()}
     base = means[result.backend]
@@ -83,8 +83,11 @@ def fusion_correctness(result: Result) -> list[Table]:
                 rows.setdefault(record.unit.backend, {})[record.unit.scene] = record.statistics.correctness
         scenes = set.intersection(*(set(of_backend) for of_backend in rows.values())) if rows else set()
         if len(rows) > 1 and scenes:
-            of_rows = ((name, [own for scene, own in by.items() if scene in scenes]) for name, by in rows.items())
-            groups.append(Group(model, tuple((name, *_right(own)) for name, own in of_rows)))
+            of_rows = (
+                (name, [correctness for scene, correctness in by.items() if scene in scenes])
+                for name, by in rows.items()
+            )
+            groups.append(Group(model, tuple((name, *_right(correctness)) for name, correctness in of_rows)))
     if not groups:
         return []
     columns = (
@@ -100,9 +103,9 @@ def fusion_correctness(result: Result) -> list[Table]:
 
 def _right(scenes: Sequence[CorrectnessStatistics]) -> tuple[float, ...]:
     """Return the macro means of accuracy, mIoU, ECE and Brier score at OP >= 2."""
-    repeated = [next(row for row in own.strata if row.name == SEEN_TWICE) for own in scenes]
+    repeated = [next(row for row in correctness.strata if row.name == SEEN_TWICE) for correctness in scenes]
     numbers = zip(*((row.accuracy, row.miou, row.ece, row.brier) for row in repeated), strict=True)
-    return tuple(macro_mean(own) for own in numbers)
+    return tuple(macro_mean(column) for column in numbers)
 
 
 def compared(result: Result) -> list[Table]:
@@ -155,12 +158,14 @@ def agreement(result: Result) -> list[Table]:
         (row.backends, (*_backend_agreement_row(row, titles), *([str(row.first or "")] if differ else [])))
         for row in result.agreement
     ]
-    groups = tuple(Group(" and ".join(pair), tuple(row for of, row in rows if of == pair)) for pair in pairs)
+    groups = tuple(
+        Group(" and ".join(pair), tuple(row for backends, row in rows if backends == pair)) for pair in pairs
+    )
     caption = (
         "Two backends fused the same frames. The table shows the largest difference of any voxel that both maps have."
     )
-    if drawn := one_in(result.agreement):
-        caption += f" With the numpy reference, {drawn} voxels were compared, drawn at random."
+    if fraction := one_in(result.agreement):
+        caption += f" With the numpy reference, {fraction} voxels were compared, drawn at random."
     return [Table("agreement", "Agreement of the fusion implementations", caption, columns, groups, "backends")]
 
 
@@ -182,5 +187,7 @@ def largest_share(voxels: int, confidence: float = CONFIDENCE) -> float:
 
 def one_in(rows: Sequence[Agreement]) -> str:
     """Return which share of the voxels was compared: '1 in 64', '1 in 64 to 128'; '' where all were."""
-    drawn = sorted({row.one_in for row in rows})
-    return "" if drawn in ([], [1]) else f"1 in {' to '.join(map(str, dict.fromkeys((drawn[0], drawn[-1]))))}"
+    fractions = sorted({row.one_in for row in rows})
+    return (
+        "" if fractions in ([], [1]) else f"1 in {' to '.join(map(str, dict.fromkeys((fractions[0], fractions[-1]))))}"
+    )

@@ -14,8 +14,8 @@ from semstab.statistics.agreement import ALPHA
 def _with_features(result: Result) -> Iterator[tuple[str, list[tuple[Record, FeatureAgreement]]]]:
     """Yield the models whose frames have features, with the agreement of these by scene."""
     for name, rows in assessed_records(result).items():
-        if own := [(record, stats.features) for record, stats in rows if stats.features is not None]:
-            yield name, own
+        if assessed := [(record, stats.features) for record, stats in rows if stats.features is not None]:
+            yield name, assessed
 
 
 def features(result: Result) -> list[Table]:
@@ -24,8 +24,16 @@ def features(result: Result) -> list[Table]:
         Group(
             name,
             tuple(
-                (record.unit.scene, own.alpha, own.cosine, own.chance, own.components, own.spots, own.one_in)
-                for record, own in rows
+                (
+                    record.unit.scene,
+                    agreement.alpha,
+                    agreement.cosine,
+                    agreement.chance,
+                    agreement.components,
+                    agreement.spots,
+                    agreement.one_in,
+                )
+                for record, agreement in rows
             ),
         )
         for name, rows in _with_features(result)
@@ -49,7 +57,7 @@ def feature_places(result: Result) -> list[Table]:
     """Return the places where features of two views differ most."""
     groups = []
     for name, rows in _with_features(result):
-        places = tuple(_row(record, place) for record, own in rows for place in own.places)
+        places = tuple(_row(record, place) for record, agreement in rows for place in agreement.places)
         groups += [Group(name, places)] if places else []
     if not groups:
         return []

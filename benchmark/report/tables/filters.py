@@ -40,10 +40,12 @@ def filter_tables(result: Result) -> list[Table]:
     if not studies:
         return []
     groups = tuple(
-        Group(each.model, tuple(row(each, filtered) for filtered in (each.unfiltered, *each.filtered)))
-        for each in studies
+        Group(study.model, tuple(row(study, filtered) for filtered in (study.unfiltered, *study.filtered)))
+        for study in studies
     )
-    best = [f"{each.best.filters} over {each.model}" if each.best else f"none over {each.model}" for each in studies]
+    best = [
+        f"{study.best.filters} over {study.model}" if study.best else f"none over {study.model}" for study in studies
+    ]
     return [
         Table(
             "filters",

@@ -61,11 +61,13 @@ def paper(result: Result) -> list[Table]:
     models = {STANDS_FOR[name]: name for name in result.models if name in STANDS_FOR}
     if result.name not in STUDIES or OPEN not in models:
         return []
-    named = " and ".join(
-        f"{ours} stands for {theirs}" for theirs, ours in models.items() if ours.lower() != theirs.lower()
+    stand_ins = " and ".join(
+        f"{model} stands for {paper_name}"
+        for paper_name, model in models.items()
+        if model.lower() != paper_name.lower()
     )
-    said = f" Here {named}; absolute numbers are not comparable, the findings are." if named else ""
-    return [_findings(result, models, said), _numbers(result, models, said)]
+    remark = f" Here {stand_ins}; absolute numbers are not comparable, the findings are." if stand_ins else ""
+    return [_findings(result, models, remark), _numbers(result, models, remark)]
 
 
 @dataclass(frozen=True)
@@ -85,11 +87,11 @@ class Finding:
 
     def row(self) -> Row:
         """Return its row of the table."""
-        theirs, ours = (
+        published, measured = (
             " → ".join(f"{value:.{self.digits}f}" for value in values) for values in (self.theirs, self.ours)
         )
         held = "--" if self.holds is None else "yes" if self.holds else "no"
-        return self.text, theirs, "--" if self.holds is None else ours, held
+        return self.text, published, "--" if self.holds is None else measured, held
 
 
 def falls(values: Sequence[float]) -> bool:
@@ -97,48 +99,50 @@ def falls(values: Sequence[float]) -> bool:
     return all(a > b for a, b in itertools.pairwise(values))
 
 
-def _finding(text: str, theirs: Sequence[float], ours: Sequence[float], digits: int) -> Finding:
+def _finding(text: str, published: Sequence[float], measured: Sequence[float], digits: int) -> Finding:
     """Return a finding that numbers fall, or rise, as the paper's numbers do."""
-    known = len(ours) == len(theirs) and not any(map(math.isnan, ours))
-    shown = falls(ours) if falls(theirs) else falls([-value for value in ours])
-    return Finding(text, theirs, ours, digits, shown if known else None)
+    is_defined = len(measured) == len(published) and not any(map(math.isnan, measured))
+    holds = falls(measured) if falls(published) else falls([-value for value in measured])
+    return Finding(text, published, measured, digits, holds if is_defined else None)
 
 
-def _changes_little(text: str, theirs: Sequence[float], ours: Sequence[float], held: float, digits: int) -> Finding:
+def _changes_little(
+    text: str, published: Sequence[float], measured: Sequence[float], held: float, digits: int
+) -> Finding:
     """Return a finding that numbers hardly change, beside a change that `held` is."""
-    if len(ours) != len(theirs) or any(map(math.isnan, (*ours, held))):
-        return Finding(text, theirs, ours, digits, None)
-    return Finding(text, theirs, ours, digits, abs(ours[-1] - ours[0]) < NEARLY * abs(held))
+    if len(measured) != len(published) or any(map(math.isnan, (*measured, held))):
+        return Finding(text, published, measured, digits, None)
+    return Finding(text, published, measured, digits, abs(measured[-1] - measured[0]) < NEARLY * abs(held))
 
 
-def _findings(result: Result, models: Mapping[str, str], said: str) -> Table:
+def _findings(result: Result, models: Mapping[str, str], remark: str) -> Table:
     columns = (Column("finding", "Finding"), Column("paper", "Paper"), Column("here", "Here"), Column("holds", "Holds"))
     groups = (
-        Group("Observation persistence", tuple(each.row() for each in _persistence(result, models[OPEN]))),
-        Group("Two models in one taxonomy", tuple(each.row() for each in _order(result, models))),
-        Group("World-space association", tuple(each.row() for each in _association(result, models[OPEN]))),
+        Group("Observation persistence", tuple(finding.row() for finding in _persistence(result, models[OPEN]))),
+        Group("Two models in one taxonomy", tuple(finding.row() for finding in _order(result, models))),
+        Group("World-space association", tuple(finding.row() for finding in _association(result, models[OPEN]))),
     )
     caption = (
         "The findings of the paper (arXiv:2608.28665) in its numbers, and in those of this study. 'Little' holds where"
         " the change is less than a third of that of all voxels above it."
     )
-    return Table("findings", "Findings of the paper", caption + said, columns, groups)
+    return Table("findings", "Findings of the paper", caption + remark, columns, groups)
 
 
 def _persistence(result: Result, model: str) -> Iterator[Finding]:
     strata = {row.name: row for row in pooled(result.select(model=model)).strata}
     recurrent = pooled(result.select(model=model)).recurrent
     once = strata["OP=1"][VSS] if "OP=1" in strata else math.nan
-    theirs = [STRATA["OP=1"][1], STRATA["3<=OP<=5"][1]]
-    yield _finding("VSS: seen once → OP>=3", theirs, [once, recurrent[VSS]], 3)
-    seen = [name for name in STRATA if name != "OP=1"]
-    ours = [strata[name][SBD] for name in seen if name in strata]
-    yield _finding("SBD falls with OP: 2 → 3 to 5 → more", [STRATA[name][2] for name in seen], ours, 4)
+    published = [STRATA["OP=1"][1], STRATA["3<=OP<=5"][1]]
+    yield _finding("VSS: seen once → OP>=3", published, [once, recurrent[VSS]], 3)
+    repeated = [name for name in STRATA if name != "OP=1"]
+    measured = [strata[name][SBD] for name in repeated if name in strata]
+    yield _finding("SBD falls with OP: 2 → 3 to 5 → more", [STRATA[name][2] for name in repeated], measured, 4)
 
 
 def _order(result: Result, models: Mapping[str, str]) -> Iterator[Finding]:
     records = result.select(SHARED) or result.select()
-    means = {theirs: pooled([r for r in records if r.unit.model == name]) for theirs, name in models.items()}
+    means = {paper_name: pooled([r for r in records if r.unit.model == name]) for paper_name, name in models.items()}
     compared: Sequence[tuple[str, int, int, Callable[[Pooled], float]]] = (
         ("VSS of all voxels", 0, 1, over_all(VSS)),
         ("VSS of voxels with OP>=3", 1, 1, over_recurrent(VSS)),
@@ -146,9 +150,9 @@ def _order(result: Result, models: Mapping[str, str]) -> Iterator[Finding]:
         ("share of voxels with OP>=3, %", 1, 0, _share),
     )
     for text, row, column, take in compared:
-        theirs = [SHARED_TAXONOMY[name][row][column] for name in (OPEN, CLOSED)]
-        ours = [take(means[name]) for name in (OPEN, CLOSED) if name in means]
-        yield _finding(f"{text}: {OPEN} → {CLOSED}", theirs, ours, 2 if column == 0 else 4)
+        published = [SHARED_TAXONOMY[name][row][column] for name in (OPEN, CLOSED)]
+        measured = [take(means[name]) for name in (OPEN, CLOSED) if name in means]
+        yield _finding(f"{text}: {OPEN} → {CLOSED}", published, measured, 2 if column == 0 else 4)
 
 
 def _association(result: Result, model: str) -> Iterator[Finding]:
@@ -175,14 +179,14 @@ def _each(of_sweep: Sequence[Level], take: Callable[[Pooled], float]) -> list[fl
     return [level.mean(take) for level in of_sweep]
 
 
-def _share(each: Pooled) -> float:
-    return 100 * each.recurrent.share
+def _share(voxels: Pooled) -> float:
+    return 100 * voxels.recurrent.share
 
 
 # --- Numbers side by side ---------------------------------------------------------------------------------------------
 
 
-def _numbers(result: Result, models: Mapping[str, str], said: str) -> Table:
+def _numbers(result: Result, models: Mapping[str, str], remark: str) -> Table:
     measured = (
         Column("percent", "Voxels (%)", 2), Column("vss", "VSS", 4), Column("sbd", "SBD", 4),
         Column("entropy", "Entropy", 4),
@@ -202,11 +206,14 @@ def _numbers(result: Result, models: Mapping[str, str], said: str) -> Table:
         Group("By class", tuple(_beside(CLASSES, classes))),
     ]
     records = result.select(SHARED) or result.select()
-    for theirs, name in models.items():
-        both = pooled([record for record in records if record.unit.model == name])
-        every, recurrent = SHARED_TAXONOMY[theirs]
-        rows: tuple[Row, ...] = (("all voxels", *every, *_of(both.every)), ("OP>=3", *recurrent, *_of(both.recurrent)))
-        groups.append(Group(f"{theirs} in the shared taxonomy", rows))
+    for paper_name, name in models.items():
+        voxels = pooled([record for record in records if record.unit.model == name])
+        all_voxels, recurrent = SHARED_TAXONOMY[paper_name]
+        rows: tuple[Row, ...] = (
+            ("all voxels", *all_voxels, *_of(voxels.every)),
+            ("OP>=3", *recurrent, *_of(voxels.recurrent)),
+        )
+        groups.append(Group(f"{paper_name} in the shared taxonomy", rows))
     flicker = {
         name: macro_mean([record.image_space.flicker_percent for record in rows])
         for name, rows in by_model(result.select()).items()
@@ -217,12 +224,12 @@ def _numbers(result: Result, models: Mapping[str, str], said: str) -> Table:
         f" {', '.join(f'{name} {value:.2f}' for name, value in FLICKER.items())}; here:"
         f" {', '.join(f'{name} {value:.2f}' for name, value in flicker.items())}."
     )
-    return Table("published", "Numbers of the paper", caption + said, columns, tuple(groups))
+    return Table("published", "Numbers of the paper", caption + remark, columns, tuple(groups))
 
 
-def _beside(theirs: Mapping[str, Numbers], ours: Mapping[str, Means]) -> Iterator[Row]:
-    for name, numbers in theirs.items():
-        yield name, *numbers, *(_of(ours[name]) if name in ours else (math.nan,) * 4)
+def _beside(published: Mapping[str, Numbers], measured: Mapping[str, Means]) -> Iterator[Row]:
+    for name, numbers in published.items():
+        yield name, *numbers, *(_of(measured[name]) if name in measured else (math.nan,) * 4)
 
 
 def _of(means: Means) -> Numbers:

@@ -35,12 +35,12 @@ def found_runs(words: list[Path]) -> dict[str, Result]:
     """
     folders: list[Path] = []
     for word in words:
-        own = (
+        run_folders = (
             [word] if is_run(word) else sorted(path for path in word.glob("*") if is_run(path)) if word.is_dir() else []
         )
-        if not own:
+        if not run_folders:
             raise ConfigError(f"{word}: there is no finished run here; give folders of --out, or the folder above them")
-        folders += own
+        folders += run_folders
     resolved = [folder.resolve() for folder in folders]
     if repeated := next(
         (folder for folder, path in zip(folders, resolved, strict=True) if resolved.count(path) > 1), None

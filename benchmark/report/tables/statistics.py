@@ -97,9 +97,9 @@ def class_agreement(result: Result) -> list[Table]:
         *(Column.of(q, over="OP>=2") for q in (KAPPA, VOXEL_ALPHA)),
     )
     cells = [row[1:] for group in groups for row in group.rows]
-    known = [k for k in range(len(columns)) if any(_has_content(row[k]) for row in cells)]
+    filled = [k for k in range(len(columns)) if any(_has_content(row[k]) for row in cells)]
     retained = tuple(
-        Group(group.name, tuple((row[0], *(row[1 + k] for k in known)) for row in group.rows)) for group in groups
+        Group(group.name, tuple((row[0], *(row[1 + k] for k in filled)) for row in group.rows)) for group in groups
     )
     caption = (
         "The table compares each class with all others. Observations are the evidence for a class in voxels seen twice"
@@ -109,7 +109,7 @@ def class_agreement(result: Result) -> list[Table]:
     )
     title = "Agreement of the frames, by class"
     return [
-        Table("class_agreement", title, caption, (Column("class", "Class"), *(columns[k] for k in known)), retained)
+        Table("class_agreement", title, caption, (Column("class", "Class"), *(columns[k] for k in filled)), retained)
     ]
 
 
@@ -195,10 +195,10 @@ def drift(result: Result) -> list[Table]:
     )
     logged = any(r.statistics is not None and r.statistics.drift.flips is not None for r in result.select())
     one_class = f"{SEEN_TWICE[:-1]} in which each frame has one class; --statistics adds the others."
-    seen = SEEN_TWICE if logged else one_class
+    population = SEEN_TWICE if logged else one_class
     caption = (
-        f"{seen} Random order is the mean SBD of the same observations over all orders; excess is SBD less that mean."
-        f" {INTERVALS}"
+        f"{population} Random order is the mean SBD of the same observations over all orders; excess is SBD less that"
+        f" mean. {INTERVALS}"
     )
     return by_scene(result, "drift", "Belief drift against random order", caption, columns, numbers)
 
@@ -207,9 +207,9 @@ def frames(result: Result) -> list[Table]:
     """Return the frames that stand out, by the names of their files; a map without any has one row that says so."""
     groups = []
     for model, records in by_model(result.select()).items():
-        known = [(record, record.outlying_frames) for record in records]
+        pairs = [(record, record.outlying_frames) for record in records]
         lines = tuple(
-            row for record, outlying in known if outlying is not None for row in _frame_rows(record, outlying)
+            row for record, outlying in pairs if outlying is not None for row in _frame_rows(record, outlying)
         )
         groups += [Group(model, lines)] if lines else []
     if not groups:
@@ -237,8 +237,8 @@ def frames(result: Result) -> list[Table]:
 
 def _frame_rows(record: Record, outlying: OutlyingFrames) -> Iterator[Row]:
     counts = outlying.judged, outlying.unjudged
-    for each in outlying.frames:
-        yield record.unit.scene, each.name, each.places, 100 * each.share, 100 * each.null, *counts
+    for outlier in outlying.frames:
+        yield record.unit.scene, outlier.name, outlier.places, 100 * outlier.share, 100 * outlier.null, *counts
     if not outlying.frames:
         yield record.unit.scene, "none", math.nan, math.nan, math.nan, *counts
 
@@ -312,12 +312,12 @@ def by_scene(
         for model, rows in assessed_records(result).items()
     }
     cells = {model: {scene: row for scene, row in rows.items() if _known(row)} for model, rows in cells.items()}
-    known = sorted({k for rows in cells.values() for row in rows.values() for k in _known(row)})
-    if not known:
+    filled = sorted({k for rows in cells.values() for row in rows.values() for k in _known(row)})
+    if not filled:
         return []
 
-    def row(scene: str, of: Sequence[float | Estimate]) -> Row:
-        return scene, *(of[k] for k in known)
+    def row(scene: str, values: Sequence[float | Estimate]) -> Row:
+        return scene, *(values[k] for k in filled)
 
     groups = tuple(
         Group(
@@ -328,7 +328,7 @@ def by_scene(
         for model, rows in cells.items()
         if rows
     )
-    return [Table(name, title, caption, (SCENE, *(columns[k] for k in known)), groups)]
+    return [Table(name, title, caption, (SCENE, *(columns[k] for k in filled)), groups)]
 
 
 def assessed_records(result: Result) -> dict[str, list[tuple[Record, MapStatistics]]]:
@@ -380,7 +380,9 @@ def grouped(rows: Iterable[T], name: Callable[[T], str]) -> dict[str, list[T]]:
 def _class_rows(assessed: Sequence[MapStatistics]) -> tuple[Row, ...]:
     by_name = grouped((row for stats in assessed for row in stats.agreement.classes), lambda row: row.name)
     spots = (stats.spots for stats in assessed if stats.spots is not None)
-    alphas: dict[str, list[ClassAlpha]] = grouped((row for each in spots for row in each.classes), lambda row: row.name)
+    alphas: dict[str, list[ClassAlpha]] = grouped(
+        (row for of_map in spots for row in of_map.classes), lambda row: row.name
+    )
     return tuple(
         (
             name,

@@ -115,13 +115,13 @@ class Table:
 
     def only(self, *keys: str) -> Table:
         """Return the table with these columns alone."""
-        at = [k for k, column in enumerate(self.columns) if column.key in keys]
+        positions = [k for k, column in enumerate(self.columns) if column.key in keys]
 
         def cut(row: Row) -> Row:
-            return tuple(row[k] for k in at)
+            return tuple(row[k] for k in positions)
 
         groups = tuple(Group(g.name, tuple(map(cut, g.rows)), g.total and cut(g.total)) for g in self.groups)
-        return dataclasses.replace(self, columns=tuple(self.columns[k] for k in at), groups=groups)
+        return dataclasses.replace(self, columns=tuple(self.columns[k] for k in positions), groups=groups)
 
     def printed(self) -> Table:
         """Return the table without the columns that are empty in every row, as print shows it; files keep them."""

@@ -58,9 +58,9 @@ def video_measures(result: Result) -> list[Table]:
         )
         for model, videos in scenes.items()
     )
-    every = [(name, video) for videos in scenes.values() for name, video in videos.items()]
-    lacking = dict.fromkeys(name for name, video in every if not video.vc8.clips and video.self_vc8.clips)
-    caption = CAPTION.format(flow=FLOWS[every[0][1].flow])
+    all_videos = [(name, video) for videos in scenes.values() for name, video in videos.items()]
+    lacking = dict.fromkeys(name for name, video in all_videos if not video.vc8.clips and video.self_vc8.clips)
+    caption = CAPTION.format(flow=FLOWS[all_videos[0][1].flow])
     caption += WITHOUT_TRUTH.format(scenes=", ".join(lacking)) if lacking else ""
     caption += TOGETHER if any(group.total for group in groups) else ""
     return [Table("video_measures", f"Published measures of time ({UNDEFINED}: undefined)", caption, COLUMNS, groups)]
@@ -74,8 +74,8 @@ def _numbers(videos: Sequence[VideoMeasures]) -> Row:
 
 def _mean(videos: Sequence[ClipMean]) -> float:
     """Return the mean over all clips of all videos."""
-    clips = sum(each.clips for each in videos)
-    return sum(each.value * each.clips for each in videos if each.clips) / clips if clips else math.nan
+    clips = sum(video.clips for video in videos)
+    return sum(video.value * video.clips for video in videos if video.clips) / clips if clips else math.nan
 
 
 def _tc(videos: Sequence[WarpedOverlap]) -> Row:

@@ -39,7 +39,7 @@ def class_lines(records: Sequence[Record], width: int, begin: str = "") -> Itera
     for name in names:
         of_model = [record for record in records if record.unit.model == name]
         classes, shares = class_means(of_model), _class_shares(of_model)
-        others = {k: v for record in of_model for k, v in record.summary.table.confused_with.items()}
+        confused_with = {k: v for record in of_model for k, v in record.summary.table.confused_with.items()}
         listed = sorted(
             (key for key, (_, disagreement) in classes.items() if disagreement >= CONTRIBUTES and key in shares),
             key=lambda key: -classes[key][1],
@@ -51,7 +51,7 @@ def class_lines(records: Sequence[Record], width: int, begin: str = "") -> Itera
         for key in listed[:most]:
             label, (alpha, disagreement) = key if alone else f"{name.removeprefix(begin)}: {key}", classes[key]
             of_map, of_all = f"{100 * shares.get(key, 0.0):.0f} %", f"{100 * disagreement:.0f} %"
-            rows.append((f"  {label}", short(alpha), others.get(key, ""), of_map, of_all))
+            rows.append((f"  {label}", short(alpha), confused_with.get(key, ""), of_map, of_all))
     if rows:
         room = width - CLASS_COLUMNS
         first = max(LEAST_CLASS, min(room * 2 // 3, max(len(row[0]) for row in rows)))
@@ -65,13 +65,14 @@ def class_lines(records: Sequence[Record], width: int, begin: str = "") -> Itera
 
 def class_means(records: Sequence[Record]) -> dict[str, tuple[float, float]]:
     """Return alpha of each class and its share of the disagreement, macro means over scenes, where both are known."""
-    known: dict[str, list[tuple[float, float]]] = {}
+    by_class: dict[str, list[tuple[float, float]]] = {}
     for statistics in (record.statistics for record in records if record.statistics is not None):
         for row in () if statistics.spots is None else statistics.spots.classes:
             if not (math.isnan(row.alpha.value) or math.isnan(row.disagreement)):
-                known.setdefault(row.name, []).append((row.alpha.value, row.disagreement))
+                by_class.setdefault(row.name, []).append((row.alpha.value, row.disagreement))
     return {
-        name: (macro_mean([a for a, _ in values]), macro_mean([d for _, d in values])) for name, values in known.items()
+        name: (macro_mean([a for a, _ in values]), macro_mean([d for _, d in values]))
+        for name, values in by_class.items()
     }
 
 
@@ -90,8 +91,12 @@ def outlying_lines(records: Sequence[Record]) -> Iterator[str]:
         outlying = record.outlying_frames
         if outlying is None or (len(records) > 1 and not outlying.frames):
             continue
-        scene = record.unit.scene if len({each.unit.scene for each in records}) > 1 else ""
-        of = ", ".join(name for name in (scene, record.unit.model) if name) if len(records) > 1 else ""
+        scene = record.unit.scene if len({other.unit.scene for other in records}) > 1 else ""
+        subject = ", ".join(name for name in (scene, record.unit.model) if name) if len(records) > 1 else ""
         yield from textwrap.wrap(
-            outlying_line(outlying, of), WIDTH, initial_indent="  ", subsequent_indent="    ", break_on_hyphens=False
+            outlying_line(outlying, subject),
+            WIDTH,
+            initial_indent="  ",
+            subsequent_indent="    ",
+            break_on_hyphens=False,
         )

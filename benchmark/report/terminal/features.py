@@ -20,9 +20,9 @@ def features_alone(features: FeatureAgreement, record: Record) -> Iterator[str]:
     alpha = features.alpha
     ends = "" if math.isnan(alpha.low) else f" ({alpha.of} {short(alpha.low)} to {short(alpha.high)})"
     yield f"  FEATURES    alpha {short(alpha.value)}{ends}    {features.components} components"
-    kept = f", 1 in {features.one_in} kept" if features.one_in > 1 else ""
+    fraction = f", 1 in {features.one_in} kept" if features.one_in > 1 else ""
     yield from wrapped(
-        f"mean cosine {features.cosine:.2f} of two views at one of {features.spots:,} spots{kept},"
+        f"mean cosine {features.cosine:.2f} of two views at one of {features.spots:,} spots{fraction},"
         f" {features.chance:.2f} of any two"
     )
     yield from wrapped(WITHOUT)
@@ -35,8 +35,8 @@ def features_alone(features: FeatureAgreement, record: Record) -> Iterator[str]:
 
 def feature_lines(features: FeatureAgreement) -> Iterator[str]:
     """Yield alpha by range, time and angle, the frames that stand out, and the worst places."""
-    if told := [row for row in features.ranges if row.is_assessed]:
-        by_range = ", ".join(f"{metres(row.low)} to {metres(row.high)} m {short(row.alpha.value)}" for row in told)
+    if assessed := [row for row in features.ranges if row.is_assessed]:
+        by_range = ", ".join(f"{metres(row.low)} to {metres(row.high)} m {short(row.alpha.value)}" for row in assessed)
         yield from wrapped(f"alpha by range: {by_range}")
     views, degrees = features.correlogram.time, features.correlogram.angle
     if len(views) > 1:
@@ -44,10 +44,11 @@ def feature_lines(features: FeatureAgreement) -> Iterator[str]:
     if len(degrees) > 1:
         yield from wrapped(f"alpha by angle between two views: {_ends(degrees, 1, ' degrees')}")
     if features.outlying_frames is not None and features.outlying_frames.frames:
-        named = features.outlying_frames.frames
-        more = f" and {len(named) - 3} more" if len(named) > 3 else ""
+        outliers = features.outlying_frames.frames
+        more = f" and {len(outliers) - 3} more" if len(outliers) > 3 else ""
         listed = ", ".join(
-            f"{each.name} (cosine {1 - 2 * each.share:.2f}, others {1 - 2 * each.null:.2f})" for each in named[:3]
+            f"{outlier.name} (cosine {1 - 2 * outlier.share:.2f}, others {1 - 2 * outlier.null:.2f})"
+            for outlier in outliers[:3]
         )
         yield from wrapped(f"frames that stand out: {listed}{more}")
     for place in features.places[:MOST_PLACES]:
@@ -61,4 +62,6 @@ def feature_lines(features: FeatureAgreement) -> Iterator[str]:
 
 def _ends(bins: Sequence[LagBin], digits: int, unit: str = "") -> str:
     """Return '.93 at 1, .71 at 40': alpha of the nearest pairs and of the farthest."""
-    return ", ".join(f"{short(each.alpha.value)} at {each.mean:.{digits}f}{unit}" for each in (bins[0], bins[-1]))
+    return ", ".join(
+        f"{short(lag_bin.alpha.value)} at {lag_bin.mean:.{digits}f}{unit}" for lag_bin in (bins[0], bins[-1])
+    )

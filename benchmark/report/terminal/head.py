@@ -19,15 +19,15 @@ def head_lines(name: str, result: Result, runs: Sequence[UnitSummary], width: in
     frames = sorted({run.frames for run in runs})
     counts = f"{frames[0]} to {frames[-1]}" if len(frames) > 1 else f"{frames[0]}"
     spots = [run.statistics.spots for run in runs if run.statistics is not None]
-    views = min((each.views for each in spots if each is not None and each.views < each.frames), default=None)
-    seen = "" if views is None else f" of {views} distinct views"
+    views = min((of_run.views for of_run in spots if of_run is not None and of_run.views < of_run.frames), default=None)
+    distinct = "" if views is None else f" of {views} distinct views"
     chosen = " (auto)" if any(advice.chosen for advice in result.advice.values()) else ""
     numbers = {run.table.K for run in runs if run.taxonomy != OF_FEATURES.name}
-    of = f"{' and '.join(map(str, sorted(numbers)))} classes" if numbers else "features"
-    what = f"{counts} frames{seen}, {of}, {_metres(first.table.voxel_size)} voxels{chosen}"
-    beside = "    ".join(filter(None, (_geometry(result), _scope(runs))))
-    line = f"{name}    {what}    {beside}".rstrip()
-    yield line if len(line) <= width else f"{name}    {what}\n  {beside}".rstrip()
+    classes = f"{' and '.join(map(str, sorted(numbers)))} classes" if numbers else "features"
+    what = f"{counts} frames{distinct}, {classes}, {_metres(first.table.voxel_size)} voxels{chosen}"
+    remarks = "    ".join(filter(None, (_geometry(result), _scope(runs))))
+    line = f"{name}    {what}    {remarks}".rstrip()
+    yield line if len(line) <= width else f"{name}    {what}\n  {remarks}".rstrip()
     for text in noted(result):
         yield from wrapped(f"note: {text}")
     yield ""
@@ -46,8 +46,8 @@ def _scope(runs: Sequence[UnitSummary]) -> str:
     """Return a note where intervals and verdicts are for the frames of a run alone, as they are too few for more."""
     alphas = [run.statistics.headline.alpha for run in runs if run.statistics is not None]
     few = [alpha for alpha in alphas if alpha.scope == THESE_FRAMES and alpha.frames]
-    of = "" if len(few) == len(alphas) else f" in {len(few)} of {len(alphas)} rows"
-    return f"intervals for these frames alone{of}: fewer than {LEAST_FRAMES} views" if few else ""
+    in_rows = "" if len(few) == len(alphas) else f" in {len(few)} of {len(alphas)} rows"
+    return f"intervals for these frames alone{in_rows}: fewer than {LEAST_FRAMES} views" if few else ""
 
 
 def _metres(size: float) -> str:

@@ -60,8 +60,8 @@ LONG_NAME = 16
 
 def common_beginning(names: Sequence[str]) -> str:
     """Return the common beginning of the names of models, up to a space, '_' or '-'; '' if it is short."""
-    same = itertools.takewhile(lambda letters: len({*letters}) == 1, zip(*names, strict=False))
-    to_last_sign = re.match(r".*[ _-]", "".join(letters[0] for letters in same))
+    shared = itertools.takewhile(lambda letters: len({*letters}) == 1, zip(*names, strict=False))
+    to_last_sign = re.match(r".*[ _-]", "".join(letters[0] for letters in shared))
     begin = to_last_sign[0] if to_last_sign and len(names) > 1 else ""
     return begin if len(begin) > LEAST_NAME and max(map(len, names)) > LONG_NAME and begin not in names else ""
 
@@ -73,11 +73,11 @@ def percents(shares: Sequence[float]) -> list[str]:
     """
     if any(map(math.isnan, shares)):
         return [percent(share) for share in shares]
-    whole = [math.floor(100 * share) for share in shares]
-    lost = sorted(range(len(shares)), key=lambda k: whole[k] - 100 * shares[k])
-    for k in lost[: round(100 * math.fsum(shares)) - sum(whole)]:
-        whole[k] += 1
-    return [f"{n} %" for n in whole]
+    rounded = [math.floor(100 * share) for share in shares]
+    lost = sorted(range(len(shares)), key=lambda k: rounded[k] - 100 * shares[k])
+    for k in lost[: round(100 * math.fsum(shares)) - sum(rounded)]:
+        rounded[k] += 1
+    return [f"{n} %" for n in rounded]
 
 
 def percent(share: float) -> str:

@@ -32,9 +32,9 @@ def many_scenes(result: Result, records: Sequence[Record], width: int) -> Iterat
     """Yield the answer, a row for each model over all scenes, a line for each scene, and what refutes a verdict."""
     listed = ", ".join(result.scenes) if len(result.scenes) <= 3 else f"{len(result.scenes)} scenes"
     yield from head_lines(listed, result, [record.summary for record in records], width)
-    for text in (told := list(answers(result))):
+    for text in (sentences := list(answers(result))):
         yield from wrapped(text)
-    if told:
+    if sentences:
         yield ""
     models, begin = by_model(records), common_beginning([*result.models])
     yield from _model_rows(models, begin, width)
@@ -53,11 +53,11 @@ def many_scenes(result: Result, records: Sequence[Record], width: int) -> Iterat
 
 def over_scenes(alphas: Sequence[float]) -> Estimate:
     """Return the mean of alpha over scenes, each counting once, with Student's interval for other scenes like these."""
-    known = [alpha for alpha in alphas if not math.isnan(alpha)]
-    n, value = len(known), macro_mean(known)
+    defined = [alpha for alpha in alphas if not math.isnan(alpha)]
+    n, value = len(defined), macro_mean(defined)
     if n < LEAST_SCENES:
         return Estimate(value, math.nan, math.nan)
-    spread = math.sqrt(sum((alpha - value) ** 2 for alpha in known) / (n - 1) / n)
+    spread = math.sqrt(sum((alpha - value) ** 2 for alpha in defined) / (n - 1) / n)
     half = float(special.stdtrit(n - 1, (1 + CONFIDENCE) / 2)) * spread
     return Estimate(value, max(value - half, -1.0), min(value + half, 1.0))
 
@@ -78,20 +78,22 @@ def _model_rows(models: dict[str, list[Record]], begin: str, width: int) -> Iter
 
 def _model_row(name: str, records: Sequence[Record]) -> list[str]:
     statistics = [record.statistics for record in records if record.statistics is not None]
-    levels = Counter(own.verdict.decisive for own in statistics).most_common()
+    levels = Counter(stats.verdict.decisive for stats in statistics).most_common()
     verdicts = levels[0][0] if len(levels) == 1 else ", ".join(f"{level} {n}" for level, n in levels[:2])
-    of_features = [own.features.alpha.value for own in statistics if own.features is not None and own.features.alone]
+    of_features = [
+        stats.features.alpha.value for stats in statistics if stats.features is not None and stats.features.alone
+    ]
     if of_features:
         verdicts = "features"
-    alpha = over_scenes(of_features or [own.headline.alpha.value for own in statistics])
-    agree = 100 * macro_mean([own.agreeing for own in statistics])
+    alpha = over_scenes(of_features or [stats.headline.alpha.value for stats in statistics])
+    agree = 100 * macro_mean([stats.agreeing for stats in statistics])
     flicker = macro_mean([record.image_space.compensated_flicker_percent for record in records])
     recurrent = pooled(records).recurrent
     means = [recurrent[m] if recurrent.voxels >= ENOUGH else math.nan for m in headlines()]
-    shown = [short(value, digits=m.digits[0]) for m, value in zip(headlines(), means, strict=True)]
-    right = [own.correctness.miou_op2.value for own in statistics if own.correctness is not None]
+    headline_texts = [short(value, digits=m.digits[0]) for m, value in zip(headlines(), means, strict=True)]
+    right = [stats.correctness.miou_op2.value for stats in statistics if stats.correctness is not None]
     miou = macro_mean(right) if right else math.nan
-    return [name, verdicts, alpha.text(), number(agree, 0), number(flicker, 1), *shown, short(miou, digits=3)]
+    return [name, verdicts, alpha.text(), number(agree, 0), number(flicker, 1), *headline_texts, short(miou, digits=3)]
 
 
 def _scene_lines(scenes: Sequence[str], models: dict[str, list[Record]], begin: str, width: int) -> Iterator[str]:
@@ -109,7 +111,7 @@ def _scene_lines(scenes: Sequence[str], models: dict[str, list[Record]], begin: 
 
 
 def _cell(records: Sequence[Record], scene: str, *, interval: bool) -> str:
-    (statistics, *_) = [own.statistics for own in records if own.unit.scene == scene] or [None]
+    (statistics, *_) = [record.statistics for record in records if record.unit.scene == scene] or [None]
     if statistics is None:
         return "-"
     alpha = statistics.headline.alpha
@@ -122,8 +124,10 @@ def _cell(records: Sequence[Record], scene: str, *, interval: bool) -> str:
 def _refuted(models: dict[str, list[Record]]) -> Iterator[str]:
     """Yield the models whose agreement ground truth refutes in a scene, with the share that is wrong there."""
     for name, records in models.items():
-        known = [own.statistics for own in records if own.statistics is not None]
-        wrong = [own.headline.wrong_of_consistent_op3.value for own in known if own.verdict.level == "misleading"]
+        assessed = [record.statistics for record in records if record.statistics is not None]
+        wrong = [
+            stats.headline.wrong_of_consistent_op3.value for stats in assessed if stats.verdict.level == "misleading"
+        ]
         if wrong:
             low, high = percent(min(wrong)), percent(max(wrong))
             share = low if low == high else f"{low} to {high}"
@@ -136,8 +140,8 @@ def _refuted(models: dict[str, list[Record]]) -> Iterator[str]:
 def _silent(models: dict[str, list[Record]]) -> Iterator[str]:
     """Yield the models with another level if pixels without a label count as disagreeing."""
     for name, records in models.items():
-        known = [own.statistics.verdict for own in records if own.statistics is not None]
-        if n := sum(bool(verdict.difference) for verdict in known):
+        verdicts = [record.statistics.verdict for record in records if record.statistics is not None]
+        if n := sum(bool(verdict.difference) for verdict in verdicts):
             yield from wrapped(
                 f"{name}: another level in {n} scenes if pixels without a label count as disagreeing:"
                 " semstab-bench show RUN verdicts"
@@ -148,8 +152,8 @@ def _outlying(models: dict[str, list[Record]]) -> Iterator[str]:
     """Yield how many frames of each model stand out."""
     counts = []
     for name, records in models.items():
-        known = [own.statistics.outlying_frames for own in records if own.statistics is not None]
-        frames = [len(each.frames) for each in known if each is not None and each.frames]
+        outlying = [record.statistics.outlying_frames for record in records if record.statistics is not None]
+        frames = [len(of_scene.frames) for of_scene in outlying if of_scene is not None and of_scene.frames]
         if frames:
             counts.append(f"{name} {sum(frames)} in {len(frames)} scene{'s' if len(frames) > 1 else ''}")
     if counts:

@@ -61,9 +61,9 @@ def _verdict(run: UnitSummary) -> Iterator[str]:
         yield from wrapped(statistics.verdict.line)
         return
     yield f"  {level} {statistics.verdict.stated}".rstrip() + f"    {name} {short(alpha.value)}{_interval(alpha)}"
-    told = wrong_text(statistics)
+    wrong = wrong_text(statistics)
     if statistics.verdict.level == "misleading":
-        yield from textwrap.wrap(told, WIDTH, initial_indent="  ", subsequent_indent="  ")
+        yield from textwrap.wrap(wrong, WIDTH, initial_indent="  ", subsequent_indent="  ")
     elif statistics.verdict.level == "uninformative" and statistics.spots is not None:
         share, name = nearly_all(statistics.spots.largest_share), statistics.spots.largest_class
         yield f"  {share} of the observations are {name}: agreement does not assess such a map"
@@ -79,8 +79,8 @@ def _verdict(run: UnitSummary) -> Iterator[str]:
     for text in statistics.moving_lines:
         yield from wrapped(text)
     yield f"  two views see the same class at {percent(statistics.agreeing)} of the spots"
-    if told and statistics.verdict.level != "misleading":
-        yield f"  {told}"
+    if wrong and statistics.verdict.level != "misleading":
+        yield f"  {wrong}"
     meaning = None if statistics.spots is None else statistics.spots.meaning
     for section in (statistics.told_ranges, statistics.groupings, meaning, statistics.features):
         if section is not None:
@@ -92,9 +92,9 @@ def wrong_text(statistics: MapStatistics) -> str:
     """Return the share of the consistent locations that are wrong, and what follows from it; '' without truth."""
     if not (share := share_of_wrong(statistics)):
         return ""
-    told = f"{share} of the voxels whose frames agree have a wrong class"
+    wrong = f"{share} of the voxels whose frames agree have a wrong class"
     misleads = statistics.verdict.level == "misleading"
-    return f"{told}, more than {percent(DANGEROUS)}: do not take agreement for truth" if misleads else told
+    return f"{wrong}, more than {percent(DANGEROUS)}: do not take agreement for truth" if misleads else wrong
 
 
 def share_of_wrong(statistics: MapStatistics) -> str:

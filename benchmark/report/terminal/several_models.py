@@ -20,9 +20,9 @@ from semstab.statistics.verdict import DANGEROUS
 
 def columns() -> list[tuple[str, str]]:
     """Return the head and the unit or the population of each number in a model's row, see `row_of`."""
-    shown = [(m.title, "OP>=3") for m in headlines()]
+    measure_columns = [(m.title, "OP>=3") for m in headlines()]
     texts = [("model", ""), ("verdict", ""), (f"alpha ({UNDEFINED.of})", "")]
-    return [*texts, ("agree", "%"), ("flicker", "%"), *shown, ("mIoU", "OP>=2")]
+    return [*texts, ("agree", "%"), ("flicker", "%"), *measure_columns, ("mIoU", "OP>=2")]
 
 
 def row_of(record: Record, begin: str = "") -> list[str]:
@@ -36,10 +36,10 @@ def row_of(record: Record, begin: str = "") -> list[str]:
             level, alpha, agree = "features", statistics.features.alpha.text(), math.nan
     recurrent = run.table.recurrent
     means = {m: recurrent[m] if recurrent.voxels >= ENOUGH else math.nan for m in headlines()}
-    shown = [short(value, digits=m.digits[0]) for m, value in means.items()]
+    measure_texts = [short(value, digits=m.digits[0]) for m, value in means.items()]
     flicker = record.image_space.compensated_flicker_percent
     agreeing, flickering, overlap = number(agree, 0), number(flicker, 1), short(miou(record), digits=3)
-    return [run.unit.model.removeprefix(begin), level, alpha, agreeing, flickering, *shown, overlap]
+    return [run.unit.model.removeprefix(begin), level, alpha, agreeing, flickering, *measure_texts, overlap]
 
 
 def miou(record: Record) -> float:
@@ -64,13 +64,13 @@ MOST_MAPS = 2
 def several_models(result: Result, records: Sequence[Record], width: int) -> Iterator[str]:
     """Yield which model is more stable where that is known, then a row for each model."""
     yield from head_lines(result.scenes[0], result, [record.summary for record in records], width)
-    for text in (told := list(answers(result))):
+    for text in (sentences := list(answers(result))):
         yield from wrapped(text)
-    if told:
+    if sentences:
         yield ""
-    known = any(not math.isnan(miou(record)) for record in records)
-    shown, begin = columns() if known else columns()[:-1], common_beginning([*result.models])
-    heads, rows = [*zip(*shown, strict=True)], [row_of(record, begin)[: len(shown)] for record in records]
+    has_truth = any(not math.isnan(miou(record)) for record in records)
+    row_columns, begin = columns() if has_truth else columns()[:-1], common_beginning([*result.models])
+    heads, rows = [*zip(*row_columns, strict=True)], [row_of(record, begin)[: len(row_columns)] for record in records]
     yield from laid_out([*heads, *rows], width)
     if begin:
         yield f"  names of models begin with '{begin}'"
@@ -107,20 +107,22 @@ def several_models(result: Result, records: Sequence[Record], width: int) -> Ite
 
 def _wrong_lines(records: Sequence[Record]) -> Iterator[str]:
     """Yield the share of the consistent locations that are wrong, of each model; nothing without ground truth."""
-    judged = [(record.unit.model, own) for record in records if (own := record.statistics) is not None]
-    shares = {model: share_of_wrong(own) for model, own in judged if own.verdict.level != "no verdict"}
-    if known := [f"{model} {share}" for model, share in shares.items() if share]:
-        misleads = any(own.verdict.level == "misleading" for _, own in judged)
+    assessed = [(record.unit.model, stats) for record in records if (stats := record.statistics) is not None]
+    shares = {model: share_of_wrong(stats) for model, stats in assessed if stats.verdict.level != "no verdict"}
+    if texts := [f"{model} {share}" for model, share in shares.items() if share]:
+        misleads = any(stats.verdict.level == "misleading" for _, stats in assessed)
         more = f"; more than {percent(DANGEROUS)} is MISLEADING: do not take agreement for truth" if misleads else ""
-        yield from wrapped(f"wrong class although frames agree: {', '.join(known)} of such voxels{more}")
+        yield from wrapped(f"wrong class although frames agree: {', '.join(texts)} of such voxels{more}")
 
 
 def _map_shares(records: Sequence[Record], width: int, begin: str) -> Iterator[str]:
     """Yield a row for each map: how much of it is stable, uncertain, drifting, and seen too rarely to tell."""
-    known = [record for record in records if record.summary.table.categories]
-    rows = [percents([record.summary.table.categories[name] for name in reversed(CATEGORIES)]) for record in known]
+    with_categories = [record for record in records if record.summary.table.categories]
+    rows = [
+        percents([record.summary.table.categories[name] for name in reversed(CATEGORIES)]) for record in with_categories
+    ]
     heads = ("stable", "uncertain", "drifting", "in less than 3 frames")
-    models = [record.unit.model.removeprefix(begin) for record in known]
+    models = [record.unit.model.removeprefix(begin) for record in with_categories]
     names = [cut(name, width - sum(map(len, heads)) - 2 * len(heads) - 2) for name in models]
     first = max(map(len, (OF_MAP, *names)))
     for name, row in ((OF_MAP, heads), *zip(names, rows, strict=True)):

@@ -79,8 +79,8 @@ def screen(
     if any(record.video_measures is not None for record in records):
         yield f"  VC and TC as published: semstab-bench show {out or 'RUN'} video_measures"
     for text in list(warnings(result))[:MOST_WARNINGS]:
-        named = text.replace("show RUN", f"show {out or 'RUN'}")
-        yield from wrapped(f"warning: {named}")
+        with_folder = text.replace("show RUN", f"show {out or 'RUN'}")
+        yield from wrapped(f"warning: {with_folder}")
     if result.benchmark:
         yield f"  benchmark {result.benchmark}"
     yield from _checks(result)
@@ -106,16 +106,16 @@ def _check(pair: tuple[str, str], rows: Sequence[Agreement]) -> str:
     share = f", {one_in(rows)}" if one_in(rows) else ""
     if not voxels and not bad:
         return f"fusion by {checked} was not compared with {reference}: the random sample{share} has no voxel"
-    drawn = f" of a random sample ({one_in(rows)})" if share else ""
+    of_sample = f" of a random sample ({one_in(rows)})" if share else ""
     if not bad and is_builtin(checked):
-        return f"fusion by {checked} equals {reference} in {'' if share else 'all '}{voxels:,} voxels{drawn}"
+        return f"fusion by {checked} equals {reference} in {'' if share else 'all '}{voxels:,} voxels{of_sample}"
     if not bad and not share:
         return f"fusion by {checked} equals {reference} in all {voxels:,} voxels"
     if not bad:
         most = f"{100 * largest_share(voxels):.2g}".removeprefix("0")
         return (
-            f"fusion by {checked} equals {reference} in {voxels:,} voxels{drawn}; with {CONFIDENCE:.0%} confidence at"
-            f" most {most} % of all voxels differ"
+            f"fusion by {checked} equals {reference} in {voxels:,} voxels{of_sample}; with {CONFIDENCE:.0%} confidence"
+            f" at most {most} % of all voxels differ"
         )
     row = bad[0]
     only = f"; {sum(row.only_in):,} voxels in one only" if any(row.only_in) else ""
@@ -154,4 +154,4 @@ def _speeds(result: Result) -> str:
         milliseconds = record.summary.stages_ms.get("network", math.nan)
         if milliseconds > 0:
             took.setdefault(record.unit.model, []).append(milliseconds)
-    return ", ".join(f"{model} {1e3 / macro_mean(each):.3g} frames/s" for model, each in took.items())
+    return ", ".join(f"{model} {1e3 / macro_mean(times):.3g} frames/s" for model, times in took.items())

@@ -24,10 +24,12 @@ def videos(result: Result, records: Sequence[Record], width: int) -> Iterator[st
     """Yield the videos, the answer, a row for each model over all videos, and the frames that stand out."""
     frames = sorted({record.summary.frames for record in records})
     counts = f"{frames[0]} to {frames[-1]}" if len(frames) > 1 else f"{frames[0]}"
-    sizes = " and ".join(dict.fromkeys(f"{w}x{h}" for w, h in (each.pixels.size for each in records if each.pixels)))
+    sizes = " and ".join(
+        dict.fromkeys(f"{w}x{h}" for w, h in (record.pixels.size for record in records if record.pixels))
+    )
     classes = " and ".join(map(str, sorted({record.summary.table.K for record in records})))
-    named = result.scenes[0] if len(result.scenes) == 1 else f"{len(result.scenes)} videos"
-    yield f"{named}    {counts} frames of {sizes}, {classes} classes    no depth, no poses"
+    listed = result.scenes[0] if len(result.scenes) == 1 else f"{len(result.scenes)} videos"
+    yield f"{listed}    {counts} frames of {sizes}, {classes} classes    no depth, no poses"
     yield ""
     for text in answers(result):
         yield from wrapped(text)
