@@ -214,13 +214,19 @@ def _of_file(path: str | Path | None) -> dict[str, Any]:
 
 
 def _over(content: Mapping[str, Any], overrides: Mapping[str, Any]) -> dict[str, Any]:
-    """Return overrides on top of a file, short forms written out; no `scene_frames` at all clear those of the file."""
+    """Return overrides on top of a file, short forms written out.
+
+    Empty `scene_frames` clear the file's. Another dataset than the file's has none of the options in the file.
+    """
     long = [dict(content), dict(overrides)]
     for settings in long:
         if isinstance(dataset := settings.get("dataset"), str):
             settings["dataset"] = {"name": dataset}
         if "frames" in settings:
             settings["frames"] = in_full(settings["frames"])
+    below, above = (settings.get("dataset") for settings in long)
+    if isinstance(below, Mapping) and isinstance(above, Mapping) and above.get("name") not in (None, below.get("name")):
+        long[0]["dataset"] = {key: value for key, value in below.items() if key != "options"}
     return merge(*long) | ({"scene_frames": {}} if overrides.get("scene_frames") == {} else {})
 
 

@@ -6,7 +6,7 @@ import pytest
 
 import semstab
 from semstab.config import BackendConfig, Config, FrameSelection, merge, read_yaml
-from semstab.configure import load_config, resolve
+from semstab.configure import load_config, load_study, resolve
 from semstab.errors import ConfigError
 
 
@@ -103,6 +103,14 @@ def test_city_is_fused_in_the_papers_taxonomy_unless_told_otherwise(tmp_path) ->
     assert load_config(overrides={"dataset": {"name": "posed_folder"}}).taxonomy is None
     (tmp_path / "c.yaml").write_text("taxonomy: null\n")
     assert load_config(tmp_path / "c.yaml").taxonomy is None
+
+
+def test_another_dataset_has_no_options_of_the_files_dataset(tmp_path) -> None:
+    file = tmp_path / "study.yaml"
+    file.write_text("dataset: {name: city, options: {frames: 40}}\nscenes: [scene0]\n")
+    other = load_study(file, {"dataset": {"name": "posed_folder", "options": {"root": "flight"}}})
+    assert other.dataset.options == {"root": "flight"}
+    assert load_study(file, {"dataset": {"options": {"width": 160}}}).dataset.options == {"frames": 40, "width": 160}
 
 
 def test_resolving_fills_in_the_datasets_own_defaults_and_absolute_paths(tmp_path, monkeypatch) -> None:
