@@ -542,9 +542,7 @@ def _parts(sums: Any) -> tuple[Any, ...]:
     return sums, *sums.answers
 
 
-def judged(
-    referee: Referee, file: Path, *, fields: bool = True, one_in: int = 1
-) -> Iterator[tuple[str, str, str]]:
+def judged(referee: Referee, file: Path, *, fields: bool = True, one_in: int = 1) -> Iterator[tuple[str, str, str]]:
     """Yield the kind of each forgery of a result, what it does, and what becomes of it; `fields`: also single ones."""
     before, honest = referee.ranks(), Parts.of(file)
     with tempfile.TemporaryDirectory() as folder:
