@@ -14,6 +14,9 @@ from typer.testing import CliRunner
 
 from semstab.cli import _Once, app
 
+FOLDERS = ("room", "wall")
+"""Datasets that tests give as first word, which is short for `run --data`."""
+
 COMMAND = str(Path(sys.executable).with_name("semstab-bench"))
 
 
@@ -27,7 +30,8 @@ def command(words: Sequence[object], report: bool = False, recording: bool = Fal
     Runs and studies draw and record nothing unless a test looks: most of their time.
     """
     said = {*map(str, words)}
-    fuses = bool(words) and (str(words[0]) in ("run", "study") or str(words[0]).startswith("-"))
+    first = str(words[0]).replace("-", "_") if words else ""
+    fuses = first in ("run", "study") or first[:1] == "_" or Path(first).name in FOLDERS
     fuses = fuses and not {"--help", "--version"} & said
     off = [name for name, wanted in (("--report", report), ("--rerun", recording)) if not wanted and name not in said]
     return [COMMAND, *map(str, words), *(word for name in off if fuses for word in (name, "off"))]

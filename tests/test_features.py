@@ -355,7 +355,6 @@ def test_a_folder_has_features_with_and_without_labels(tmp_path):
     assert not net.features.alone
     assert clip.features.alone
     assert net.headline.alpha.value > 0.5
-    bench("room", "--voxel-size", "0.2", "-o", "plain", "--model", "net", cwd=tmp_path)
     alone = bench("room", "--voxel-size", "0.2", "-o", "alone", "--model", "clip", cwd=tmp_path).stdout
     assert "FEATURES    alpha" in alone
     assert "VSS, SBD, entropy, flicker, classes and a verdict have no number" in " ".join(alone.split())

@@ -160,7 +160,7 @@ def home(tmp_path_factory):
         labels = np.where(flips, other[truth], truth).astype(np.uint8)
         seen.append(semstab.Frame(i, depth, semstab.Intrinsics(96, 96, 48, 36), T, labels=labels))
     write_posed(base / "wall", [f"{i:04d}" for i in range(16)], {"net": seen}, classes=CLASSES, up_axis="-y")
-    bench("wall", "--voxel-size", "0.1", "-o", "run", cwd=base)
+    bench("wall", "--voxel-size", "0.1", "-o", "run", cwd=base, report=True)
     return base
 
 

@@ -162,25 +162,30 @@ def test_a_table_that_lacks_something_is_one_line(tmp_path, text, words):
 # --- The command line -------------------------------------------------------------------------------------------------
 
 
+OPTIONS = (
+    "--voxel-size", "0.1", "--taxonomy", "small.yaml", "--check", "none", "--no-geometry-check", "-o", "run",
+)  # fmt: skip
+
+
 @pytest.fixture(scope="module")
 def home(tmp_path_factory):
     """A wall; the model `net` takes cars for trucks, `worse` takes as many for trees."""
     base, rng = tmp_path_factory.mktemp("meaning"), np.random.default_rng(0)
     sources = {"net": [], "worse": []}
     for i in range(16):
-        truth = np.tile(((np.arange(96) + 12 * i) // 20 % 3).astype(np.uint8), (72, 1))
-        flips = (rng.random((9, 12)) < 0.3).repeat(8, axis=0).repeat(8, axis=1)
+        truth = np.tile(((np.arange(48) + 6 * i) // 10 % 3).astype(np.uint8), (36, 1))
+        flips = (rng.random((9, 12)) < 0.3).repeat(4, axis=0).repeat(4, axis=1)
         T = np.eye(4)
         T[:3, 3] = [0.25 * i + 0.01, 0.01, 0.01]
         depth = np.full(truth.shape, 2, np.float32)
         for name, other in (("net", [1, 0, 2]), ("worse", [2, 1, 0])):
             labels = np.where(flips, np.array(other)[truth], truth).astype(np.uint8)
-            camera = semstab.Intrinsics(96, 96, 48, 36)
+            camera = semstab.Intrinsics(48, 48, 24, 18)
             sources[name].append(semstab.Frame(i, depth, camera, T, labels=labels))
     names = [f"{i:04d}" for i in range(16)]
     write_posed(base / "wall", names, sources, classes=[*SPACE.classes], up_axis="-y")
     SPACE.save(base / "small.yaml")
-    bench("wall", "--voxel-size", "0.1", "--taxonomy", "small.yaml", "-o", "run", cwd=base)
+    bench("wall", *OPTIONS, cwd=base)
     return base
 
 
@@ -209,10 +214,7 @@ def test_distances_that_do_not_fit_end_a_run_before_it_begins(home):
 def test_other_distances_are_measured_anew(home):
     """A run whose distances changed is no run to go on with."""
     np.save(home / "d.npy", np.array([[0, 1, 0.1], [1, 0, 1], [0.1, 1, 0]]))
-    bench(
-        "wall", "--voxel-size", "0.1", "--taxonomy", "small.yaml", "--distances", "d.npy", "-o", "run", "--overwrite",
-        cwd=home,
-    )  # fmt: skip
+    bench("wall", *OPTIONS, "--distances", "d.npy", "--overwrite", cwd=home)
     numbers = {record.unit.model: record.statistics for record in semstab.load_result(home / "run").select()}
     assert numbers["worse"].spots.meaning.near == 1.0
     assert numbers["worse"].spots.meaning.alpha.value > numbers["net"].spots.meaning.alpha.value

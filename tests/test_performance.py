@@ -10,12 +10,17 @@ import logging
 import os
 import subprocess
 import sys
+import time
 from pathlib import Path
 from typing import Literal
 
 import bench
 import cases
+import measuring
 import pytest
+from command_line import bench as bench_command
+
+from semstab.core.process import resident_bytes
 
 ROOT = Path(__file__).parents[1]
 
@@ -37,9 +42,20 @@ SMALL = {
 }  # fmt: skip
 
 
+def run_here(*words: object, **variables: str) -> measuring.Process:
+    """Run `python -m semstab` with these words in this process."""
+    assert words[:2] == ("-m", "semstab")
+    started, cpu = time.perf_counter(), time.process_time()
+    bench_command(*words[2:], cwd=Path(), recording=True, **variables)
+    return measuring.Process(time.perf_counter() - started, time.process_time() - cpu, resident_bytes() / 1e9)
+
+
 @pytest.mark.parametrize("name", SMALL)
 def test_a_case_prints_its_table_and_writes_it(name, tmp_path, capsys, monkeypatch) -> None:
     text, words, *more = SMALL[name]
+    monkeypatch.setattr("timed.tiles.SIZE", (160, 120))
+    if name == "recording":  # four runs; those of other cases are processes
+        monkeypatch.setattr("measuring.python", run_here)
     file = tmp_path / "figures.json"
     called([name, *words.split(), *more, "--json", str(file)], tmp_path, monkeypatch)
     assert text in capsys.readouterr().out

@@ -6,6 +6,7 @@ The conformance data find them as `conform` reads a program's table, and as the 
 from __future__ import annotations
 
 import dataclasses
+import functools
 import math
 import re
 import sys
@@ -471,8 +472,30 @@ class LastFrameIsTheLastFused(Mutant):
 # --- The tests --------------------------------------------------------------------------------------------------------
 
 
+@functools.cache
+def fused(mutant, case):
+    """The frames of a case, fused."""
+    voxel_size, num_classes, frames = read_case(case_folder(case))
+    backend = mutant(voxel_size, num_classes)
+    for frame in frames:
+        backend.integrate(frame)
+    return backend
+
+
+@functools.cache
+def table_of(mutant, case):
+    """The table of a case's frames; what changes only the table has the log of the reference, or the expected table."""
+    if case in LONG:
+        return mutant(1.0, 3).finished(expected_table(case))
+    if any(getattr(mutant, step) is not getattr(Mutant, step) for step in ("read", "points", "index", "observed")):
+        return fused(mutant, case).table()
+    backend = mutant(*(getattr(fused(Mutant, case), name) for name in ("voxel_size", "num_classes")))
+    vars(backend).update(vars(fused(Mutant, case)))
+    return backend.table()
+
+
 def suite(mutant):
-    """The pytest class for a backend; in long cases, what changes only the table is put over the expected one."""
+    """The pytest class for a backend."""
 
     class Suite(BackendConformance):
         long_cases = True
@@ -481,27 +504,31 @@ def suite(mutant):
             return mutant(voxel_size, num_classes)
 
         def fuse_case(self, case):
-            return mutant(1.0, 3).finished(expected_table(case)) if case in LONG else super().fuse_case(case)
+            return table_of(mutant, case)
 
     return Suite()
 
 
 FIRST = {param.values[1]: param for param in reversed(MUTANTS)}
+ONCE = [FIRST[case] for case in ("frames_65536", "voxels_65536")]
+"""Found by the data alone: these cases are large, and another mutant of each is found by the suite."""
 
 
 @pytest.mark.parametrize(("mutant", "case"), FIRST.values())
 def test_a_subtle_defect_is_found_by_the_data(mutant, case, tmp_path):
-    write_rows(tmp_path / "table.csv", suite(mutant).fuse_case(case))
+    write_rows(tmp_path / "table.csv", table_of(mutant, case))
     assert "voxel" in compared(case_folder(case), tmp_path / "table.csv")
 
 
-@pytest.mark.parametrize(("mutant", "case"), MUTANTS)
-def test_a_subtle_defect_is_found_by_the_suite(mutant, case):
+@pytest.mark.parametrize(("mutant", "case"), [param for param in MUTANTS if param not in ONCE])
+def test_a_subtle_defect_is_found_by_the_suite(mutant, case, monkeypatch):
+    if case.startswith(("frames_", "voxels_", "pixels_")):  # large: their likely causes are tried by the data above
+        monkeypatch.setattr("semstab.testing.cases.likely_cause", lambda *_: "")
     with pytest.raises(AssertionError, match=r"the voxel \(.*\) (is .*, expected|is missing|should not be there)"):
         suite(mutant).test_case(case)
 
 
-@pytest.mark.parametrize("case", sorted({param.values[1] for param in MUTANTS}))
+@pytest.mark.parametrize("case", sorted({param.values[1] for param in MUTANTS} - {*LONG}))
 def test_without_a_defect_the_data_are_passed(case):
     suite(Mutant).test_case(case)
 

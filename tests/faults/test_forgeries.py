@@ -10,16 +10,14 @@ import pytest
 RESULTS = Path(__file__).parents[2] / "results"
 
 
-@pytest.mark.parametrize(("named", "model"), [
-    ("livingroom@1", "espnetv2-1.0"), ("livingroom@1", "dicenet-0.2"),
-    ("city@1", "trick-world-locked"), ("apc_shelf@1", "fcn-scores"),
+@pytest.mark.parametrize(("named", "model", "one_in"), [
+    ("livingroom@1", "espnetv2-1.0", 1), ("livingroom@1", "dicenet-0.2", 6),
+    ("city@1", "trick-world-locked", 6), ("apc_shelf@1", "fcn-scores", 6),
 ])  # fmt: skip
-def test_no_forgery_changes_a_rank(named, model) -> None:
+def test_no_forgery_changes_a_rank(named, model, one_in) -> None:
     referee = forgeries.Referee.of(RESULTS, named)
-    outcomes = [
-        (what, outcome)
-        for _, what, outcome in forgeries.judged(referee, RESULTS / f"{named}__{model}.semstab", fields=False)
-    ]
-    assert len(outcomes) >= 100
+    file = RESULTS / f"{named}__{model}.semstab"
+    outcomes = [(what, outcome) for _, what, outcome in forgeries.judged(referee, file, fields=False, one_in=one_in)]
+    assert len(outcomes) >= 100 // one_in
     assert [each for each in outcomes if each[1] not in ("refused", "no rank changes")] == []
     assert sum(outcome == "refused" for _, outcome in outcomes) > len(outcomes) / 2
