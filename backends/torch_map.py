@@ -34,8 +34,8 @@ from semstab.backends.torch_storage import (
     Columns,
     DepthView,
     Image,
-    Labels,
     MapGrid,
+    PixelLabels,
     Scores,
     Storage,
     TensorPrediction,
@@ -137,7 +137,9 @@ class TorchMaps:
 
     @torch.no_grad()
     @torch.inference_mode(False)
-    def fuse(self, view: DepthView, predicted: Mapping[str, Labels | Scores], started: float) -> dict[str, FrameReport]:
+    def fuse(
+        self, view: DepthView, predicted: Mapping[str, PixelLabels | Scores], started: float
+    ) -> dict[str, FrameReport]:
         """Fuse a view that is on the device, with predictions of some models; timed from `started`."""
         grid = self._grid or self._first_grid(view)
         association = associate(view, grid)
@@ -193,10 +195,10 @@ class TorchMaps:
         return self.storage.columns[name]
 
     def _evidence(
-        self, association: Association, predicted: Labels | Scores, name: str, view: DepthView
+        self, association: Association, predicted: PixelLabels | Scores, name: str, view: DepthView
     ) -> ViewEvidence:
         K = self.storage.columns[name].num_classes
-        if isinstance(predicted, Labels):
+        if isinstance(predicted, PixelLabels):
             return count_labels(association, predicted, K)
         if len(predicted.values) != K:
             kind = "logits" if predicted.softmax else "scores"
@@ -330,7 +332,9 @@ class TorchMap(FusionBackend):
         points = None if frame.points is None else on_device(frame.points, self.device)
         view = DepthView(on_device(frame.depth, self.device), frame, points)
         if frame.labels is not None:
-            prediction: Labels | Scores = Labels(on_device(frame.labels, self.device).reshape(-1), frame.ignore_id)
+            prediction: PixelLabels | Scores = PixelLabels(
+                on_device(frame.labels, self.device).reshape(-1), frame.ignore_id
+            )
         else:
             scores = on_device(cast(Image, frame.scores), self.device)
             prediction = Scores(scores.reshape(-1, scores.shape[2]).T, softmax=False)

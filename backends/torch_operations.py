@@ -17,7 +17,7 @@ import torch
 
 from semstab.backends.shared.keys import HALF
 from semstab.backends.shared.observations import Change
-from semstab.backends.torch_storage import Columns, DepthView, Labels, MapGrid, Scores
+from semstab.backends.torch_storage import Columns, DepthView, MapGrid, PixelLabels, Scores
 from semstab.data.measures import RECURRENT
 
 NONE, LOST = -1, -2
@@ -155,7 +155,7 @@ def _uploaded(terms: list[npt.NDArray[Any]], dtype: torch.dtype, device: torch.d
 # --- Evidence ---------------------------------------------------------------------------------------------------------
 
 
-def count_labels(seen: Association, predicted: Labels, num_classes: int) -> ViewEvidence:
+def count_labels(seen: Association, predicted: PixelLabels, num_classes: int) -> ViewEvidence:
     """Return pixels of each class in each voxel."""
     n, K, voxels = len(seen.keys), num_classes, seen.voxel.reshape(-1)
     sums = voxels.new_zeros(K * n)

@@ -315,7 +315,7 @@ class DepthView:
 
 
 @dataclass(frozen=True, eq=False)
-class Labels:
+class PixelLabels:
     """Class ids of a view's P pixels: (P,) integers; `ignore` is one of them that means none, as all below 0 do."""
 
     ids: torch.Tensor
@@ -330,7 +330,7 @@ class Scores:
     softmax: bool
 
 
-def evidence_of(prediction: TensorPrediction, view: DepthView, num_classes: int, where: str) -> Labels | Scores:
+def evidence_of(prediction: TensorPrediction, view: DepthView, num_classes: int, where: str) -> PixelLabels | Scores:
     """Return the prediction of a model for the view's pixels, on the view's device; `where` is its name in errors.
 
     Raises:
@@ -349,7 +349,7 @@ def evidence_of(prediction: TensorPrediction, view: DepthView, num_classes: int,
         (H, W), (h, w) = view.depth.shape, image.shape[-2:]
         raise DataError(f"{where}: {kind} are {w}x{h} but depth is {W}x{H}; bring them to one size")
     if kind == "labels":
-        return Labels(image.reshape(-1), _ignored_id(image.dtype, num_classes))
+        return PixelLabels(image.reshape(-1), _ignored_id(image.dtype, num_classes))
     return Scores(image.reshape(len(image), -1), softmax=kind == "logits")
 
 

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from semstab.comparison.differences import ComparisonData, Progress, find
-from semstab.comparison.locations import Changes
+from semstab.comparison.locations import VoxelChanges
 from semstab.comparison.quantities import HEADLINES, IOU, by_name
 from semstab.config.groups import ScopeOption, validated
 from semstab.core.files import TEMPORARY, FolderLock, keep_only, read_json, write_json, write_text
@@ -79,7 +79,7 @@ def charts(comparison: RunComparison) -> dict[str, list[dict[str, str]]]:
     }
 
 
-def _changed(comparison: ComparisonData) -> Iterator[tuple[SceneComparison, Against, Changes]]:
+def _changed(comparison: ComparisonData) -> Iterator[tuple[SceneComparison, Against, VoxelChanges]]:
     """Yield the scenes and runs with known changes in each voxel."""
     for scene in comparison.result.scenes:
         for against in scene.against:
@@ -87,7 +87,7 @@ def _changed(comparison: ComparisonData) -> Iterator[tuple[SceneComparison, Agai
                 yield scene, against, changes
 
 
-def _shown(comparison: ComparisonData) -> Iterator[tuple[SceneComparison, Against, Changes]]:
+def _shown(comparison: ComparisonData) -> Iterator[tuple[SceneComparison, Against, VoxelChanges]]:
     """Yield the same without those of which no voxel can be shown, as no two frames see one place in both runs."""
     return (changed for changed in _changed(comparison) if len(changed[2].shown.table))
 
@@ -108,7 +108,7 @@ def maps(comparison: ComparisonData, known: Mapping[str, Georeference] = Mapping
 
 
 def _draw(
-    changes: Changes,
+    changes: VoxelChanges,
     up: tuple[float, float, float],
     scene: str,
     against: Against,
@@ -313,7 +313,7 @@ def _described(comparison: ComparisonData, result: RunComparison) -> list[dict[s
     return listed
 
 
-def _points(area: Area, changes: Changes) -> Float64:
+def _points(area: Area, changes: VoxelChanges) -> Float64:
     """Return the centres (n, 3) of an area's voxels, in the scene's coordinates."""
     number = changes.area if area.what == "agreement" else changes.wrong_area
     return np.zeros((0, 3)) if number is None else changes.shown.table.centers[number == area.number]

@@ -331,7 +331,7 @@ def convert_scene(scene: Scene, config: Config, path: Path, depth_error: float, 
     folders = [folder_name(name) for name in models]
     if repeated := [name for name in models if folders.count(folder_name(name)) > 1]:
         raise ConfigError(f"{scene.name}: {' and '.join(repeated)} would get the same folder; choose with --model")
-    work = _Work(scene, indices, models, folder, progress)
+    work = _Conversion(scene, indices, models, folder, progress)
     settings: dict[str, Any] = {"pose_convention": "camera_to_world", "camera_axes": "opencv"}
     if up := _up_axis(scene):
         settings["up_axis"] = up
@@ -358,7 +358,7 @@ def convert_scene(scene: Scene, config: Config, path: Path, depth_error: float, 
 
 
 @dataclass
-class _Work:
+class _Conversion:
     """The frames of a scene that go into a folder, by label source."""
 
     scene: Scene

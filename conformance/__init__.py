@@ -65,7 +65,7 @@ OF_SCANS = ("scan", "scan_scores", "scan_faces", "scan_utm", "scans_and_images")
 
 
 @dataclass(frozen=True)
-class Verdict:
+class CaseResult:
     """The result of a case: `problem` is the first difference of the program's table from the expected table, or ''.
 
     `left_out` names the parts of the case that the program was declared not to take: then the case was not run.
@@ -123,7 +123,7 @@ def conform(
     *,
     scans: bool = True,
     scores: bool = True,
-) -> Iterator[Verdict]:
+) -> Iterator[CaseResult]:
     """Run `command CASE OUT` for each case, or for some, and compare what it wrote to OUT with what is expected.
 
     The command may be a backend's FILE.py:NAME. A program with the same failure in the first three cases is not started
@@ -149,7 +149,7 @@ def conform(
     for name in names:
         folder = case_folder(name)
         if lacking := [word for word in needs(folder) if not {"scans": scans, "scores": scores}[word]]:
-            yield Verdict(name, left_out=" and ".join(lacking))
+            yield CaseResult(name, left_out=" and ".join(lacking))
             continue
         with ScratchFolder() as temporary:
             out = temporary / "table.csv"
@@ -158,7 +158,7 @@ def conform(
         failures.append(failed)
         if failed and failures == [failed] * ALIKE:
             raise ConfigError(f"{command}: {failed}, in each of the first {ALIKE} cases (PROGRAM CASE OUT)")
-        yield Verdict(name, problem)
+        yield CaseResult(name, problem)
 
 
 def needs(folder: Path) -> list[str]:

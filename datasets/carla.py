@@ -20,7 +20,7 @@ from semstab.core.types import Float32, Float64
 from semstab.data.frames import Intrinsics
 from semstab.data.labels import LabelSpace
 from semstab.datasets.files import options as opt
-from semstab.datasets.files.options import FileOptions, FrameSource, Truth
+from semstab.datasets.files.options import FileOptions, FrameSource, TruthSource
 from semstab.datasets.files.reader import FileDataset, frames_of, images_named
 from semstab.datasets.files.scans import rigid_inverse
 from semstab.datasets.formats.disk import files_named, matrix_of, read_table
@@ -81,11 +81,11 @@ class Carla(FileDataset[CarlaOptions]):
         truth = f"images_ss/{{name}}_{10 + self.options.camera}.png" if kitti else "semantic/{name}.png"
         return self.options.model_copy(update={"ground_truth": self.options.ground_truth or truth})
 
-    def truth(self, folder: Path) -> Truth:
+    def truth(self, folder: Path) -> TruthSource:
         """Return how tags are read, and what they mean."""
         usual = "carla23" if (folder / LIDAR_POSES).is_file() else "carla"
         space = LabelSpace.load(self.options.tags or usual)
-        return Truth(partial(read_tags, space=space), space=space)
+        return TruthSource(partial(read_tags, space=space), space=space)
 
     def frames(self, folder: Path) -> Iterator[FrameSource]:
         """Yield a frame for each depth image.

@@ -18,7 +18,7 @@ from semstab.data.frames import Intrinsics
 from semstab.data.labels import IGNORE_8BIT, IGNORE_16BIT, LabelSpace
 from semstab.datasets.files import options as opt
 from semstab.datasets.files.labels import NO_ID
-from semstab.datasets.files.options import FileOptions, FrameSource, Truth
+from semstab.datasets.files.options import FileOptions, FrameSource, TruthSource
 from semstab.datasets.files.reader import FileDataset, frames_of, images_named
 from semstab.datasets.formats.disk import read_object, read_table
 from semstab.datasets.formats.images import Read, depth_size, read_labels
@@ -77,12 +77,12 @@ class Habitat(FileDataset[HabitatOptions]):
         W, H = size
         return Camera.stated((W / 2, W / 2, (W - 1) / 2, (H - 1) / 2), size, str(folder / "depth"))
 
-    def truth(self, folder: Path) -> Truth:
+    def truth(self, folder: Path) -> TruthSource:
         """Return how instances become classes; raises DataError for a damaged table."""
         near = (folder / INFO, folder / "habitat" / INFO, folder.parent / INFO, folder.parent / "habitat" / INFO)
         path = self.options.semantic_info or next((path for path in near if path.is_file()), None)
         if path is None:
-            return Truth(read=_without_table)
+            return TruthSource(read=_without_table)
         ids, space = read_info(path)
         most = int(np.flatnonzero(ids[:IGNORE_16BIT] != NO_ID).max(initial=0))
 
@@ -95,7 +95,7 @@ class Habitat(FileDataset[HabitatOptions]):
                 )
             return stored
 
-        return Truth(instances, ids, space)
+        return TruthSource(instances, ids, space)
 
 
 def _without_table(_: FrameSource, file: Path, __: Read) -> Labels:

@@ -18,7 +18,7 @@ from semstab.core.types import Float32, Float64
 from semstab.data.frames import Intrinsics
 from semstab.data.labels import IGNORE_16BIT, LabelSpace
 from semstab.datasets.files import options as opt
-from semstab.datasets.files.options import FileOptions, FrameSource, Truth
+from semstab.datasets.files.options import FileOptions, FrameSource, TruthSource
 from semstab.datasets.files.reader import FileDataset, frames_of
 from semstab.datasets.formats.disk import files_named, read_text, subfolders
 from semstab.datasets.formats.hdf5 import numbers, opened
@@ -67,9 +67,9 @@ class Hypersim(FileDataset[HypersimOptions]):
         truth = self.options.ground_truth or truth
         return self.options.model_copy(update={"ground_truth": truth, "metres_per_unit": unit})
 
-    def truth(self, folder: Path) -> Truth:
+    def truth(self, folder: Path) -> TruthSource:
         """Return how classes are read."""
-        return Truth(read=_classes, space=LabelSpace.load("nyu40"))
+        return TruthSource(read=_classes, space=LabelSpace.load("nyu40"))
 
     def frames(self, folder: Path) -> Iterator[FrameSource]:
         """Yield a frame for each depth map, whose number is that of its pose.

@@ -20,7 +20,7 @@ from semstab.data.labels import LabelSpace
 from semstab.datasets import GROUND_TRUTH
 from semstab.datasets.files import options as opt
 from semstab.datasets.files.labels import SceneEntry
-from semstab.datasets.files.options import FileOptions, Folders, FrameSource, Truth
+from semstab.datasets.files.options import FileOptions, Folders, FrameSource, TruthSource
 from semstab.datasets.files.reader import FileDataset, find_scenes, images_named
 from semstab.datasets.files.scans import rigid_inverse
 from semstab.datasets.formats.disk import matrix_of, pinhole, records, to_number
@@ -72,9 +72,9 @@ class Kitti360Images(FileDataset[Kitti360ImagesOptions]):
             changes["labels"] = f"{RAW}/{{scene}}/labels/{{model}}/{{name}}"
         return self.options.model_copy(update=changes)
 
-    def truth(self, folder: Path) -> Truth:
+    def truth(self, folder: Path) -> TruthSource:
         """Return the classes of the ground truth."""
-        return Truth(space=LabelSpace.load("kitti360"))
+        return TruthSource(space=LabelSpace.load("kitti360"))
 
     def frames_of_scene(self, entry: SceneEntry) -> Iterable[FrameSource]:
         """Return the frames of the drive that the scene is called after. Raises what `frames` raises."""

@@ -16,7 +16,7 @@ from semstab.core.types import UInt16
 from semstab.data.labels import IGNORE_16BIT
 from semstab.datasets.files import options as opt
 from semstab.datasets.files.labels import NO_ID
-from semstab.datasets.files.options import FileOptions, FrameSource, Truth
+from semstab.datasets.files.options import FileOptions, FrameSource, TruthSource
 from semstab.datasets.files.reader import FileDataset, frames_of
 from semstab.datasets.formats.disk import MAX_TABLE_BYTES, files_named, read_intrinsics, read_text
 from semstab.datasets.geometry.cameras import Camera
@@ -59,10 +59,10 @@ class ScanNet(FileDataset[ScanNetOptions]):
         depth = self.depth_files(folder / "depth", "", ".png", instead=files_named(folder / "pose", "", ".txt"))
         return frames_of(folder, depth, camera, pose="pose/{name}.txt", color="color/{name}", label_camera=label_camera)
 
-    def truth(self, folder: Path) -> Truth:
+    def truth(self, folder: Path) -> TruthSource:
         """Return the ground truth with ids of the class table's column, or with its own ids without a table."""
         table = self.options.class_table
-        return Truth(ids=None if table is None else read_class_table(table, self.options.class_column))
+        return TruthSource(ids=None if table is None else read_class_table(table, self.options.class_column))
 
     def _camera(self, folder: Path, which: Which) -> Camera:
         size = self.options.color_size if which == "color" else None

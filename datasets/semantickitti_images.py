@@ -17,14 +17,14 @@ from semstab.core.types import Float32, Float64
 from semstab.data.frames import Intrinsics
 from semstab.data.labels import IGNORE_16BIT, LabelSpace
 from semstab.datasets.files import options as opt
-from semstab.datasets.files.options import FileOptions, Folders, FrameSource, Truth
+from semstab.datasets.files.options import FileOptions, Folders, FrameSource, TruthSource
 from semstab.datasets.files.reader import FileDataset
 from semstab.datasets.files.scans import floats_of, ids_of, rigid_inverse
 from semstab.datasets.formats.disk import pinhole, read_matrices
 from semstab.datasets.formats.images import COLOR_SUFFIXES, Read, color_size
 from semstab.datasets.geometry.cameras import Camera
 from semstab.datasets.geometry.lenses import Labels
-from semstab.datasets.geometry.projection import Seen, seen_points
+from semstab.datasets.geometry.projection import SeenPoints, seen_points
 from semstab.datasets.semantickitti import MOVING, benchmark_ids, lidar_to_camera, scans_of
 from semstab.errors import DataError
 
@@ -77,12 +77,12 @@ class SemanticKittiImages(FileDataset[SemanticKittiImagesOptions]):
                 timestamp=scan.timestamp,
             )
 
-    def truth(self, folder: Path) -> Truth:
+    def truth(self, folder: Path) -> TruthSource:
         """Return how the classes of points become those of pixels; raises DataError for a damaged calibration."""
         K, T_cl = _camera(folder, self.options.camera)
         moving = MOVING if self.options.moving == "mask" else ()
         read = partial(_classes, K=K, T_cl=T_cl)
-        return Truth(read, benchmark_ids(), LabelSpace.load("semantickitti"), moving)
+        return TruthSource(read, benchmark_ids(), LabelSpace.load("semantickitti"), moving)
 
 
 def _camera(folder: Path, name: str) -> tuple[Intrinsics, Float64]:
@@ -97,7 +97,7 @@ def _camera(folder: Path, name: str) -> tuple[Intrinsics, Float64]:
     return K, T @ Tr
 
 
-def _seen(path: Path, color: Path, read: Read, K: Intrinsics, T_cl: Float64) -> Seen:
+def _seen(path: Path, color: Path, read: Read, K: Intrinsics, T_cl: Float64) -> SeenPoints:
     if not color.is_file():
         raise DataError(f"{color}: is missing; scan {path.name} is projected onto this image")
     W, H = color_size(color)

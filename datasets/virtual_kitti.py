@@ -17,7 +17,7 @@ from semstab.core.types import Float64
 from semstab.data.frames import Intrinsics
 from semstab.data.labels import LabelSpace
 from semstab.datasets.files import options as opt
-from semstab.datasets.files.options import FileOptions, FrameSource, Truth
+from semstab.datasets.files.options import FileOptions, FrameSource, TruthSource
 from semstab.datasets.files.reader import FileDataset, frames_of, images_named
 from semstab.datasets.formats.disk import read_table
 from semstab.datasets.geometry.cameras import Camera
@@ -55,9 +55,9 @@ class VirtualKitti(FileDataset[VirtualKittiOptions]):
         truth = f"frames/{where}/{self.options.camera}/classgt_{{name}}.png"
         return self.options.model_copy(update={"ground_truth": self.options.ground_truth or truth})
 
-    def truth(self, folder: Path) -> Truth:
+    def truth(self, folder: Path) -> TruthSource:
         """Return the classes of the ground truth."""
-        return Truth(space=LabelSpace.load("virtual_kitti"))
+        return TruthSource(space=LabelSpace.load("virtual_kitti"))
 
     def frames(self, folder: Path) -> Iterator[FrameSource]:
         """Yield a frame for each depth image.

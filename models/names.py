@@ -28,7 +28,7 @@ Leniency = Literal["strict", "lenient"]
 
 
 @dataclass(frozen=True)
-class Vocabulary:
+class ModelClassNames:
     """The names that one family of models has for the classes of UAVid; see configs/models/class_names.yaml.
 
     Attributes:
@@ -57,11 +57,11 @@ class Vocabulary:
 
 
 @functools.cache
-def vocabularies() -> Mapping[str, Vocabulary]:
+def vocabularies() -> Mapping[str, ModelClassNames]:
     """Return the vocabularies that ship, by name."""
     file = importlib.resources.files("semstab.configs") / "models" / "class_names.yaml"
     content = parse_yaml(file.read_text(encoding="utf-8"), file.name)
-    return {name: Vocabulary(**entry) for name, entry in content.items()}
+    return {name: ModelClassNames(**entry) for name, entry in content.items()}
 
 
 def class_mapping(source: LabelSpace, target: LabelSpace, leniency: Leniency = "strict") -> LabelMapping:
@@ -93,7 +93,7 @@ def class_mapping(source: LabelSpace, target: LabelSpace, leniency: Leniency = "
     return LabelMapping(source, target, tuple(rows))
 
 
-def _candidates(name: str, vocabulary: Vocabulary | None, leniency: Leniency) -> Sequence[str]:
+def _candidates(name: str, vocabulary: ModelClassNames | None, leniency: Leniency) -> Sequence[str]:
     """Return the names of a class in the target, the best first."""
     target = None if vocabulary is None else vocabulary.target_of(name, leniency)
     if vocabulary is None or target is not None:

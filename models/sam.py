@@ -285,7 +285,7 @@ class Range(Settings):
         )
 
 
-class Rule(Settings):
+class MaskRule(Settings):
     """A class, and the limits of its masks' features; see configs/models/sam_heuristic.yaml."""
 
     name: str
@@ -305,7 +305,7 @@ class Rules(Settings):
 
     classes: list[str] = Field(min_length=1)
     rest: str
-    rules: list[Rule] = Field(min_length=1)
+    rules: list[MaskRule] = Field(min_length=1)
 
     @model_validator(mode="after")
     def _classes_are_known(self) -> Self:

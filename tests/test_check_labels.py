@@ -12,7 +12,7 @@ from PIL import Image
 from posed_writer import write_posed
 
 from semstab.check.label_ids import id_remarks
-from semstab.check.label_maps import MAPS, Run, Seen
+from semstab.check.label_maps import MAPS, LabelledFrame, LabelRun
 from semstab.check.labels import check_labels
 from semstab.check.reprojection import View
 from semstab.data.labels import LabelSpace
@@ -99,7 +99,7 @@ def test_a_first_class_that_may_be_missing_is_no_remark():
 
 def test_every_hypothesis_has_maps_of_the_shape_of_the_given_ones(frames):
     views = [View.of(frame, 500) for frame in frames[:5]]
-    run = Run([Seen(view, (), view.labels) for view in views])
+    run = LabelRun([LabelledFrame(view, (), view.labels) for view in views])
     assert all(each.applies(run) for each in MAPS)
     others = [(each, each.change(run).maps) for each in MAPS]
     assert {len(maps) for each, maps in others if "frame" not in each.name} == {5}

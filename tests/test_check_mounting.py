@@ -12,7 +12,7 @@ from command_line import bench
 from posed_writer import write_posed
 
 from semstab.check.inspection import Inspection
-from semstab.check.mounting import ALL, ARM, FX, FY, Change, fitted_change, with_mounting
+from semstab.check.mounting import ALL, ARM, FX, FY, MountingChange, fitted_change, with_mounting
 from semstab.check.reprojection import clusters
 from semstab.check.scene_check import CLUSTERS, POINTS
 from semstab.check.verdict import Verdict
@@ -36,7 +36,7 @@ def planted(of, **values):
     change = np.zeros(ALL)
     for name, value in values.items():
         change[{"fx": FX, "fy": FY, "right": 5, "down": 6, "forward": 7}[name]] = value
-    made = Change(change, np.zeros((ALL, ALL)))
+    made = MountingChange(change, np.zeros((ALL, ALL)))
     return of.of({at: made.of(view) for at, view in of.views.items()})
 
 

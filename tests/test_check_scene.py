@@ -21,7 +21,7 @@ from typer.testing import CliRunner
 import semstab
 from semstab.check import check, check_scene, quick_check
 from semstab.check.coverage import SIZES, plane_residuals
-from semstab.check.histogram import Tally
+from semstab.check.histogram import LabelTally
 from semstab.check.reprojection import View
 from semstab.cli import app
 from semstab.configure import load_config, resolve
@@ -163,7 +163,7 @@ def test_frames_are_those_that_are_selected(folder):
 
 
 def tallied(space, *maps):
-    tally = Tally("net")
+    tally = LabelTally("net")
     for labels in maps:
         depth = np.ones(labels.shape[:2], np.float32)
         given = {"scores": labels} if labels.ndim == 3 else {"labels": labels}

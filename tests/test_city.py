@@ -20,8 +20,8 @@ from semstab.datasets.city.hashing import splitmix64
 from semstab.datasets.city.labellers import LABELLERS
 from semstab.datasets.city.mesh import MOVERS, join, surface
 from semstab.datasets.city.options import CONFUSION
-from semstab.datasets.city.rendering import Caster
-from semstab.datasets.city.simulation import Simulation, View
+from semstab.datasets.city.rendering import CityCaster
+from semstab.datasets.city.simulation import CityView, Simulation
 from semstab.datasets.city.things import flats
 from semstab.errors import ConfigError, DataError
 
@@ -62,14 +62,14 @@ def packed(q: np.ndarray) -> np.ndarray:
     return q[:, 0] << 42 | q[:, 1] << 21 | q[:, 2]
 
 
-def view_of(scene: CityScene, index: int, *, as_frame: int | None = None) -> View:
+def view_of(scene: CityScene, index: int, *, as_frame: int | None = None) -> CityView:
     """A frame's view, pretending on request that it was taken as another frame."""
     frame = scene.frame(index, GROUND_TRUTH)
     rendered = scene.rendered[index]
-    return View(index if as_frame is None else as_frame, rendered, frame.intrinsics, frame.T_wc)
+    return CityView(index if as_frame is None else as_frame, rendered, frame.intrinsics, frame.T_wc)
 
 
-def simulated(scene: CityScene, seen: View, **model: Any) -> np.ndarray:
+def simulated(scene: CityScene, seen: CityView, **model: Any) -> np.ndarray:
     return Simulation(SimulatedModel(**model), 0, "test", scene.name).labels(seen)
 
 
@@ -163,7 +163,7 @@ def test_moving_cars_move_and_a_surface_without_triangles_is_never_hit() -> None
         assert within.mean() > 0.9
         assert (step[within] >= slow).all()
         assert (step[within] <= fast).all()
-    nothing = Caster(surface(np.empty((0, 3)), np.empty((0, 3)), 0))
+    nothing = CityCaster(surface(np.empty((0, 3)), np.empty((0, 3)), 0))
     face = nothing.first(np.zeros((2, 3)), np.ones((2, 3)))
     assert (face == -1).all()
     assert np.isinf(nothing.depth(face, np.zeros(3), np.ones((2, 3)))).all()

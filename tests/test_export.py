@@ -30,7 +30,7 @@ from semstab.errors import ConfigError, DataError, MissingDependencyError
 from semstab.exports import export, maps
 from semstab.exports.clouds import codes
 from semstab.exports.maps import seen_from_above
-from semstab.exports.voxels import Column, Voxels
+from semstab.exports.voxels import ExportedVoxels, VoxelColumn
 from semstab.metrics import categories, dominant, vss
 
 CRS, OFFSET = "EPSG:32615", (576714, 5188162, 200)
@@ -144,7 +144,7 @@ def test_the_raster_lies_where_the_voxels_do(fused, table):
 
 def as_voxels(table, columns=(), classes=CLASSES, taxonomy="t", up=(0.0, 0.0, 1.0)):
     colors = np.zeros((table.K, 3), np.uint8)
-    return Voxels(table, dict(columns), tuple(classes), colors, taxonomy, up, None)
+    return ExportedVoxels(table, dict(columns), tuple(classes), colors, taxonomy, up, None)
 
 
 def test_a_cell_of_several_voxels_sums_the_beliefs_of_the_topmost():
@@ -152,7 +152,7 @@ def test_a_cell_of_several_voxels_sums_the_beliefs_of_the_topmost():
     made = voxels_by_hand((1, 3, [3, 0, 0]), (1, 3, [1, 2, 0]), (1, 5, [5, 0, 0]), (1, 5, [1, 0, 4]), r=1.0)
     table = dataclasses.replace(made, ix=np.array([0, 0, 1, 1]), iz=np.array([0, 1, 0, 3]))
     stable = categories(table) == 3
-    bands, west, north = seen_from_above(as_voxels(table, {"op": Column(table.op)}), cell=2)
+    bands, west, north = seen_from_above(as_voxels(table, {"op": VoxelColumn(table.op)}), cell=2)
     value = {name: band.values.item() for name, band in bands.items()}
     assert value["class"] == 3  # 1/3 + 1/5, 2/3, 4/5
     assert value["op"] == 4

@@ -41,7 +41,7 @@ from semstab.recording import (
     record_finished,
     voxel_maps,
 )
-from semstab.recording.drift import DriftLog, View
+from semstab.recording.drift import DriftLog, FrameView
 from semstab.recording.timeline import Clock, entity
 from semstab.task import read as read_frame
 
@@ -338,7 +338,7 @@ def test_the_voxel_that_flickers_comes_first_with_its_top_contributing_frames(tm
 
 def test_a_number_is_drawn_where_it_lies_inside_the_image() -> None:
     T_wc = np.array([[1.0, 0, 0, 5], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]])
-    seen_by = View(None, Intrinsics(100.0, 100.0, 50.0, 40.0), T_wc, (80, 100))
+    seen_by = FrameView(None, Intrinsics(100.0, 100.0, 50.0, 40.0), T_wc, (80, 100))
     pixels, inside = seen_by.project(np.array([[5.0, 0, 2], [5.2, 0.1, 2], [5.0, 0, -2], [5.98, 0, 2], [8, 0, 2]]))
     assert inside.tolist() == [True, True, False, False, False]  # behind, at the edge, outside
     np.testing.assert_allclose(pixels[:2], [[50.5, 40.5], [60.5, 45.5]])

@@ -5,13 +5,13 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from semstab.core.arrays import Rows
+from semstab.core.arrays import GrowingRows
 
 
 @pytest.mark.parametrize("count", [0, 1, 300])
 def test_rows_are_what_went_in(count) -> None:
     expected = np.random.default_rng(0).random((count, 3))
-    rows = Rows(3, expected[:7])
+    rows = GrowingRows(3, expected[:7])
     for row in expected[7:]:
         rows.append(row)
     columns = [rows.column(k) for k in range(3)]

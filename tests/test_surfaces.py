@@ -31,7 +31,7 @@ from semstab.data.frames import Intrinsics
 from semstab.data.georeference import Georeference, wkt
 from semstab.datasets import open_dataset
 from semstab.datasets.files import surfaces
-from semstab.datasets.files.surfaces import Surface, View
+from semstab.datasets.files.surfaces import CameraView, Surface
 from semstab.errors import ConfigError, DataError, MissingDependencyError
 
 pytest.importorskip("laspy")
@@ -39,8 +39,8 @@ pytest.importorskip("laspy")
 PLACED = {"crs": down.UTM, "offset": down.OFFSET}
 
 
-def view(k: int = 0) -> View:
-    return View(down.K, down.pose(k), (down.H, down.W))
+def view(k: int = 0) -> CameraView:
+    return CameraView(down.K, down.pose(k), (down.H, down.W))
 
 
 def placed() -> Georeference:
@@ -85,7 +85,7 @@ def test_far_from_the_origin_depth_is_as_exact(tmp_path) -> None:
     surface = Surface(down.write_mesh(tmp_path / "far.obj", shift=far))
     T = down.pose(1)
     T[:3, 3] += far
-    found = surface.depth(View(down.K, T, (down.H, down.W)))
+    found = surface.depth(CameraView(down.K, T, (down.H, down.W)))
     np.testing.assert_allclose(found, down.plane_depth(down.pose(1)), atol=1e-4)
 
 

@@ -26,7 +26,7 @@ from semstab.data.measures import SBD, VSS
 from semstab.data.records import ImageSpace, RegionFlicker, Result
 from semstab.errors import ConfigError
 from semstab.metrics import entropy, op, sbd, vss
-from semstab.report.means import ENOUGH, Spread, complete_scenes, describe, levels, pooled, swept
+from semstab.report.means import ENOUGH, RepeatSpread, complete_scenes, describe, levels, pooled, swept
 from semstab.report.tables import (
     Column,
     Group,
@@ -259,8 +259,8 @@ def test_the_agreement_says_who_agrees(walls):
     (Column("", "", 4), math.nan, "--"), (Column("", "", 3), -0.0001, "0.000"),
     (Column("", "", 3, signed=True), 0.0021, "+0.002"), (Column("", "", 3, signed=True), -0.0021, "-0.002"),
     (Column("", "", 3, signed=True), 0.0001, "0.000"), (Column("", "", 0, scientific=True), 2.2e-16, "2e-16"),
-    (Column("", "", 0, scientific=True), 0.0, "0"), (Column("", "", 2), Spread(9.81, 0.123, 3), "9.81 ± 0.12"),
-    (Column("", "", 2), Spread(9.81, math.nan, 1), "9.81"), (Column("", ""), "road", "road"),
+    (Column("", "", 0, scientific=True), 0.0, "0"), (Column("", "", 2), RepeatSpread(9.81, 0.123, 3), "9.81 ± 0.12"),
+    (Column("", "", 2), RepeatSpread(9.81, math.nan, 1), "9.81"), (Column("", ""), "road", "road"),
     (Column("", "", 2), Estimate(0.481, 0.326, 0.61), "0.48 (0.33, 0.61)"),
     (Column("", "", 2, signed=True), Estimate(0.02, -0.01, 0.05), "+0.02 (-0.01, +0.05)"),
     (Column("", "", 2), Estimate(0.481, math.nan, math.nan), "0.48"),

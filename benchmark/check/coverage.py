@@ -102,7 +102,7 @@ class Persistence:
 
 
 @dataclass(frozen=True)
-class Noise:
+class DepthNoise:
     """Noise of depth, metres: a point seen again is off by `between`, pixels of one frame by `within`; medians.
 
     Attributes:
@@ -127,7 +127,7 @@ class Suggestion:
 
 
 @dataclass(frozen=True, eq=False)
-class Seen:
+class SharedPoints:
     """Points of one view that another one sees on the same surface.
 
     Attributes:
@@ -185,12 +185,12 @@ class Coverage:
         """Return one row a distance between frames."""
         return [self._overlap(distances, pairs) for distances, pairs in by_distance(self.sample.pairs)]
 
-    def noise(self) -> Noise:
+    def noise(self) -> DepthNoise:
         """Return how far depth is off, between frames and within one."""
         offsets = [surface.offset for surface in self._seen.values()]
         views = self.sample.views.values()
         footprints = [view.depth[view.v, view.u] / view.camera.fx for view in views]
-        return Noise(
+        return DepthNoise(
             between=_median(np.concatenate(offsets)) if offsets else math.nan,
             within=_median(np.concatenate([plane_residuals(view) for view in views])),
             footprint=_median(np.concatenate(footprints)),
@@ -247,12 +247,12 @@ class Coverage:
             agreement=_mean(agree),
         )
 
-    def _same_surface(self, pair: Pair) -> Seen:
+    def _same_surface(self, pair: Pair) -> SharedPoints:
         a, b = self.sample.views[pair[0]], self.sample.views[pair[1]]
         match = self._matches[pair]
         shared = Shared.of(a, match)
         first, second = shared.labels(a.labels, b.labels, a.ignore_id, b.ignore_id)
-        return Seen(
+        return SharedPoints(
             offset=np.abs(match.depth - match.z)[0][shared.chosen],
             first=world_points(a, *shared.first),
             second=world_points(b, *shared.second),
@@ -322,7 +322,7 @@ class Covers(Protocol):
     def overlaps(self) -> list[Overlap]:
         """Return one row a distance between frames."""
 
-    def noise(self) -> Noise:
+    def noise(self) -> DepthNoise:
         """Return how far points are off, between frames and within one."""
 
     def stays(self, voxel_size: float) -> float:

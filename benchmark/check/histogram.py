@@ -36,7 +36,7 @@ class Histogram:
     problem: str | None
 
 
-class Tally:
+class LabelTally:
     """The labels of a model, counted frame by frame."""
 
     def __init__(self, model: str) -> None:

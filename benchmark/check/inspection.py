@@ -13,7 +13,7 @@ from semstab.check.chain import Chain
 from semstab.check.continuity import Neighbours, with_continuity
 from semstab.check.conventions import Reading, reading
 from semstab.check.geometry import assess, with_mistakes
-from semstab.check.histogram import Tally
+from semstab.check.histogram import LabelTally
 from semstab.check.intrinsics import with_intrinsics
 from semstab.check.mounting import with_mounting
 from semstab.check.precision import with_precision
@@ -76,7 +76,7 @@ class Inspection:
         with_color: bool = False,
     ) -> None:
         self.scene, self.indices, self.source = scene, indices, source
-        self.tally = Tally(source or "")
+        self.tally = LabelTally(source or "")
         self.views: dict[int, View] = {}
         self.fused = evenly(len(indices), fused)
         self.chained: tuple[Neighbours, Chain] | None = None

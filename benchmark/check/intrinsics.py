@@ -42,7 +42,7 @@ REFUSED = 0.5
 
 
 @dataclass(frozen=True)
-class Camera:
+class CameraChange:
     """A change of the intrinsics: a factor on the focal lengths, and a shift of the principal point in widths."""
 
     factor: float = 1.0
@@ -66,7 +66,7 @@ class CameraFit:
         error: Median relative depth error under it; present without it.
     """
 
-    camera: Camera
+    camera: CameraChange
     K: Intrinsics
     before: Intrinsics
     error: float
@@ -123,11 +123,11 @@ def find_camera(sample: Sample) -> CameraFit | None:
     errors = functools.cache(
         lambda camera: sample.of({position: camera.of(v) for position, v in sample.views.items()}).by_pair()
     )
-    if len(sample.pairs) < LEAST_PAIRS or not middle(present := errors(Camera())) > MIN_GAIN:
+    if len(sample.pairs) < LEAST_PAIRS or not middle(present := errors(CameraChange())) > MIN_GAIN:
         return None
-    best = _simplest(fitted(Camera(), _moves(), errors), errors)
+    best = _simplest(fitted(CameraChange(), _moves(), errors), errors)
     error = middle(errors(best))
-    if best == Camera() or error > GOOD or not clearly_falls(errors(best), present):
+    if best == CameraChange() or error > GOOD or not clearly_falls(errors(best), present):
         return None
     if min(middle(_scaled(sample, factor)) for factor in SCALES.tolist()) <= SIMPLER * error:
         return None  # a depth that is a little too long or too short explains it as well
@@ -135,7 +135,7 @@ def find_camera(sample: Sample) -> CameraFit | None:
     return CameraFit(best, best.of(first).camera, first.camera, error, middle(present))
 
 
-def _moves() -> Iterator[Callable[[Camera], list[Camera]]]:
+def _moves() -> Iterator[Callable[[CameraChange], list[CameraChange]]]:
     """Yield which focal lengths, then shifts of the principal point, are tried next to the best camera so far."""
     fields = (("factor", FACTORS), ("right", SHIFTS), ("down", SHIFTS))
     for name, values in fields:
@@ -145,17 +145,17 @@ def _moves() -> Iterator[Callable[[Camera], list[Camera]]]:
             yield functools.partial(_others, name, FINE, spread)
 
 
-def _others(name: str, values: Sequence[float], spread: float, best: Camera) -> list[Camera]:
+def _others(name: str, values: Sequence[float], spread: float, best: CameraChange) -> list[CameraChange]:
     """Return cameras with these values of a field; with a spread, `values` are steps from the best camera's value."""
     now = getattr(best, name)
     reach = spread * (FACTOR_NEAR * now if name == "factor" else SHIFT_NEAR)
     return [dataclasses.replace(best, **{name: now + reach * value if spread else value}) for value in values]
 
 
-def _simplest(best: Camera, errors: Callable[[Camera], Float64]) -> Camera:
+def _simplest(best: CameraChange, errors: Callable[[CameraChange], Float64]) -> CameraChange:
     """Return the camera without the changes that hardly matter."""
     for name, least in (("factor", LEAST_FACTOR), ("right", LEAST_SHIFT), ("down", LEAST_SHIFT)):
-        neutral = getattr(Camera(), name)
+        neutral = getattr(CameraChange(), name)
         without = dataclasses.replace(best, **{name: neutral})
         small = abs(getattr(best, name) - neutral) < least
         if small or middle(errors(without)) <= SIMPLER * middle(errors(best)):

@@ -41,7 +41,7 @@ Change = Callable[[Ids, int], Ids]
 
 
 @dataclass(frozen=True, eq=False)
-class Seen:
+class LabelledFrame:
     """A frame with labels, thinned, and the maps of edges that these should lie on: of depth, and of colour if any.
 
     Attributes:
@@ -70,7 +70,7 @@ class Seen:
         return float(np.mean([np.sum(edges * reference) for reference in self.references]))
 
 
-def read(scene: Scene, index: int, model: str) -> Seen:
+def read(scene: Scene, index: int, model: str) -> LabelledFrame:
     """Read a frame with its labels and its colour; raises DataError."""
     frame = scene.frame(index, model, color=False)
     stride = max(1, math.ceil(math.sqrt(math.prod(frame.shape) / PIXELS)))
@@ -85,7 +85,7 @@ def read(scene: Scene, index: int, model: str) -> Seen:
             edges.append(image_edges(grey[::stride, ::stride]))
     except DataError:  # no image of the depth's view
         pass
-    return Seen(view, tuple(_smooth(edge_map) for edge_map in edges if edge_map.any()), frame.predicted)
+    return LabelledFrame(view, tuple(_smooth(edge_map) for edge_map in edges if edge_map.any()), frame.predicted)
 
 
 def _smooth(edges: Mask) -> Float64:
@@ -106,7 +106,7 @@ def _edges(labels: Ids, ignore: int) -> Float64 | None:
     return _smooth(edges) if edges.any() else None
 
 
-def readable(scene: Scene, run: Sequence[int], model: str) -> Iterator[Seen]:
+def readable(scene: Scene, run: Sequence[int], model: str) -> Iterator[LabelledFrame]:
     """Yield frames up to the first that cannot be read."""
     for index in run:
         try:
@@ -146,10 +146,12 @@ def agreements(common: Common, maps: Mapping[int, Ids], ignore: int) -> list[flo
     ]
 
 
-class Run:
+class LabelRun:
     """Frames in a row, and a label map with its edges for those that have one, by their places in the run."""
 
-    def __init__(self, frames: Sequence[Seen], maps: Mapping[int, tuple[Ids, Float64 | None]] | None = None) -> None:
+    def __init__(
+        self, frames: Sequence[LabelledFrame], maps: Mapping[int, tuple[Ids, Float64 | None]] | None = None
+    ) -> None:
         self.frames, self._maps = frames, maps
 
     @functools.cached_property
@@ -169,11 +171,11 @@ class Run:
         return shared_of(views, [*itertools.combinations(views, 2)])
 
     @functools.cached_property
-    def tried(self) -> list[tuple[Hypothesis[Run], Run]]:
+    def tried(self) -> list[tuple[Hypothesis[LabelRun], LabelRun]]:
         """All hypotheses, with the run as each supposes."""
         return [(hypothesis, hypothesis.change(self)) for hypothesis in MAPS if hypothesis.applies(self)]
 
-    def otherwise(self, step: int, change: Change | None = None) -> Run:
+    def otherwise(self, step: int, change: Change | None = None) -> LabelRun:
         """Return the run in which each frame has the map of the frame `step` further on, changed."""
         maps = dict[int, tuple[Ids, Float64 | None]]()
         for k, frame in enumerate(self.frames):
@@ -182,13 +184,13 @@ class Run:
                 other = source.labels if change is None else change(source.labels, ignore)
                 if other.shape == frame.labels.shape:
                     maps[k] = other, source.edges if change is None else _edges(other, ignore)
-        return Run(self.frames, maps)
+        return LabelRun(self.frames, maps)
 
-    def by_frame(self, other: Run) -> list[tuple[int, float, float]]:
+    def by_frame(self, other: LabelRun) -> list[tuple[int, float, float]]:
         """Return index, own fit and fit in the other run of the frames that have a map there."""
         return [(self.frames[k].view.index, self.fits[k], other.fits[k]) for k in other.maps]
 
-    def by_pair(self, other: Run) -> list[tuple[float, float]]:
+    def by_pair(self, other: LabelRun) -> list[tuple[float, float]]:
         """Return for each pair of frames the share of common points whose labels agree, here and in the other run."""
         common = {pair: shared for pair, shared in self.common.items() if {*pair} <= other.maps.keys()}
         label_maps = [{k: labels for k, (labels, _) in run.maps.items()} for run in (self, other)]
@@ -216,7 +218,7 @@ def frames_of(count: int) -> str:
     return "one frame" if count == 1 else f"{('two', 'three', 'four')[count - 2] if count < 5 else count} frames"
 
 
-def shifted(step: int) -> Hypothesis[Run]:
+def shifted(step: int) -> Hypothesis[LabelRun]:
     """Return the mistake that each frame has the map of `step` frames before."""
     mend = f"give frame k the file of frame k {'+' if step > 0 else '-'} {abs(step)}"
     return Hypothesis(f"are {frames_of(abs(step))} {side_of(step)}", lambda run: run.otherwise(step), mend)
@@ -231,18 +233,18 @@ STEPS = {shifted(step).name: step for step in (1, -1, 2, -2)}
 """Steps of the mistakes that are tried, by name."""
 
 
-def redrawn(name: str, mend: str, change: Change) -> Hypothesis[Run]:
+def redrawn(name: str, mend: str, change: Change) -> Hypothesis[LabelRun]:
     """Return the mistake that maps (H, W) of all frames, whose ignore id is given too, are to be changed."""
     return Hypothesis(name, lambda run: run.otherwise(0, change), mend)
 
 
-def _is_oblong(run: Run) -> bool:
+def _is_oblong(run: LabelRun) -> bool:
     sides = run.frames[0].labels.shape
     return bool(max(sides) > 1.1 * min(sides))
 
 
 SQUARE, PADDED = "are those of the central square of the image", "have the padding to a square still in them"
-MAPS: tuple[Hypothesis[Run], ...] = (
+MAPS: tuple[Hypothesis[LabelRun], ...] = (
     *map(shifted, STEPS.values()),
     redrawn("are mirrored left to right", "mirror the files", lambda L, _: L[:, ::-1]),
     redrawn("are upside down", "mirror the files", lambda L, _: L[::-1]),

@@ -7,8 +7,18 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from semstab.check.label_maps import IN_A_RUN, STEPS, Run, Seen, agreements, frames_of, readable, shared_of, side_of
-from semstab.check.trials import BETTER_FIT, LEAST_FIT, LEAST_TOLD, Contrast, Hypothesis
+from semstab.check.label_maps import (
+    IN_A_RUN,
+    STEPS,
+    LabelledFrame,
+    LabelRun,
+    agreements,
+    frames_of,
+    readable,
+    shared_of,
+    side_of,
+)
+from semstab.check.trials import BETTER_FIT, LEAST_FIT, LEAST_TOLD, FitContrast, Hypothesis
 from semstab.core.arrays import evenly
 from semstab.core.types import Float64, Int64
 from semstab.datasets import Scene
@@ -41,8 +51,8 @@ class Turn:
     """
 
     at: int
-    before: Contrast
-    after: Contrast
+    before: FitContrast
+    after: FitContrast
     fit: float
 
     @classmethod
@@ -55,8 +65,8 @@ class Turn:
         fits = np.concatenate([fit_given[:position], fit_other[position:]])
         return cls(
             position,
-            Contrast.of(fit_other[:position], fit_given[:position]),
-            Contrast.of(fit_given[position:], fit_other[position:]),
+            FitContrast.of(fit_other[:position], fit_given[:position]),
+            FitContrast.of(fit_given[position:], fit_other[position:]),
             float(np.nanmean(fits)) if np.isfinite(fits).any() else np.nan,
         )
 
@@ -66,7 +76,7 @@ class Turn:
         return self.before.fits_better and self.after.fits_better
 
 
-def from_a_frame_on(scene: Scene, model: str, runs: Sequence[Run], everywhere: float) -> str | None:
+def from_a_frame_on(scene: Scene, model: str, runs: Sequence[LabelRun], everywhere: float) -> str | None:
     """Return the finding where maps fit as they are up to a frame, and otherwise from it on.
 
     They have to fit better than under any hypothesis that holds for all frames, whose best mean fit is `everywhere`.
@@ -90,11 +100,11 @@ def from_a_frame_on(scene: Scene, model: str, runs: Sequence[Run], everywhere: f
     return None
 
 
-def _located(scene: Scene, model: str, hypothesis: Hypothesis[Run], last: int, first: int) -> int:
+def _located(scene: Scene, model: str, hypothesis: Hypothesis[LabelRun], last: int, first: int) -> int:
     """Return the index of the frame from which on maps are otherwise, between two that are known."""
 
     def rows(span: range) -> list[tuple[int, float, float]]:
-        run = Run([*readable(scene, span, model)])
+        run = LabelRun([*readable(scene, span, model)])
         return run.by_frame(hypothesis.change(run))
 
     while first - last > 2 * IN_A_RUN:
@@ -144,7 +154,7 @@ def in_another_order(scene: Scene, indices: Sequence[int], model: str, pixels: i
     near = [(a, b) for a in range(n) for b in range(a + 1, min(n, a + 4))]
     common = shared_of({k: frame.view for k, frame in enumerate(frames)}, near)
     maps = ({k: frames[source].labels for k, source in enumerate(sequence)} for sequence in (range(n), order))
-    agreement = Contrast.of(*(agreements(common, labels, frames[0].view.ignore_id) for labels in maps))
+    agreement = FitContrast.of(*(agreements(common, labels, frames[0].view.ignore_id) for labels in maps))
     if not (agreement.is_clear and 1 - agreement.other <= FEWER * (1 - agreement.given)):
         return None
     text = (
@@ -154,7 +164,7 @@ def in_another_order(scene: Scene, indices: Sequence[int], model: str, pixels: i
     return f"{_order(order, frames, scene)} {text}: give each frame the map of its own image"
 
 
-def _order(order: Int64, frames: Sequence[Seen], scene: Scene) -> str:
+def _order(order: Int64, frames: Sequence[LabelledFrame], scene: Scene) -> str:
     """Return what the order of the maps is: map `order[k]` is that of frame k."""
     n, k = len(order), np.arange(len(order))
     steps, counts = np.unique(order - k, return_counts=True)

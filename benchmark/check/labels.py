@@ -20,10 +20,10 @@ from semstab.check.chain import Chain
 from semstab.check.continuity import Neighbours
 from semstab.check.conventions import reading
 from semstab.check.label_ids import id_remarks, remarks_on_maps, wrong_ids
-from semstab.check.label_maps import IN_A_RUN, STEPS, Run, readable, runs_of, shifted
+from semstab.check.label_maps import IN_A_RUN, STEPS, LabelRun, readable, runs_of, shifted
 from semstab.check.label_order import ORDER_PIXELS, QUICK_PIXELS, from_a_frame_on, in_another_order
 from semstab.check.reprojection import reader
-from semstab.check.trials import BETTER_FIT, LEAST_TOLD, Contrast, Hypothesis
+from semstab.check.trials import BETTER_FIT, LEAST_TOLD, FitContrast, Hypothesis
 from semstab.data.labels import LabelSpace
 from semstab.datasets import Scene
 from semstab.errors import DataError
@@ -71,9 +71,9 @@ class LabelFindings:
 class Comparison:
     """An alternative with what speaks for it: edges frame by frame, agreement pair by pair."""
 
-    hypothesis: Hypothesis[Run]
-    edges: Contrast
-    agreement: Contrast
+    hypothesis: Hypothesis[LabelRun]
+    edges: FitContrast
+    agreement: FitContrast
 
     @property
     def is_better(self) -> bool:
@@ -104,13 +104,13 @@ class Comparison:
         return f"{self.hypothesis.name} ({text}): {self.hypothesis.mend}"
 
 
-def compare(runs: Sequence[Run]) -> list[Comparison]:
+def compare(runs: Sequence[LabelRun]) -> list[Comparison]:
     """Compare every hypothesis with the maps as they are."""
     trials = zip(*(run.tried for run in runs), strict=True)
     return [_compared(tried[0][0], runs, [other for _, other in tried]) for tried in trials]
 
 
-def counted(found: Comparison, runs: Sequence[Run]) -> Comparison:
+def counted(found: Comparison, runs: Sequence[LabelRun]) -> Comparison:
     """Return the comparison with maps as many frames late, or early, as fit best, where one of these was found."""
     if (step := STEPS.get(found.hypothesis.name)) is None:
         return found
@@ -121,7 +121,9 @@ def counted(found: Comparison, runs: Sequence[Run]) -> Comparison:
     )
 
 
-def _compared(hypothesis: Hypothesis[Run], runs: Sequence[Run], changed_runs: Sequence[Run]) -> Comparison:
+def _compared(
+    hypothesis: Hypothesis[LabelRun], runs: Sequence[LabelRun], changed_runs: Sequence[LabelRun]
+) -> Comparison:
     pairs = [*zip(runs, changed_runs, strict=True)]
     fits = [row[1:] for run, other in pairs for row in run.by_frame(other)]
     return Comparison(
@@ -129,8 +131,8 @@ def _compared(hypothesis: Hypothesis[Run], runs: Sequence[Run], changed_runs: Se
     )
 
 
-def _contrast(rows: Sequence[tuple[float, float]]) -> Contrast:
-    return Contrast.of(*np.reshape(rows, (-1, 2)).T)
+def _contrast(rows: Sequence[tuple[float, float]]) -> FitContrast:
+    return FitContrast.of(*np.reshape(rows, (-1, 2)).T)
 
 
 # --- findings --------------------------------------------------------------------------------------------------------
@@ -151,7 +153,7 @@ def check_labels(
     where they fit better another way. Then frames are read to find maps in another order. Frames
     that cannot be read are passed over.
     """
-    runs_read = dict[int, Run]()
+    runs_read = dict[int, LabelRun]()
     few = _findings(scene, indices, model, space, min(runs, FIRST_RUNS), runs_read)
     if few.clear or not (thorough or few.doubted):
         return few.found
@@ -179,13 +181,18 @@ class _Findings:
 
 
 def _findings(
-    scene: Scene, indices: Sequence[int], model: str, space: LabelSpace | None, count: int, runs_read: dict[int, Run]
+    scene: Scene,
+    indices: Sequence[int],
+    model: str,
+    space: LabelSpace | None,
+    count: int,
+    runs_read: dict[int, LabelRun],
 ) -> _Findings:
     """Return what some runs show; those that are read are kept in `runs_read`, by their first frames."""
     frame_runs = runs_of(scene, indices, model, count)
     for run in frame_runs:
         if run[0] not in runs_read:
-            runs_read[run[0]] = Run([*readable(scene, run, model)])
+            runs_read[run[0]] = LabelRun([*readable(scene, run, model)])
     runs = [runs_read[run[0]] for run in frame_runs if len(runs_read[run[0]].frames) > 1]
     frames = [frame for run in runs for frame in run.frames]
     if len(frames) < 2 or any(frame.labels.shape != frames[0].labels.shape for frame in frames):
@@ -212,13 +219,13 @@ def _findings(
     )
 
 
-def _is_right(run: Run) -> bool:
+def _is_right(run: LabelRun) -> bool:
     """Return whether maps of a run fit better as they are than in any other way."""
     fits = [_contrast([row[1:] for row in run.by_frame(other)]) for _, other in run.tried]
     return all(contrast.other < TELLING * contrast.given for contrast in fits)
 
 
-def _identical(runs: Sequence[Run]) -> str | None:
+def _identical(runs: Sequence[LabelRun]) -> str | None:
     """Return the finding where all maps are the same, of several classes, though the camera moves."""
     frames = [frame for run in runs for frame in run.frames]
     first = frames[0].labels

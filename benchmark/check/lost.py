@@ -33,7 +33,7 @@ Compare = Callable[[Sequence[Pair]], Sequence[Link | None]]
 
 
 @dataclass(frozen=True)
-class Run:
+class PoseRun:
     """Frames in a row that have one pose, which is the identity, or the pose of another frame, too.
 
     Attributes:
@@ -85,7 +85,7 @@ def lost_tracking(poses: Sequence[Float64], configured: Convention, compare: Com
     return sorted(lost | {k for run in of_same_pose for k in range(run.first, run.last + 1)})
 
 
-def runs_of_one_pose(poses: Sequence[Float64], configured: Convention) -> list[Run]:
+def runs_of_one_pose(poses: Sequence[Float64], configured: Convention) -> list[PoseRun]:
     """Return the runs of frames whose pose is the identity as the files have it, or that of another frame."""
     origin = origin_of(configured)
     frames_by_pose = defaultdict[bytes, list[int]](list)
@@ -102,7 +102,7 @@ def runs_of_one_pose(poses: Sequence[Float64], configured: Convention) -> list[R
         for _, part in itertools.groupby(enumerate(members), lambda item: item[1] - item[0]):
             row = [k for _, k in part]
             before = next((k for k in reversed(free) if k < row[0]), None)
-            runs.append(Run(row[0], row[-1], before, next((k for k in free if k > row[-1]), None)))
+            runs.append(PoseRun(row[0], row[-1], before, next((k for k in free if k > row[-1]), None)))
     return runs
 
 
@@ -117,11 +117,11 @@ def _key(pose: Float64) -> bytes:
     return bytes((np.round(pose, DIGITS) + 0.0).tobytes())
 
 
-def _is_near(pair: Pair, run: Run) -> bool:
+def _is_near(pair: Pair, run: PoseRun) -> bool:
     return pair[1] == run.before or pair[0] == run.after
 
 
-def _lost_of(run: Run, links: Sequence[Link | None], limit: float) -> Sequence[int]:
+def _lost_of(run: PoseRun, links: Sequence[Link | None], limit: float) -> Sequence[int]:
     """Return the frames of a run that are elsewhere: all of them, or all but the first, whose pose the others have."""
     off = {pair: _is_off(link, limit) for pair, link in zip(run.pairs, links, strict=True) if link is not None}
     moves = any(is_off for pair, is_off in off.items() if pair in run.within)
@@ -131,7 +131,7 @@ def _lost_of(run: Run, links: Sequence[Link | None], limit: float) -> Sequence[i
     return range(run.first, run.last + 1) if moves or ends == [True, True] else ()
 
 
-def _fits(run: Run, links: Sequence[Link | None], limit: float) -> bool:
+def _fits(run: PoseRun, links: Sequence[Link | None], limit: float) -> bool:
     """Return whether one of its ends fits the frame next to it."""
     end_links = [
         link for pair, link in zip(run.pairs, links, strict=True) if link is not None and pair not in run.within

@@ -52,7 +52,7 @@ LEAST_ARM, ARM_OF_DEPTH = 0.02, 0.005
 
 
 @dataclass(frozen=True, eq=False)
-class Change:
+class MountingChange:
     """A change of the calibration (11,) that mends it, and its covariance (11, 11); 0 in what was not fitted."""
 
     values: Float64
@@ -90,7 +90,7 @@ def with_mounting(verdict: Verdict, sample: Sample) -> Verdict:
     return verdict.refuted(text) if error <= REFUSED * sample.fit().error else verdict.remarking(text)
 
 
-def _aspect(sample: Sample, full_change: Change) -> tuple[str, Sample] | None:
+def _aspect(sample: Sample, full_change: MountingChange) -> tuple[str, Sample] | None:
     """Return what is said of fx and fy where they do not belong together, and the sample with the one that does."""
     fx, fy = float(full_change.values[FX]), float(full_change.values[FY])
     difference = np.zeros((1, ALL))
@@ -111,7 +111,7 @@ def _aspect(sample: Sample, full_change: Change) -> tuple[str, Sample] | None:
     ), _changed(sample, alone)
 
 
-def _arm(sample: Sample, full_change: Change) -> tuple[str, Sample] | None:
+def _arm(sample: Sample, full_change: MountingChange) -> tuple[str, Sample] | None:
     """Return what is said of a lever arm from the tracked body to the camera, and the sample with it."""
     rows = np.eye(ALL)[ARM]
     if full_change.certainty(rows) < CERTAIN:
@@ -132,23 +132,23 @@ def _arm(sample: Sample, full_change: Change) -> tuple[str, Sample] | None:
     ), _changed(sample, alone)
 
 
-def fitted_change(sample: Sample, free: Float64) -> Change | None:
+def fitted_change(sample: Sample, free: Float64) -> MountingChange | None:
     """Return the change of the calibration in directions (k, 11) under which depth fits best; None of few points."""
-    change, now = Change(np.zeros(ALL), np.zeros((ALL, ALL))), sample
+    change, now = MountingChange(np.zeros(ALL), np.zeros((ALL, ALL))), sample
     for _ in range(ROUNDS):
         slopes = {position: _slopes(view) for position, view in now.views.items()}
         pairs = [_linear(now, pair, *slopes[pair[1]]) for pair in now.pairs]
         if sum(len(error) for error, _ in pairs) < LEAST_POINTS:
             return None
         step, covariance = _least_squares([(error, J @ free.T) for error, J in pairs])
-        change = Change(change.values + step @ free, free.T @ covariance @ free)
+        change = MountingChange(change.values + step @ free, free.T @ covariance @ free)
         if not (np.isfinite(change.values).all() and np.abs(change.values[[FX, FY, 4]]).max() < 1):
             return None
         now = _changed(sample, change)
     return change
 
 
-def _changed(sample: Sample, change: Change) -> Sample:
+def _changed(sample: Sample, change: MountingChange) -> Sample:
     return sample.of({position: change.of(view) for position, view in sample.views.items()})
 
 

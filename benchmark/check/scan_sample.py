@@ -13,7 +13,7 @@ import numpy as np
 
 from semstab.backends.shared.association import in_world
 from semstab.check.conventions import Convention
-from semstab.check.coverage import Noise, Overlap, by_distance
+from semstab.check.coverage import DepthNoise, Overlap, by_distance
 from semstab.check.reprojection import CONSISTENT, Pair, clusters, frames_at, motion, pairs_within, reader
 from semstab.check.surfaces import LEAST_RANGE, Surfaces
 from semstab.check.verdict import Fit
@@ -165,11 +165,11 @@ class ScanSample:
         share, agreement = float(np.mean(error <= CONSISTENT)), float(agree.mean()) if len(agree) else math.nan
         return Overlap(distances, len(pairs), share, share, float(np.median(error)), agreement)
 
-    def noise(self) -> Noise:
+    def noise(self) -> DepthNoise:
         """Return the distance of points from the nearest of another scan and of their own, and between rays."""
         ranges = np.concatenate([met.range for met in self.met.values()])
         angle = float(np.median([scan.ray_angle for scan in self.scans.values()]))
-        return Noise(self.between, self.spacing, angle * float(np.median(ranges)))
+        return DepthNoise(self.between, self.spacing, angle * float(np.median(ranges)))
 
     def pixel_stride(self, voxel_size: float | None) -> tuple[int | None, str]:
         """Return that all points are fused."""

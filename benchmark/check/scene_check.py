@@ -13,7 +13,7 @@ from semstab.check.coverage import (
     FUSED_FRAMES,
     Coverage,
     Covers,
-    Noise,
+    DepthNoise,
     Overlap,
     Persistence,
     Suggestion,
@@ -23,7 +23,7 @@ from semstab.check.coverage import (
     without_labels,
 )
 from semstab.check.geometry import shifts_and_turns
-from semstab.check.histogram import Histogram, Tally
+from semstab.check.histogram import Histogram, LabelTally
 from semstab.check.inspection import Depth, Inspection
 from semstab.check.labels import LabelFindings, Ordered, label_findings
 from semstab.check.no_depth import with_invalid_depth
@@ -94,7 +94,7 @@ class SceneCheck:
     verdict: Verdict
     labels: tuple[Histogram, ...]
     overlaps: tuple[Overlap, ...] = ()
-    noise: Noise | None = None
+    noise: DepthNoise | None = None
     fused_frames: int = 0
     fused_stride: int = 1
     persistence: tuple[Persistence, ...] = ()
@@ -225,7 +225,7 @@ def _check_scans(
     verdict = with_sweep(assess_scans(sample), sample)
     scans, ranges = [*sample.scans.values()], sample.ranges
     valid = [len(valid_ranges) / scan.depth.size for valid_ranges, scan in zip(ranges, scans, strict=True)]
-    tally = Tally(first or "")
+    tally = LabelTally(first or "")
     for scan in scans if first is not None else ():
         tally.add(scan)
     checked = SceneCheck(
@@ -362,10 +362,10 @@ def _motion(sample: Sample) -> Motion | None:
     return Motion((float(shifts.min()), float(shifts.max())), (float(turns.min()), float(turns.max())))
 
 
-def _labels(scene: Scene, model: str, indices: Sequence[int], config: Config, tally: Tally) -> Histogram:
+def _labels(scene: Scene, model: str, indices: Sequence[int], config: Config, tally: LabelTally) -> Histogram:
     """Return the labels of a model: of the frames that were read already, or of a few read for it."""
     if model != tally.model:
-        tally = Tally(model)
+        tally = LabelTally(model)
         chosen = [indices[position] for position in evenly(len(indices), LABELLED_FRAMES)]
         for fetched in prefetch(reader(scene, model), chosen):
             tally.add(fetched.item)

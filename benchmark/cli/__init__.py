@@ -117,7 +117,7 @@ def _usage(error: Any) -> str:
     return f"no such option: {option}" + (f"; did you mean {near[0]}?" if near else "")
 
 
-class Group(TyperGroup):
+class CommandGroup(TyperGroup):
     """Group that runs `run` by default, shows the options of `run` in the help, and reports every error in one line."""
 
     def get_params(self, ctx: Any) -> list[Any]:
@@ -184,7 +184,7 @@ class Group(TyperGroup):
 
 
 app = typer.Typer(
-    cls=Group,
+    cls=CommandGroup,
     invoke_without_command=True,
     pretty_exceptions_enable=False,
     context_settings={"help_option_names": ["-h", "--help"]},

@@ -13,7 +13,7 @@ import numpy as np
 
 from semstab.comparison.caution import cautions
 from semstab.comparison.entries import Entry, Flicker, RunHandle, open_models, open_runs, shared_scenes
-from semstab.comparison.locations import Changes, worse_areas
+from semstab.comparison.locations import VoxelChanges, worse_areas
 from semstab.comparison.pairing import Common, joint_class, pair
 from semstab.comparison.quantities import (
     BY_CLASS,
@@ -296,7 +296,7 @@ class ComparisonData:
     """
 
     result: RunComparison
-    changes: Mapping[tuple[str, str], Changes]
+    changes: Mapping[tuple[str, str], VoxelChanges]
     up: Mapping[str, Up]
 
 
@@ -324,7 +324,7 @@ def differences_of(
         DataError: As `shared_scenes` and `pair` do.
     """
     scenes: list[SceneComparison] = []
-    changes: dict[tuple[str, str], Changes] = {}
+    changes: dict[tuple[str, str], VoxelChanges] = {}
     for scene in shared_scenes(handles):
         progress(scene)
         rows, scene_changes = _scene(scene, handles, scope)
@@ -356,7 +356,7 @@ def _cautions(handles: Sequence[RunHandle], against: Against, scenes: Sequence[S
     return cautions((base.name, other.name), entries, against.contrasts)
 
 
-def _scene(scene: str, runs: Sequence[RunHandle], scope: Scope) -> tuple[SceneComparison, dict[str, Changes]]:
+def _scene(scene: str, runs: Sequence[RunHandle], scope: Scope) -> tuple[SceneComparison, dict[str, VoxelChanges]]:
     entries, names = [run.scenes[scene] for run in runs], [run.name for run in runs]
     common = pair(entries, names, scope)
     numbers = range(1, len(entries))

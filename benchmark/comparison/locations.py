@@ -95,7 +95,7 @@ class Changed:
 
 
 @dataclass(frozen=True, eq=False)
-class Changes:
+class VoxelChanges:
     """Changes between two maps; of a large map `shown` has those that matter, and some of the others.
 
     Attributes:
@@ -119,7 +119,7 @@ class Worse:
 
     areas: tuple[Area, ...]
     top_frames: tuple[FrameShare, ...]
-    changes: Changes
+    changes: VoxelChanges
 
 
 def worse_areas(common: Common, number: int) -> Worse:
@@ -157,7 +157,7 @@ def worse_areas(common: Common, number: int) -> Worse:
         for changed in _changed(common, number):
             yield _columns(changed, *numbers(changed.table))
 
-    changes = Changes(displayed, compared, worse, better, *numbers(displayed.table), parts)
+    changes = VoxelChanges(displayed, compared, worse, better, *numbers(displayed.table), parts)
     top_frames = () if observations is None else _top_frames(observations.among(area > 0, result.label))
     return Worse(tuple(listed), top_frames, changes)
 
@@ -242,7 +242,7 @@ def _areas(
     voxel_size: float,
     label: Int64,
     names: Sequence[str],
-    observations: Observations | None,
+    observations: PairedObservations | None,
 ) -> list[Area]:
     listed = []
     for k in range(1, min(len(improved_alike), MOST) + 1):
@@ -265,7 +265,7 @@ def _areas(
 
 
 @dataclass(frozen=True, eq=False)
-class Observations:
+class PairedObservations:
     """The observations of both maps at voxels: (m,) each.
 
     Attributes:
@@ -278,17 +278,17 @@ class Observations:
     base: Float64
     other: Float64
 
-    def among(self, where: Mask, label: Int64) -> Seen:
+    def among(self, where: Mask, label: Int64) -> AreaObservations:
         """Return the observations at some of the voxels (n,), with their classes (n,) as the expected ones."""
         rows = where[self.voxel]
         k = label[self.voxel[rows]][:, None]
         base, other = self.base[rows], self.other[rows]
         lost = (np.take_along_axis(base, k, axis=1) - np.take_along_axis(other, k, axis=1))[:, 0]
-        return Seen(self.frame[rows], lost, other)
+        return AreaObservations(self.frame[rows], lost, other)
 
 
 @dataclass(frozen=True, eq=False)
-class Seen:
+class AreaObservations:
     """Observations of an area: frame (m,), loss of the area's class (m,), and shares of the classes (m, K)."""
 
     frame: Int64
@@ -302,7 +302,7 @@ class Seen:
         return names[int(missing.argmax())] if missing.max(initial=0) > 0 else ""
 
 
-def _top_frames(observations: Seen) -> tuple[FrameShare, ...]:
+def _top_frames(observations: AreaObservations) -> tuple[FrameShare, ...]:
     frames, of = np.unique(observations.frame, return_inverse=True)
     lost = np.maximum(np.bincount(of, weights=observations.lost, minlength=len(frames)), 0.0)
     if not lost.sum() > 0:
@@ -315,12 +315,12 @@ def _top_frames(observations: Seen) -> tuple[FrameShare, ...]:
     )
 
 
-def _observations(common: Common, number: int, index: Int32, voxel_size: float) -> Observations | None:
+def _observations(common: Common, number: int, index: Int32, voxel_size: float) -> PairedObservations | None:
     if not common.logs:
         return None
     base, other = (_rows_of(common.logs[k], index, voxel_size) for k in (0, number))
     there = base[0] >= 0
-    return Observations(base[0][there], base[1][there], base[2][there], other[2][there])
+    return PairedObservations(base[0][there], base[1][there], base[2][there], other[2][there])
 
 
 def _rows_of(log: Events, index: Int32, voxel_size: float) -> tuple[Int64, Int64, Float64]:

@@ -12,7 +12,7 @@ from pydantic import Field, ValidationError, ValidationInfo, field_validator
 from semstab.config.groups import (
     Deviation,
     FrameSelection,
-    Noise,
+    NoiseLevels,
     Part,
     ScopeSetting,
     Settings,
@@ -29,8 +29,9 @@ from semstab.core.types import THIS_SCENE
 from semstab.errors import ConfigError, nearest
 
 __all__ = [
-    "BackendConfig", "Config", "DatasetConfig", "Deviation", "Exclusion", "FrameSelection", "NamedBenchmark", "Noise",
-    "Part", "Perturbation", "Settings", "Sweeps", "as_range", "explain", "merge", "nearest", "read_yaml", "validated",
+    "BackendConfig", "Config", "DatasetConfig", "Deviation", "Exclusion", "FrameSelection", "NamedBenchmark",
+    "NoiseLevels", "Part", "Perturbation", "Settings", "Sweeps", "as_range", "explain", "merge", "nearest",
+    "read_yaml", "validated",
 ]  # fmt: skip
 
 BASE, SHARED, BACKENDS = "base", "shared_taxonomy", "backends"

@@ -133,7 +133,7 @@ class Values(Part, Generic[V]):
         return values
 
 
-class Noise(Values[Deviation]):
+class NoiseLevels(Values[Deviation]):
     """Standard deviations; each but 0 is drawn `repeats` times, with seeds of their own."""
 
     repeats: int = Field(1, ge=1)
@@ -147,11 +147,11 @@ class Sweeps(Settings):
     """The settings that are varied one by one."""
 
     voxel_size: Lengths | None = Field(None, description="edges of a voxel, metres")
-    depth_noise: Noise | None = Field(None, description="see `semstab.config.Perturbation`, like the next four")
-    translation_noise: Noise | None = None
-    rotation_noise: Noise | None = None
-    translation_drift: Noise | None = None
-    rotation_drift: Noise | None = None
+    depth_noise: NoiseLevels | None = Field(None, description="see `semstab.config.Perturbation`, like the next four")
+    translation_noise: NoiseLevels | None = None
+    rotation_noise: NoiseLevels | None = None
+    translation_drift: NoiseLevels | None = None
+    rotation_drift: NoiseLevels | None = None
     frame_count: Counts | None = Field(None, description="number of frames, evenly over the extent of `frames`")
     pixel_stride: Counts | None = Field(None, description="use every n-th pixel of each axis")
 

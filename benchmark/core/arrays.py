@@ -69,7 +69,7 @@ def _read(kind: Any, arrays: Mapping[str, npt.NDArray[Any]], path: str) -> Any:
     return arrays[path] if origin is np.ndarray else kind(arrays[path][()])
 
 
-class Rows:
+class GrowingRows:
     """A table of float64 that grows row by row; rows (n, columns) are the first ones."""
 
     def __init__(self, columns: int, rows: npt.ArrayLike = ()) -> None:

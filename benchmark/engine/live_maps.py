@@ -16,7 +16,7 @@ import numpy as np
 from semstab.backends import FusionBackend, create, is_builtin, takes_option
 from semstab.backends.numpy_reference import NumpySample
 from semstab.config import Config
-from semstab.core.arrays import Rows
+from semstab.core.arrays import GrowingRows
 from semstab.core.background import Background
 from semstab.core.prefetch import Fetched
 from semstab.core.process import Stopwatch
@@ -250,7 +250,7 @@ class Stream:
         self.video = None if flow is None else VideoMeter(len(self.task.mapping.target), flow)
         self.wants_color = flow == "dis" or not posed
         self.truth_task = truth_task(self.task) if base or maps[0].work.unit.compares_truth else None
-        self._poses = Rows(POSE)
+        self._poses = GrowingRows(POSE)
         self._estimates_up = base and posed and self.task.scene.up is None
         self.shown = self.task.indices[len(self.task.indices) // 2] if base else None
         self.overview: dict[str, Any] = {}

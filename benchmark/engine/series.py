@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from semstab.core.arrays import Rows
+from semstab.core.arrays import GrowingRows
 from semstab.core.files import atomic_path
 from semstab.core.types import Float64
 from semstab.data.measures import ENTROPY, RECURRENT, VSS
@@ -113,7 +113,7 @@ class Series:
     """The rows of a time series, stored as numbers; `numbers` (F, C) are the NUMBERS of the first ones."""
 
     def __init__(self, numbers: npt.ArrayLike = ()) -> None:
-        self._rows = Rows(len(NUMBERS), numbers)
+        self._rows = GrowingRows(len(NUMBERS), numbers)
 
     @property
     def numbers(self) -> Float64:

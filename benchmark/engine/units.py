@@ -20,7 +20,7 @@ from semstab.config import (
     BackendConfig,
     Config,
     FrameSelection,
-    Noise,
+    NoiseLevels,
     Part,
     Perturbation,
     Sweeps,
@@ -325,7 +325,7 @@ def _variations(config: Config) -> Iterator[tuple[Variation, Part, Any]]:
         yield Variation(SHARED), Part(), config.shared_taxonomy
     for sweep, part in config.sweeps.given():
         for value in part.values:
-            for repeat in range(part.repeats if isinstance(part, Noise) and value else 1):
+            for repeat in range(part.repeats if isinstance(part, NoiseLevels) and value else 1):
                 yield Variation(sweep, float(value), repeat), part, value
     for backend in config.fused_by()[1:]:
         yield Variation(BACKENDS), backend, backend

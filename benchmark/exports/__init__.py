@@ -23,7 +23,7 @@ from semstab.exports.moving import holds_masks, write_masks
 from semstab.exports.places import GEOJSON, holds_places, write_places
 from semstab.exports.relabel import task_of
 from semstab.exports.taxonomy import TAXONOMY, holds_taxonomy, write_taxonomy
-from semstab.exports.voxels import Chosen, Voxels
+from semstab.exports.voxels import ExportedUnit, ExportedVoxels
 from semstab.statistics.acceptance import AcceptanceThresholds
 from semstab.task import Task
 
@@ -49,14 +49,14 @@ class Exported:
 
 
 @dataclass(frozen=True)
-class Settings:
+class ExportSettings:
     """The settings of some formats: the cell of a raster in voxels, a table of ASPRS codes."""
 
     cell: int = 1
     asprs: Path | None = None
 
 
-Writer = Callable[[Chosen, Path, Settings], int]
+Writer = Callable[[ExportedUnit, Path, ExportSettings], int]
 
 WRITERS: Mapping[str, Writer] = {
     ".ply": lambda chosen, path, settings: clouds.write_ply(chosen, path, sum(len(part.table) for part in chosen)),
@@ -135,12 +135,12 @@ def export(
     _require_writable(files, (asprs, join, thresholds), task_format)
     result = load_result(run)
     record = result.record(scene=scene, model=model, backend=backend)
-    settings = Settings(cell, None if asprs is None else Path(asprs))
+    settings = ExportSettings(cell, None if asprs is None else Path(asprs))
     accepted = None if thresholds is None else AcceptanceThresholds.load(thresholds)
 
     @functools.cache
-    def chosen(usual: tuple[str, ...] | None) -> Chosen:
-        return Chosen(
+    def chosen(usual: tuple[str, ...] | None) -> ExportedUnit:
+        return ExportedUnit(
             result, record, columns=measures or usual, min_op=min_op, classes=classes, thresholds=accepted,
             join=None if join is None else Path(join),
         )  # fmt: skip
@@ -182,19 +182,19 @@ def _require_writable(files: Sequence[Path], inputs: Sequence[str | Path | None]
         remove_abandoned(folder)
 
 
-def _written(chosen: Chosen, file: Path, settings: Settings) -> Exported:
+def _written(chosen: ExportedUnit, file: Path, settings: ExportSettings) -> Exported:
     voxels, part = WRITERS[file.suffix.lower()](chosen, file, settings), chosen.first
     return Exported(file, f"{voxels:,} voxels, {_where(part)}", tuple(_notes(part, file, settings)))
 
 
-def _where(part: Voxels) -> str:
+def _where(part: ExportedVoxels) -> str:
     """Return what coordinates are in, in words."""
     if part.georeference is None:
         return "coordinates of the scene, which has no georeference"
     return part.georeference.name
 
 
-def _places_written(chosen: Chosen, record: Record, file: Path, most: int) -> Exported:
+def _places_written(chosen: ExportedUnit, record: Record, file: Path, most: int) -> Exported:
     places, part = write_places(chosen, record, file, most)
     content = f"{places} place{'' if places == 1 else 's'} where frames disagree, {_where(part)}"
     notes = []
@@ -224,7 +224,9 @@ def _tasks_written(file: TaskFile, task: Task) -> Exported:
     return Exported(file.path, f"{len(file.tasks)} tasks in {images} images, {bits:,.0f} bits of entropy", (note,))
 
 
-def _classified(chosen: Chosen, cloud: Path, file: Path, radius: float | None, settings: Settings) -> Exported:
+def _classified(
+    chosen: ExportedUnit, cloud: Path, file: Path, radius: float | None, settings: ExportSettings
+) -> Exported:
     part = chosen.first
     tally = joining.classify(chosen, cloud, file, part.table.voxel_size if radius is None else radius, settings.asprs)
     share = tally.classified / tally.points
@@ -234,7 +236,7 @@ def _classified(chosen: Chosen, cloud: Path, file: Path, radius: float | None, s
     return Exported(file, content, tuple(_notes(part, file, settings)))
 
 
-def _few_met(tally: joining.Tally, part: Voxels) -> str:
+def _few_met(tally: joining.JoinTally, part: ExportedVoxels) -> str:
     """Return the possible reasons why few points of a cloud have a voxel."""
     text = f"only {tally.classified / tally.points:.1%} of its points lie in or next to a voxel"
     within = tally.classified / max(1, tally.over)
@@ -247,7 +249,7 @@ def _few_met(tally: joining.Tally, part: Voxels) -> str:
     )
 
 
-def _notes(voxels: Voxels, file: Path, settings: Settings) -> Iterator[str]:
+def _notes(voxels: ExportedVoxels, file: Path, settings: ExportSettings) -> Iterator[str]:
     kind = file.suffix.lower()
     if kind == ".tif":
         yield f"the classes, with their colours, are in {file.with_suffix(f'.class{file.suffix}').name}"

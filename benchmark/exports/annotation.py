@@ -17,7 +17,7 @@ from semstab.data.measures import bits, dominant
 from semstab.data.voxels import VoxelTable
 from semstab.errors import ConfigError, DataError
 from semstab.exports.join import NONE, VoxelLookup
-from semstab.exports.voxels import Chosen
+from semstab.exports.voxels import ExportedUnit
 from semstab.metrics import CATEGORIES, categories
 from semstab.statistics import psa
 from semstab.statistics.places import connected
@@ -64,7 +64,7 @@ class AnnotationTask:
     views: tuple[str, ...]
 
 
-def annotation_tasks(chosen: Chosen, task: Task, most: int) -> list[AnnotationTask]:
+def annotation_tasks(chosen: ExportedUnit, task: Task, most: int) -> list[AnnotationTask]:
     """Return at most `most` tasks, the highest score first.
 
     A location is a connected set of voxels that at least two frames saw, with the same two likeliest classes, on which
@@ -111,7 +111,7 @@ class _Locations:
     projected: Callable[[Float64], Float64]
 
     @classmethod
-    def of(cls, chosen: Chosen, most: int) -> _Locations:
+    def of(cls, chosen: ExportedUnit, most: int) -> _Locations:
         """Return the locations with the most entropy, at most `most`."""
         parts = list(chosen)
         first = parts[0]

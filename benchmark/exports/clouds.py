@@ -21,13 +21,13 @@ from semstab.data.labels import name_key
 from semstab.datasets.files.surfaces import open_las
 from semstab.datasets.formats.ply import Header
 from semstab.errors import ConfigError, DataError, MissingDependencyError
-from semstab.exports.voxels import Voxels
+from semstab.exports.voxels import ExportedVoxels
 
 if TYPE_CHECKING:
     import laspy
 
 
-def write_ply(parts: Iterable[Voxels], path: Path, count: int) -> int:
+def write_ply(parts: Iterable[ExportedVoxels], path: Path, count: int) -> int:
     """Write the centres of `count` voxels with colour, class and measures; the names of the classes are comments."""
     written = 0
     with atomic_path(path) as temporary, temporary.open("wb") as file:
@@ -47,7 +47,7 @@ def write_ply(parts: Iterable[Voxels], path: Path, count: int) -> int:
     return written
 
 
-def legend(voxels: Voxels) -> Iterable[str]:
+def legend(voxels: ExportedVoxels) -> Iterable[str]:
     """Yield the lines that explain a file: the voxel size, the coordinates, the classes, the columns."""
     where = "coordinates of the scene" if voxels.georeference is None else voxels.georeference.name
     yield f"semstab: voxels of {voxels.table.voxel_size:g} m, {where}"
@@ -78,7 +78,7 @@ FORMAT = 7
 FIRST_OF_1_4 = 6
 
 
-def write_las(parts: Iterable[Voxels], path: Path, asprs: Path | None = None) -> int:
+def write_las(parts: Iterable[ExportedVoxels], path: Path, asprs: Path | None = None) -> int:
     """Write the voxels' centres to the millimetre, part after part; return the number of voxels.
 
     Raises:
@@ -138,7 +138,7 @@ def with_lazrs(path: Path) -> Any:
     return laspy
 
 
-def declare(header: laspy.LasHeader, voxels: Voxels, **more: tuple[npt.DTypeLike, str]) -> None:
+def declare(header: laspy.LasHeader, voxels: ExportedVoxels, **more: tuple[npt.DTypeLike, str]) -> None:
     """Declare the class, the voxels' columns and `more` as extra dimensions where the header has none of that name.
 
     Also write the names of the classes and, where the cloud has none, the reference system.
@@ -168,7 +168,7 @@ def declare(header: laspy.LasHeader, voxels: Voxels, **more: tuple[npt.DTypeLike
         header.global_encoding.wkt = True
 
 
-def codes(voxels: Voxels, table: Path | None = None) -> UInt8:
+def codes(voxels: ExportedVoxels, table: Path | None = None) -> UInt8:
     """Return (1 + K,) the ASPRS code of 'unclassified' and of each class, from a YAML file CLASS: CODE.
 
     Without a file the codes are those that ship for the taxonomy.
@@ -194,7 +194,7 @@ def codes(voxels: Voxels, table: Path | None = None) -> UInt8:
     return codes_by_row
 
 
-def without_code(voxels: Voxels, table: Path | None) -> list[str]:
+def without_code(voxels: ExportedVoxels, table: Path | None) -> list[str]:
     """Return the classes of these voxels without a code of their own, which become 'unclassified'."""
     code_of_row, present = codes(voxels, table), np.unique(voxels.classified)
     return [voxels.classes[row - 1] for row in present.tolist() if row and code_of_row[row] == UNCLASSIFIED]

@@ -23,7 +23,7 @@ from semstab.datasets.files.surfaces import open_las, points_at_once
 from semstab.datasets.formats.ply import Header
 from semstab.errors import ConfigError, DataError
 from semstab.exports import clouds
-from semstab.exports.voxels import Chosen, Voxels
+from semstab.exports.voxels import ExportedUnit, ExportedVoxels
 from semstab.metrics.agreement import voxel_keys
 
 if TYPE_CHECKING:
@@ -100,7 +100,7 @@ OLD_CODES = 31
 
 
 @dataclass
-class Tally:
+class JoinTally:
     """The number of points, those with a voxel, those within the map's bounds from above, and the bounds of all."""
 
     points: int = 0
@@ -127,10 +127,10 @@ class Taken:
 
 
 Finder = Callable[[Float64], Taken]
-Writer = Callable[[Voxels, Path, Path, Finder], None]
+Writer = Callable[[ExportedVoxels, Path, Path, Finder], None]
 
 
-def classify(chosen: Chosen, cloud: Path, out: Path, radius: float, asprs: Path | None = None) -> Tally:
+def classify(chosen: ExportedUnit, cloud: Path, out: Path, radius: float, asprs: Path | None = None) -> JoinTally:
     """Write the cloud with all its fields, and class, classification (LAS) and the voxels' columns.
 
     A point belongs to the voxel that it lies in, else to the nearest whose centre is within `radius` metres; else it
@@ -160,8 +160,8 @@ def classify(chosen: Chosen, cloud: Path, out: Path, radius: float, asprs: Path 
 class _Finder:
     """A search for the voxels of points, tile by tile; the latest tiles stay in memory."""
 
-    def __init__(self, chosen: Chosen, radius: float) -> None:
-        self.chosen, self.tally, self._radius = chosen, Tally(), radius
+    def __init__(self, chosen: ExportedUnit, radius: float) -> None:
+        self.chosen, self.tally, self._radius = chosen, JoinTally(), radius
         self._lookups = SizedCache(self.lookup, lambda lookup: len(lookup.table), AT_HAND)
 
     def lookup(self, tile: TileIndex) -> VoxelLookup:
@@ -235,7 +235,7 @@ def _outside(cloud: Path, finder: _Finder) -> DataError:
 # --- LAS --------------------------------------------------------------------------------------------------------------
 
 
-def _classify_las(voxels: Voxels, cloud: Path, out: Path, find: Finder, asprs: Path | None) -> None:
+def _classify_las(voxels: ExportedVoxels, cloud: Path, out: Path, find: Finder, asprs: Path | None) -> None:
     clouds.with_lazrs(cloud)
     with open_las(cloud) as reader:
         _require_same_crs(voxels, reader.header, cloud)
@@ -263,7 +263,7 @@ def _las_chunks(cloud: Path) -> Iterator[laspy.ScaleAwarePointRecord]:
         yield from reader.chunk_iterator(min(CHUNK, points_at_once(reader.header)))
 
 
-def _extended(header: laspy.LasHeader, voxels: Voxels) -> laspy.LasHeader:
+def _extended(header: laspy.LasHeader, voxels: ExportedVoxels) -> laspy.LasHeader:
     """Return the cloud's header with the dimensions of the voxels."""
     extended = copy.deepcopy(header)
     extended.vlrs = type(header.vlrs)(_without_copc(header.vlrs))
@@ -277,7 +277,11 @@ def _without_copc(records: Iterable[laspy.VLR]) -> list[laspy.VLR]:
 
 
 def _classified_points(
-    points: laspy.ScaleAwarePointRecord, header: laspy.LasHeader, voxels: Voxels, find: Finder, asprs: Path | None
+    points: laspy.ScaleAwarePointRecord,
+    header: laspy.LasHeader,
+    voxels: ExportedVoxels,
+    find: Finder,
+    asprs: Path | None,
 ) -> laspy.ScaleAwarePointRecord:
     """Return a chunk with the classes and columns of its points."""
     assigned = find(np.stack([points.x, points.y, points.z], axis=1))
@@ -295,7 +299,7 @@ def _classified_points(
     return taken
 
 
-def _require_same_crs(voxels: Voxels, header: laspy.LasHeader, cloud: Path) -> None:
+def _require_same_crs(voxels: ExportedVoxels, header: laspy.LasHeader, cloud: Path) -> None:
     """Raise DataError where cloud and run have different projections."""
     stated = header.parse_crs()
     if stated is None or voxels.georeference is None:
@@ -311,7 +315,7 @@ def _require_same_crs(voxels: Voxels, header: laspy.LasHeader, cloud: Path) -> N
 # --- PLY --------------------------------------------------------------------------------------------------------------
 
 
-def _classify_ply(voxels: Voxels, cloud: Path, out: Path, find: Finder) -> None:
+def _classify_ply(voxels: ExportedVoxels, cloud: Path, out: Path, find: Finder) -> None:
     with cloud.open("rb") as source, out.open("wb") as target:
         header = Header.read(source, cloud)
         fields = {name: header.dtype[name].newbyteorder("<") for name in header.dtype.names or ()}

@@ -21,7 +21,7 @@ from semstab.data.information import normalise
 from semstab.data.tiles import TileIndex
 from semstab.data.topdown import covered, level_axes
 from semstab.errors import ConfigError, MissingDependencyError
-from semstab.exports.voxels import Chosen, Column, Voxels, together
+from semstab.exports.voxels import ExportedUnit, ExportedVoxels, VoxelColumn, together
 from semstab.metrics import CATEGORIES, categories
 
 RASTER_MEASURES = ("vss", "entropy", "op")
@@ -36,7 +36,7 @@ WINDOW = 1024
 STABLE = len(CATEGORIES) - 1
 
 
-def write_raster(chosen: Chosen, path: Path, cell: int = 1) -> int:
+def write_raster(chosen: ExportedUnit, path: Path, cell: int = 1) -> int:
     """Write FILE.tif with bands in single precision (NaN: no voxel), and FILE.class.tif with classes and their colours.
 
     A cell is `cell` voxels wide. Its class is that of the summed belief of the topmost voxels of its columns, each
@@ -75,12 +75,12 @@ def write_raster(chosen: Chosen, path: Path, cell: int = 1) -> int:
     return voxels
 
 
-def _names(part: Voxels) -> tuple[str, ...]:
+def _names(part: ExportedVoxels) -> tuple[str, ...]:
     """Return the names of the bands of measures."""
     return ("class", *part.columns, "stable", "height")
 
 
-def _grid(part: Voxels, extent: Window, cell: int) -> dict[str, Any]:
+def _grid(part: ExportedVoxels, extent: Window, cell: int) -> dict[str, Any]:
     """Return where the cells of a raster lie, and how they are stored."""
     import rasterio
 
@@ -102,7 +102,7 @@ def _write_window(measures: _Raster, classes: _Raster, values: Mapping[str, npt.
     classes.write(np.nan_to_num(values["class"], nan=0).astype(kind), 1, window)
 
 
-def _describe_measures(raster: Any, part: Voxels) -> None:
+def _describe_measures(raster: Any, part: ExportedVoxels) -> None:
     """Say what the bands are, and the classes by number."""
     for number, (name, unit, about) in enumerate(_abouts(part), start=1):
         raster.set_band_description(number, name)
@@ -113,7 +113,7 @@ def _describe_measures(raster: Any, part: Voxels) -> None:
         raster.update_tags(benchmark=part.benchmark)
 
 
-def _describe_classes(raster: Any, part: Voxels) -> None:
+def _describe_classes(raster: Any, part: ExportedVoxels) -> None:
     """Say which classes the numbers mean, and their colours."""
     if part.benchmark:
         raster.update_tags(benchmark=part.benchmark)
@@ -122,7 +122,7 @@ def _describe_classes(raster: Any, part: Voxels) -> None:
     raster.update_tags(1, **_legend(part))
 
 
-def _legend(part: Voxels) -> dict[str, str]:
+def _legend(part: ExportedVoxels) -> dict[str, str]:
     return {str(k): name for k, name in enumerate(("unclassified", *part.classes))}
 
 
@@ -203,19 +203,19 @@ class Window:
                 yield Window(low, (last, min(self.high[1], first + WINDOW - 1)))
 
 
-def seen_from_above(voxels: Voxels, cell: int = 1) -> tuple[Mapping[str, Column], float, float]:
+def seen_from_above(voxels: ExportedVoxels, cell: int = 1) -> tuple[Mapping[str, VoxelColumn], float, float]:
     """Return the bands (H, W) float32 by name, first row the farthest ahead, and the coordinates of their corner."""
     extent = _fitting(_window(voxels, cell))
     return _bands(voxels, cell, extent), *_corner(voxels, extent, cell)
 
 
-def _axes(voxels: Voxels) -> tuple[Float64, Float64, Float64]:
+def _axes(voxels: ExportedVoxels) -> tuple[Float64, Float64, Float64]:
     if voxels.up is None:
         raise ConfigError("the up direction is not known; set up_axis of the dataset, and run again")
     return level_axes(voxels.up)
 
 
-def _covered(voxels: Voxels) -> tuple[Int64, Int64]:
+def _covered(voxels: ExportedVoxels) -> tuple[Int64, Int64]:
     """Return the cells (m, 2) of one voxel's width, and the voxel (m,) that covers each."""
     right, ahead, above = _axes(voxels)
     table, laid = voxels.table, voxels.laid
@@ -247,7 +247,7 @@ def _covered_by_turned(plane: Float64, axes: Float64, edge: float) -> tuple[Int6
     return np.concatenate(cells), np.concatenate(covering)
 
 
-def _window(voxels: Voxels, cell: int) -> Window:
+def _window(voxels: ExportedVoxels, cell: int) -> Window:
     """Return the cells that voxels cover."""
     cells = _covered(voxels)[0] // cell
     (low, first), (high, last) = cells.min(axis=0).tolist(), cells.max(axis=0).tolist()
@@ -266,14 +266,14 @@ def _fitting(window: Window) -> Window:
     return window
 
 
-def _corner(voxels: Voxels, extent: Window, cell: int) -> tuple[float, float]:
+def _corner(voxels: ExportedVoxels, extent: Window, cell: int) -> tuple[float, float]:
     """Return the coordinates west and north of a raster of these cells."""
     (right, ahead, _), edge = _axes(voxels), cell * voxels.table.voxel_size
     west, north = extent.low[1] * edge + voxels.offset @ right, (extent.high[0] + 1) * edge + voxels.offset @ ahead
     return float(west), float(north)
 
 
-def _abouts(voxels: Voxels) -> Iterator[tuple[str, str, str]]:
+def _abouts(voxels: ExportedVoxels) -> Iterator[tuple[str, str, str]]:
     """Yield name, unit and explanation of each band."""
     yield "class", "", "1 to K, of the topmost voxels"
     for name, column in voxels.columns.items():
@@ -282,7 +282,7 @@ def _abouts(voxels: Voxels) -> Iterator[tuple[str, str, str]]:
     yield "height", "m", "of the topmost voxel's centre"
 
 
-def _bands(voxels: Voxels, cell: int, window: Window) -> Mapping[str, Column]:
+def _bands(voxels: ExportedVoxels, cell: int, window: Window) -> Mapping[str, VoxelColumn]:
     """Return the bands of a window, by the voxels of the tiles that it shows."""
     fine, rows = _covered(voxels)
     inside = ((fine // cell >= window.low) & (fine // cell <= window.high)).all(axis=1)
@@ -297,7 +297,7 @@ def _bands(voxels: Voxels, cell: int, window: Window) -> Mapping[str, Column]:
     stable = (categories(voxels.table) == STABLE).astype(np.float64)
     values = {"class": label, **{name: over.mean(column.values) for name, column in voxels.columns.items()}}
     values |= {"stable": all_cells.mean(stable), "height": over.highest(height)}
-    return {name: Column(values[name].astype(np.float32), unit, about) for name, unit, about in _abouts(voxels)}
+    return {name: VoxelColumn(values[name].astype(np.float32), unit, about) for name, unit, about in _abouts(voxels)}
 
 
 class _Cells:
@@ -348,7 +348,7 @@ MOST_BYTES = 2**31
 """The most bytes of the meshes of a file: glTF counts in 32 bits, and trimesh makes a file in memory."""
 
 
-def write_mesh(chosen: Chosen, path: Path) -> int:
+def write_mesh(chosen: ExportedUnit, path: Path) -> int:
     """Write the sides of voxels that no other voxel hides, a mesh for each tile; return the number of voxels.
 
     glTF is in single precision: coordinates count from `origin`, and the scene's extras say where that is. glTF's y is
@@ -394,7 +394,7 @@ def write_mesh(chosen: Chosen, path: Path) -> int:
     return voxels
 
 
-def _adjacent(chosen: Chosen, tile: TileIndex) -> Int64:
+def _adjacent(chosen: ExportedUnit, tile: TileIndex) -> Int64:
     """Return the voxels (n, 3) of the tiles around one that may touch it."""
     adjacent, size = [np.zeros((0, 3), np.int64)], chosen.size
     for (dx, dy), axis, edge in (((1, 0), 0, 0), ((-1, 0), 0, -1), ((0, 1), 1, 0), ((0, -1), 1, -1)):

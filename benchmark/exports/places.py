@@ -14,7 +14,7 @@ from semstab.core.files import csv_text, write_json, write_text
 from semstab.data.georeference import INSTALL, Georeference
 from semstab.data.records import Record
 from semstab.errors import ConfigError, MissingDependencyError
-from semstab.exports.voxels import Chosen, Voxels
+from semstab.exports.voxels import ExportedUnit, ExportedVoxels
 from semstab.report.places import frame_names
 from semstab.statistics.observations import SpotObservations
 from semstab.statistics.places import Place, worst_places
@@ -31,7 +31,7 @@ def holds_places(file: Path) -> bool:
     return file.suffix.lower() == GEOJSON or (file.suffix.lower() == ".csv" and name == "places")
 
 
-def write_places(chosen: Chosen, record: Record, file: Path, most: int) -> tuple[int, Voxels]:
+def write_places(chosen: ExportedUnit, record: Record, file: Path, most: int) -> tuple[int, ExportedVoxels]:
     """Write the worst places among the chosen voxels, at most `most`; return their number and a part of the map.
 
     Raises:
@@ -60,7 +60,7 @@ def write_places(chosen: Chosen, record: Record, file: Path, most: int) -> tuple
     return len(places), part
 
 
-def _row(place: Place, point: Sequence[float], part: Voxels, names: Mapping[int, str]) -> dict[str, Any]:
+def _row(place: Place, point: Sequence[float], part: ExportedVoxels, names: Mapping[int, str]) -> dict[str, Any]:
     """Return what is known of a place, by name: coordinates are those of the other exports."""
     frames = [names.get(view.frame, str(view.frame)) for view in place.views]
     labels = ["" if view.label < 0 else part.classes[view.label] for view in place.views]
@@ -87,7 +87,7 @@ def geojson(
     rows: Sequence[Mapping[str, Any]],
     points: Sequence[Sequence[float]],
     degrees: Sequence[tuple[float, float]] | None,
-    part: Voxels,
+    part: ExportedVoxels,
 ) -> dict[str, Any]:
     """Return a collection of points: longitude and latitude (RFC 7946), or with a note metres of the scene."""
     where = {"crs": None, "note": LOCAL} if degrees is None else {"note": "longitude and latitude, WGS 84"}

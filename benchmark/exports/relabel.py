@@ -22,7 +22,7 @@ from semstab.engine.folder import load_result, model_of
 from semstab.engine.units import make_plan
 from semstab.errors import ConfigError, DataError
 from semstab.exports.fused_labels import Belief, FusedLabels, labels_of
-from semstab.exports.relabel_counts import Relabelled, Tally
+from semstab.exports.relabel_counts import PixelTally, Relabelled
 from semstab.predict.folder import NO_FOLDER_NAME, PredictionFolder, names_a_folder
 from semstab.task import Task, read, truth_task
 
@@ -90,7 +90,7 @@ def relabel(
             contextlib.closing(_folder(Path(out), name, task, record, belief, overwrite=overwrite))
         )
         fused = FusedLabels(Tiles.open(record.voxels_file, VoxelTable), belief, len(space))
-        tally = Tally(len(space))
+        tally = PixelTally(len(space))
         for done, (frame, rows, true_frame) in enumerate(_fused_frames(task, fused, pixel_stride), start=1):
             _write_map(folder, record.key, task, frame, rows)
             tally.add(frame, rows, true_frame)

@@ -31,7 +31,7 @@ class Accuracy:
 
 
 @dataclass(frozen=True)
-class Correctness:
+class RelabelCorrectness:
     """The accuracy of labels by ground truth, before and after: on all pixels, and on those with a label in both.
 
     Attributes:
@@ -69,7 +69,7 @@ class Relabelled:
     unseen: int
     unstable: int
     leave_one_out: bool = False
-    correctness: Correctness | None = None
+    correctness: RelabelCorrectness | None = None
 
     def lines(self) -> Iterator[str]:
         """Yield the report, a line each."""
@@ -89,7 +89,7 @@ class Relabelled:
             yield "  do not assess the stability of these maps: a voxel has one class in all of them"
 
 
-class Tally:
+class PixelTally:
     """A count of pixels, frame by frame."""
 
     def __init__(self, K: int) -> None:
@@ -124,8 +124,8 @@ class Tally:
             pairs = true[mask] * self._K + labels[mask]
             self._confusion[name] += np.bincount(pairs, minlength=self._K**2).reshape(self._K, self._K)
 
-    def correctness(self) -> Correctness | None:
+    def correctness(self) -> RelabelCorrectness | None:
         """Return the accuracies, or None without ground truth."""
         if not self._confusion["all_before"].any():
             return None
-        return Correctness(**{name: Accuracy.of(confusion) for name, confusion in self._confusion.items()})
+        return RelabelCorrectness(**{name: Accuracy.of(confusion) for name, confusion in self._confusion.items()})

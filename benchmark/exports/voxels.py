@@ -42,7 +42,7 @@ INDEX = ("ix", "iy", "iz")
 
 
 @dataclass(frozen=True, eq=False)
-class Column:
+class VoxelColumn:
     """A number of each voxel (n,), its unit, and a short description."""
 
     values: npt.NDArray[Any]
@@ -51,7 +51,7 @@ class Column:
 
 
 @dataclass(frozen=True, eq=False)
-class Voxels:
+class ExportedVoxels:
     """The voxels of a map that are exported, in the order of its table.
 
     Attributes:
@@ -66,7 +66,7 @@ class Voxels:
     """
 
     table: VoxelTable
-    columns: Mapping[str, Column]
+    columns: Mapping[str, VoxelColumn]
     classes: tuple[str, ...]
     colors: UInt8
     taxonomy: str
@@ -108,7 +108,7 @@ class Voxels:
         return (dominant(self.table) + 1).astype(np.min_scalar_type(self.table.K))
 
 
-class Chosen:
+class ExportedUnit:
     """The voxels of a unit that are exported, tile by tile; the latest tiles stay in memory.
 
     A voxel is exported if its OP is at least min_op, its dominant class is one of `classes` (any if `classes` is empty)
@@ -153,11 +153,11 @@ class Chosen:
     def __contains__(self, tile: TileIndex) -> bool:
         return tile in self._files
 
-    def __getitem__(self, tile: TileIndex) -> Voxels:
+    def __getitem__(self, tile: TileIndex) -> ExportedVoxels:
         """Return the voxels of a tile, which may be none."""
         return self._cache[tile]
 
-    def __iter__(self) -> Iterator[Voxels]:
+    def __iter__(self) -> Iterator[ExportedVoxels]:
         """Yield the voxels tile by tile, without empty tiles."""
         return (self[tile] for tile in self.tiles())
 
@@ -178,11 +178,11 @@ class Chosen:
             raise ConfigError(f"{self._record.voxels_file}: no voxel with {limits}; OP goes up to {self._highest}")
 
     @cached_property
-    def first(self) -> Voxels:
+    def first(self) -> ExportedVoxels:
         """The voxels of one tile, for the properties that all share."""
         return next(iter(self))
 
-    def _read(self, tile: TileIndex) -> Voxels:
+    def _read(self, tile: TileIndex) -> ExportedVoxels:
         """Read a tile and choose its voxels."""
         file, record = self._files[tile], self._record
         assert record.voxels_file is not None
@@ -200,7 +200,7 @@ class Chosen:
         }
         scene, model = record.unit.scene, record.unit.model
         georeference = self._result.georeference.get(scene)
-        return Voxels(
+        return ExportedVoxels(
             rows_of(table, keep),
             {name: replace(column, values=column.values[keep]) for name, column in columns.items()},
             names,
@@ -212,7 +212,7 @@ class Chosen:
         )
 
 
-def together(parts: Sequence[Voxels]) -> Voxels:
+def together(parts: Sequence[ExportedVoxels]) -> ExportedVoxels:
     """Return the voxels of several tiles as one."""
     if len(parts) == 1:
         return parts[0]
@@ -224,7 +224,7 @@ def together(parts: Sequence[Voxels]) -> Voxels:
     return replace(parts[0], table=VoxelTable.joined([part.table for part in parts]), columns=columns)
 
 
-def joined_columns(table: VoxelTable, file: Path) -> dict[str, Column]:
+def joined_columns(table: VoxelTable, file: Path) -> dict[str, VoxelColumn]:
     """Return the columns of a file with rows of these voxels, as `compare` writes it; 0, or NaN, without a row.
 
     Raises:
@@ -247,7 +247,7 @@ def joined_columns(table: VoxelTable, file: Path) -> dict[str, Column]:
         empty = np.nan if content[name].dtype.kind == "f" else 0
         values = np.full(len(table), empty, dtype=content[name].dtype)
         values[positions[joined]] = content[name][joined]
-        columns[name] = Column(values)
+        columns[name] = VoxelColumn(values)
     return columns
 
 
@@ -269,22 +269,22 @@ def rows_named(wanted: Sequence[str], names: Sequence[str], where: str) -> list[
     return [row_of_name[name_key(name)] for name in wanted]
 
 
-def _column(name: str, table: VoxelTable, file: Path) -> Column:
+def _column(name: str, table: VoxelTable, file: Path) -> VoxelColumn:
     """Return a column by its name: a measure, or one that the run wrote into its Parquet file."""
     measure_of_key = {measure.key: measure for measure in measures()}
     if name in measure_of_key:
-        return Column(measure_of_key[name].of(table), measure_of_key[name].unit, measure_of_key[name].title)
+        return VoxelColumn(measure_of_key[name].of(table), measure_of_key[name].unit, measure_of_key[name].title)
     if name == "op":
-        return Column(table.op, "frames", "observations")
+        return VoxelColumn(table.op, "frames", "observations")
     if name == "category":
-        return Column(categories(table), "", "0 low 1 drift 2 uncert 3 stable")
+        return VoxelColumn(categories(table), "", "0 low 1 drift 2 uncert 3 stable")
     if name == "psa":
-        return Column(psa(table), "", "pairwise semantic agreement")
+        return VoxelColumn(psa(table), "", "pairwise semantic agreement")
     in_file = parquet.names_in(file)
     if name not in in_file:
         available = sorted({*measure_of_key, "op", "category", "psa", *in_file} - {*INDEX, "label"})
         raise ConfigError(f"{file}: the run has no column '{name}'; {nearest(name, available)}")
-    return Column(VoxelTable.columns(file, [name])[name])
+    return VoxelColumn(VoxelTable.columns(file, [name])[name])
 
 
 def _colors(overview: Path, K: int) -> UInt8:
@@ -299,7 +299,7 @@ def _colors(overview: Path, K: int) -> UInt8:
 # Parquet and CSV have a row for each voxel, with its coordinates, the name of its class, and measures.
 
 
-def write_parquet(parts: Iterable[Voxels], path: Path) -> int:
+def write_parquet(parts: Iterable[ExportedVoxels], path: Path) -> int:
     """Write columns, part after part, and a metadata entry 'semstab' that describes them; return the number of voxels.
 
     An undefined value is null.
@@ -309,20 +309,20 @@ def write_parquet(parts: Iterable[Voxels], path: Path) -> int:
     return _written(parts, path, lambda file, schema: pq.ParquetWriter(file, schema, compression="zstd"))
 
 
-def write_csv(parts: Iterable[Voxels], path: Path) -> int:
+def write_csv(parts: Iterable[ExportedVoxels], path: Path) -> int:
     """Write columns, part after part; an undefined value is an empty field. Return the number of voxels."""
     from pyarrow import csv
 
     return _written(map(_in_csv, parts), path, csv.CSVWriter)
 
 
-def _in_csv(part: Voxels) -> Voxels:
+def _in_csv(part: ExportedVoxels) -> ExportedVoxels:
     """Return a part with names in which a spreadsheet sees no formula."""
     columns = {csv_text(name): column for name, column in part.columns.items()}
     return replace(part, columns=columns, classes=tuple(map(csv_text, part.classes)))
 
 
-def _written(parts: Iterable[Voxels], path: Path, opened: Callable[[Path, pa.Schema], Any]) -> int:
+def _written(parts: Iterable[ExportedVoxels], path: Path, opened: Callable[[Path, pa.Schema], Any]) -> int:
     """Write parts with a writer of Arrow; return the number of voxels."""
     voxels, writer = 0, None
     with atomic_path(path) as temporary, ExitStack() as open_files:
@@ -342,7 +342,7 @@ def _written(parts: Iterable[Voxels], path: Path, opened: Callable[[Path, pa.Sch
     return voxels
 
 
-def arrow(voxels: Voxels) -> pa.Table:
+def arrow(voxels: ExportedVoxels) -> pa.Table:
     """Return x, y, z in metres, class and category by their names, and the other columns."""
     import pyarrow as pa
 

@@ -149,7 +149,7 @@ def rows_in(keys: Int64, of: Int64) -> Int64:
 
 
 @dataclass(frozen=True)
-class _Content:
+class _GeometryContent:
     schema: int
     digests: str
     scenes: Mapping[str, Spots]
@@ -182,7 +182,7 @@ def load_geometry(path: Path, digests: str) -> Mapping[str, Spots]:
     Raises:
         DataError: If the file is damaged, or of other data.
     """
-    content = from_json(_Content, read_json(path), path)
+    content = from_json(_GeometryContent, read_json(path), path)
     if (content.schema, content.digests) != (SCHEMA, digests):
         raise DataError(f"{path}: it is of other data, or another version; write it with scripts/benchmark_digests.py")
     return content.scenes

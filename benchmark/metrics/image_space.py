@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from semstab.core.arrays import Rows
+from semstab.core.arrays import GrowingRows
 from semstab.core.types import Mask, UInt8
 from semstab.data.frames import Frame
 from semstab.data.measures import mean
@@ -58,7 +58,7 @@ class ImageSpaceMeter:
     """
 
     def __init__(self, rows: npt.ArrayLike = (), *, voxel_size: float = math.nan) -> None:
-        self.rows = Rows(len(COLUMNS), rows)
+        self.rows = GrowingRows(len(COLUMNS), rows)
         self._voxel_size = voxel_size
         self._previous: Frame | None = None
         self._by_truth = [VideoConsistency(n) for n in CLIPS]

@@ -14,21 +14,21 @@ from semstab.core.types import Float64, Int64
 from semstab.data.georeference import INSTALL, Georeference
 from semstab.engine.folder import load_result, model_of
 from semstab.errors import ConfigError, DataError, MissingDependencyError
-from semstab.exports.voxels import Chosen, Voxels
+from semstab.exports.voxels import ExportedUnit, ExportedVoxels
 from semstab.other_maps.agreement import (
-    ClassAgreement,
+    ClassMatch,
+    DifferingPlace,
     MapAgreement,
-    Place,
     RunMap,
     StratumAgreement,
     Voxelwise,
     agreement,
 )
-from semstab.other_maps.classes import NONE, Target, labels_of
+from semstab.other_maps.classes import NONE, RunClasses, labels_of
 from semstab.other_maps.clouds import Cloud, System, read_cloud
-from semstab.other_maps.placing import UNITS, Placement, better_placement, fused, index_of, on_surface
+from semstab.other_maps.placing import UNITS, MapPlacement, better_placement, fused, index_of, on_surface
 
-__all__ = ["ClassAgreement", "MapAgreement", "MapComparison", "Place", "StratumAgreement", "compare_maps"]
+__all__ = ["ClassMatch", "DifferingPlace", "MapAgreement", "MapComparison", "StratumAgreement", "compare_maps"]
 
 SYSTEMS: tuple[System, ...] = ("scene", "projection")
 
@@ -48,7 +48,7 @@ class MapComparison:
     """
 
     run: RunMap
-    first: Voxels
+    first: ExportedVoxels
     maps: tuple[Voxelwise, ...]
     scene: str
 
@@ -113,17 +113,17 @@ def compare_maps(
         raise ConfigError("name a map of another program: PLY, LAS, LAZ, NPZ or Parquet")
     if frame not in (None, *SYSTEMS):
         raise ConfigError(f"--frame {frame}: not known; it is scene or projection")
-    Placement.parse(unit, axes, shift, "scene")
+    MapPlacement.parse(unit, axes, shift, "scene")
     folder, model = model_of(run, model)
     result = load_result(folder)
     record = result.record(scene=scene, model=model, backend=backend)
-    first = Chosen(result, record, columns=("op",)).first
-    target = Target.of(first.classes, first.colors, first.taxonomy)
+    first = ExportedUnit(result, record, columns=("op",)).first
+    target = RunClasses.of(first.classes, first.colors, first.taxonomy)
     ours, compared = RunMap.of(record, first.classes), []
     for path, name in zip(map(Path, others), _names(others), strict=True):
         cloud = read_cloud(path, field)
         system = _system(cloud, frame, first.georeference)
-        placement = Placement.parse(unit, axes, shift, system)
+        placement = MapPlacement.parse(unit, axes, shift, system)
         labels = labels_of(
             cloud, target, None if classes is None else str(classes), None if colours is None else Path(colours)
         )
@@ -194,7 +194,7 @@ def _frame_notes(cloud: Cloud) -> tuple[str, ...]:
 
 
 def _compared(
-    cloud: Cloud, row: Int64, run: RunMap, placement: Placement, georeference: Georeference | None, name: str
+    cloud: Cloud, row: Int64, run: RunMap, placement: MapPlacement, georeference: Georeference | None, name: str
 ) -> Voxelwise:
     points, size = cloud.points, run.grid.size
     if cloud.faces is not None:

@@ -17,7 +17,7 @@ from semstab.metrics import strata
 from semstab.metrics.correctness import mean_iou
 from semstab.metrics.summary import groups_of
 from semstab.other_maps.classes import NONE
-from semstab.other_maps.placing import Grid, Placement, centers
+from semstab.other_maps.placing import Grid, MapPlacement, centers
 from semstab.statistics.correctness import join_truth
 
 EDGES = (1, 2, 5)
@@ -66,7 +66,7 @@ def _true(record: Record, grid: Grid) -> Int64 | None:
 
 
 @dataclass(frozen=True)
-class ClassAgreement:
+class ClassMatch:
     """Voxels of a class of the run that both maps hold and label.
 
     Attributes:
@@ -102,7 +102,7 @@ class StratumAgreement:
 
 
 @dataclass(frozen=True)
-class Place:
+class DifferingPlace:
     """Neighbouring voxels to which the maps give different classes, the same two for all.
 
     Attributes:
@@ -147,9 +147,9 @@ class MapAgreement:
     known: int
     accuracy: tuple[float, float]
     miou: tuple[float, float]
-    classes: tuple[ClassAgreement, ...]
+    classes: tuple[ClassMatch, ...]
     strata: tuple[StratumAgreement, ...]
-    places: tuple[Place, ...]
+    places: tuple[DifferingPlace, ...]
     notes: tuple[str, ...] = ()
     better: str = ""
 
@@ -190,7 +190,7 @@ class Voxelwise:
     theirs: Grid
     at: Int64
     area: Int64
-    placement: Placement
+    placement: MapPlacement
 
     def laid_together(self, run: RunMap) -> Union:
         """Return the voxels of both maps."""
@@ -222,7 +222,7 @@ def share(where: Mask, among: Mask) -> float:
 
 
 def agreement(
-    run: RunMap, theirs: Grid, name: str, points: int, outside: float, unlabelled: float, placement: Placement
+    run: RunMap, theirs: Grid, name: str, points: int, outside: float, unlabelled: float, placement: MapPlacement
 ) -> Voxelwise:
     """Compare the voxels of another map with the run's."""
     at, ours = run.grid.rows(theirs.index), run.grid.label
@@ -250,7 +250,7 @@ def _miou(label: Int64, true: Int64, has_truth: Mask, K: int) -> float:
     return float(mean_iou(*counts)) if has_truth.any() else math.nan
 
 
-def _by_class(run: RunMap, label: Int64, labelled: Mask, true: Int64) -> list[ClassAgreement]:
+def _by_class(run: RunMap, label: Int64, labelled: Mask, true: Int64) -> list[ClassMatch]:
     ours, K = run.grid.label, len(run.classes)
     confusion = np.bincount(ours[labelled] * K + label[labelled], minlength=K * K).reshape(K, K)
     rows = []
@@ -260,7 +260,7 @@ def _by_class(run: RunMap, label: Int64, labelled: Mask, true: Int64) -> list[Cl
         if n or of_class.any():
             instead = run.classes[int(confused.argmax())] if confused.any() else ""
             recall = share(ours == k, of_class), share(label == k, of_class)
-            rows.append(ClassAgreement(name, n, int(confusion[k, k]) / n if n else math.nan, instead, recall))
+            rows.append(ClassMatch(name, n, int(confusion[k, k]) / n if n else math.nan, instead, recall))
     return rows
 
 
@@ -278,7 +278,7 @@ def _by_op(run: RunMap, label: Int64, held: Mask, labelled: Mask, true: Int64) -
     return rows
 
 
-def _places(run: RunMap, label: Int64, differs: Mask, true: Int64) -> tuple[Int64, tuple[Place, ...]]:
+def _places(run: RunMap, label: Int64, differs: Mask, true: Int64) -> tuple[Int64, tuple[DifferingPlace, ...]]:
     """Return the number (n,) of each voxel's place, the largest first, 0 in none, and the places."""
     ours, K, size = run.grid.label, len(run.classes), run.grid.size
     area, count = connected(run.grid.index, ours * K + label, np.ones(len(ours)), differs)
@@ -292,7 +292,7 @@ def _places(run: RunMap, label: Int64, differs: Mask, true: Int64) -> tuple[Int6
         extent = float(np.linalg.norm(np.ptp(points, axis=0) + size))
         first = rows[0]
         class_names = run.classes[ours[first]], run.classes[label[first]], _most(true[rows], run.classes)
-        places.append(Place(k + 1, *class_names, len(rows), (x, y, z), extent))
+        places.append(DifferingPlace(k + 1, *class_names, len(rows), (x, y, z), extent))
     return area, tuple(places)
 
 

@@ -32,7 +32,7 @@ UNLABELLED = {name_key(name) for name in ("unclassified", "unlabelled", "unlabel
 
 
 @dataclass(frozen=True, eq=False)
-class Target:
+class RunClasses:
     """The classes of a run: their names, their ids in label maps, their colours (K, 3), and the rows by other names."""
 
     classes: tuple[str, ...]
@@ -42,7 +42,7 @@ class Target:
     row_of: Mapping[str, int]
 
     @classmethod
-    def of(cls, classes: tuple[str, ...], colors: UInt8, taxonomy: str) -> Target:
+    def of(cls, classes: tuple[str, ...], colors: UInt8, taxonomy: str) -> RunClasses:
         """Return the classes of a run; a taxonomy that ships has ids and members of each class."""
         row_of = {name_key(name): row for row, name in enumerate(classes)}
         try:
@@ -55,14 +55,14 @@ class Target:
 
 
 @dataclass(frozen=True, eq=False)
-class Labels:
+class PointLabels:
     """The class (n,) of each point as a row of the run's classes, NONE without one, and what to know about them."""
 
     row: Int64
     notes: tuple[str, ...]
 
 
-def labels_of(cloud: Cloud, target: Target, classes: str | None = None, colours: Path | None = None) -> Labels:
+def labels_of(cloud: Cloud, target: RunClasses, classes: str | None = None, colours: Path | None = None) -> PointLabels:
     """Return the class of each point.
 
     Args:
@@ -89,11 +89,11 @@ def labels_of(cloud: Cloud, target: Target, classes: str | None = None, colours:
     return labels
 
 
-def _by_name(names: npt.NDArray[Any], target: Target) -> Labels:
+def _by_name(names: npt.NDArray[Any], target: RunClasses) -> PointLabels:
     distinct, of = np.unique(names, return_inverse=True)
     rows = np.array([target.row_of.get(name_key(str(name)), NONE) for name in distinct], np.int64)
     row = np.maximum(rows, NONE)[of]
-    return Labels(row, _unknown(distinct, of, row))
+    return PointLabels(row, _unknown(distinct, of, row))
 
 
 def _unknown(distinct: npt.NDArray[Any], of: Int64, row: Int64) -> tuple[str, ...]:
@@ -108,7 +108,7 @@ def _unknown(distinct: npt.NDArray[Any], of: Int64, row: Int64) -> tuple[str, ..
     return (f"classes that the run does not have, their points have no class: {listed}",)
 
 
-def _by_id(cloud: Cloud, ids: npt.NDArray[Any], target: Target, classes: str | None) -> Labels:
+def _by_id(cloud: Cloud, ids: npt.NDArray[Any], target: RunClasses, classes: str | None) -> PointLabels:
     """Name ids by the file of classes, else by what the cloud states, else by ASPRS codes, else as the run's own."""
     notes: tuple[str, ...] = ()
     name_of_id: Mapping[int, str]
@@ -128,7 +128,7 @@ def _by_id(cloud: Cloud, ids: npt.NDArray[Any], target: Target, classes: str | N
     distinct, of = np.unique(ids, return_inverse=True)
     texts = np.array([name_of_id.get(int(k), "" if k < 0 else f"id {k}") for k in distinct], dtype=np.str_)
     labels = _by_name(texts[of], target)
-    return Labels(labels.row, (*notes, *labels.notes))
+    return PointLabels(labels.row, (*notes, *labels.notes))
 
 
 def names_by_id(classes: str) -> dict[int, str]:
@@ -148,14 +148,14 @@ def names_by_id(classes: str) -> dict[int, str]:
     return dict(zip(space.ids, space.classes, strict=True))
 
 
-def _of_asprs(target: Target) -> dict[int, str]:
+def _of_asprs(target: RunClasses) -> dict[int, str]:
     """Return the class of each ASPRS code that one class of the taxonomy alone has."""
     shipped = read_yaml(str(importlib.resources.files("semstab.configs") / "asprs.yaml")).get(target.taxonomy, {})
     shared = Counter(shipped.values())
     return {code: name for name, code in shipped.items() if shared[code] == 1}
 
 
-def _by_colour(cloud: Cloud, target: Target, colours: Path | None) -> Labels:
+def _by_colour(cloud: Cloud, target: RunClasses, colours: Path | None) -> PointLabels:
     if cloud.colors is None:
         raise ConfigError(f"{cloud.path}: its points have no colour; leave out --colours")
     from scipy.spatial import cKDTree
@@ -173,7 +173,7 @@ def _by_colour(cloud: Cloud, target: Target, colours: Path | None) -> Labels:
     if strange := float(np.mean(~near[of])):
         whose = "the run's palette" if colours is None else colours.name
         notes = (f"{strange:.1%} of the points have a colour of no class of {whose} (--colours names others)", *notes)
-    return Labels(row, notes)
+    return PointLabels(row, notes)
 
 
 def palette_of(file: Path) -> dict[str, Sequence[int]]:

@@ -29,7 +29,7 @@ FARTHEST = 2**30
 
 
 @dataclass(frozen=True)
-class Placement:
+class MapPlacement:
     """How coordinates of a file become those of the run's scene: times the unit, by its axes, plus the shift.
 
     Attributes:
@@ -45,7 +45,7 @@ class Placement:
     system: System = "scene"
 
     @classmethod
-    def parse(cls, unit: str, axes: str | None, shift: str | None, system: System) -> Placement:
+    def parse(cls, unit: str, axes: str | None, shift: str | None, system: System) -> MapPlacement:
         """Read the options.
 
         Raises:
@@ -81,7 +81,7 @@ class Placement:
             return georeference.in_scene(placed)
         return placed
 
-    def options(self, before: Placement) -> str:
+    def options(self, before: MapPlacement) -> str:
         """Return the options that lead here from another placement."""
         words = [] if self.system == before.system else [f"--frame {self.system}"]
         words += [] if self.unit == before.unit else [f"--unit {self.unit}"]
@@ -219,7 +219,7 @@ SMALL = 0.1
 class Found:
     """A placement that fits the map much better than the given one; the share of voxels that meet the map's in each."""
 
-    placement: Placement
+    placement: MapPlacement
     options: str
     share: float
     share_before: float
@@ -245,7 +245,7 @@ class _Fit:
 
 
 def better_placement(
-    points: Float64, row: Int64, grid: Grid, given: Placement, georeference: Georeference | None
+    points: Float64, row: Int64, grid: Grid, given: MapPlacement, georeference: Georeference | None
 ) -> Found | None:
     """Return a placement under which much more of a cloud lies in the map with its class, or None without one.
 
@@ -263,7 +263,7 @@ def better_placement(
     points, row = points[sample], row[sample]
     extent = float(np.linalg.norm(np.ptp(grid.index, axis=0) + 1.0)) * grid.size
 
-    def fit(placement: Placement) -> _Fit:
+    def fit(placement: MapPlacement) -> _Fit:
         placed = placement(points, georeference)
         if placement.unit != given.unit and float(np.linalg.norm(np.ptp(placed, axis=0))) < SMALL * extent:
             return _Fit(0.0, 0.0)
@@ -298,7 +298,7 @@ def _near(placed: Float64, grid: Grid) -> bool:
     )
 
 
-def _turned(configured: Placement, georeference: Georeference | None) -> Iterator[Placement]:
+def _turned(configured: MapPlacement, georeference: Georeference | None) -> Iterator[MapPlacement]:
     """Yield placements with other frames, units and axes, those that change least first."""
     systems: Sequence[System] = ("scene",) if georeference is None else ("scene", "projection")
     tried = [
@@ -311,12 +311,12 @@ def _turned(configured: Placement, georeference: Georeference | None) -> Iterato
     yield from sorted(tried, key=lambda placement: _changes(placement, configured))
 
 
-def _changes(placement: Placement, configured: Placement) -> int:
+def _changes(placement: MapPlacement, configured: MapPlacement) -> int:
     axes = sum(axis != before for axis, before in zip(placement.axes, configured.axes, strict=True))
     return 4 * (placement.system != configured.system) + 4 * (placement.unit != configured.unit) + axes
 
 
-def _shifted(placement: Placement, size: float) -> Iterator[Placement]:
+def _shifted(placement: MapPlacement, size: float) -> Iterator[MapPlacement]:
     """Yield placements that are shifted by half a voxel, along all axes first."""
     halves = sorted(itertools.product((-0.5, 0.0, 0.5), repeat=3), key=lambda step: -sum(map(abs, step)))
     for steps in halves:

@@ -7,7 +7,7 @@ import textwrap
 from collections.abc import Iterator
 
 from semstab.core.console import Console
-from semstab.other_maps.agreement import MapAgreement, Place
+from semstab.other_maps.agreement import DifferingPlace, MapAgreement
 from semstab.report.tables.table import Column, Group, Row, Table, to_terminal
 from semstab.report.terminal import WIDTH
 
@@ -104,7 +104,7 @@ def _places(agreements: tuple[MapAgreement, ...], run: str) -> Table:
     return Table("maps_places", "Where they differ", caption, columns, groups, "map")
 
 
-def _place(place: Place) -> Row:
+def _place(place: DifferingPlace) -> Row:
     x, y, z = place.centre
     return (str(place.number), place.ours, place.theirs, place.true, place.voxels, x, y, z, place.size)
 

@@ -12,7 +12,7 @@ from semstab.core.files import keep_only, write_json, write_text
 from semstab.data.results import slug
 from semstab.data.topdown import top_down
 from semstab.exports.places import degrees_of, geojson, places_table
-from semstab.other_maps.agreement import ONLY_OTHER, ONLY_RUN, OTHER, SAME, Place, Voxelwise
+from semstab.other_maps.agreement import ONLY_OTHER, ONLY_RUN, OTHER, SAME, DifferingPlace, Voxelwise
 from semstab.other_maps.placing import centers
 from semstab.other_maps.tables import short, tables
 from semstab.report.figures.located import Located
@@ -87,7 +87,7 @@ def _write_places(comparison: MapComparison, out: Path) -> list[Path]:
     return [out / "places.csv", out / "places.geojson"]
 
 
-def _row(name: str, place: Place, point: Any, georeference: Any) -> dict[str, Any]:
+def _row(name: str, place: DifferingPlace, point: Any, georeference: Any) -> dict[str, Any]:
     return {
         "map": name, "number": place.number, "class": place.ours, "class_of_map": place.theirs,
         "true_class": place.true, "voxels": place.voxels, "size_m": round(place.size, 3),

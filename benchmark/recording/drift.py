@@ -138,7 +138,7 @@ COLORS = (
 """The colours of numbered places, on the viewer's dark ground."""
 
 
-class View(NamedTuple):
+class FrameView(NamedTuple):
     """A frame without its images: its time, the camera that projects into it, if it is an image, and its label file."""
 
     timestamp: float | None
@@ -200,7 +200,7 @@ class DriftLog:
     def __init__(self, voxel_size: float) -> None:
         self._voxel_size = voxel_size
         self._moves: list[npt.NDArray[np.void]] = []  # records of MOVE, in the order of the frames
-        self._views: dict[int, View] = {}
+        self._views: dict[int, FrameView] = {}
 
     def follow(self, frame: Frame, changes: Changes) -> FrameChanges:
         """Store the moves of a frame that the map has fused; return its changes, for pictures."""
@@ -211,7 +211,7 @@ class DriftLog:
         self._moves += [moves] if len(moves) else []
         file = PurePath(frame.files.get("labels") or frame.files.get("scores") or "")
         name = file.name if file.suffix else ""
-        self._views[frame.index] = View(frame.timestamp, frame.intrinsics, np.array(frame.T_wc), frame.shape, name)
+        self._views[frame.index] = FrameView(frame.timestamp, frame.intrinsics, np.array(frame.T_wc), frame.shape, name)
         if sum(map(len, self._moves)) > MAX_MOVES:  # keep half of them: the moves of the voxels that were moved most
             all_moves = np.concatenate(self._moves)
             _, voxel = np.unique(all_moves["voxel"], return_inverse=True)

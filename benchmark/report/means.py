@@ -134,7 +134,7 @@ def over_recurrent(measure: Measure) -> Callable[[Pooled], float]:
 
 
 @dataclass(frozen=True)
-class Spread:
+class RepeatSpread:
     """The mean and standard deviation over the repeats of a random variation; sd is NaN for a single repeat."""
 
     mean: float
@@ -142,7 +142,7 @@ class Spread:
     repeats: int
 
     @classmethod
-    def of(cls, values: Sequence[float]) -> Spread:
+    def of(cls, values: Sequence[float]) -> RepeatSpread:
         """Return the statistics of the repeats where the value is defined."""
         defined = [value for value in values if not math.isnan(value)]
         sd = statistics.stdev(defined) if len(defined) > 1 else math.nan
@@ -156,9 +156,9 @@ class Level:
     value: float
     repeats: tuple[Pooled, ...]
 
-    def spread(self, measure: Callable[[Pooled], float]) -> Spread:
+    def spread(self, measure: Callable[[Pooled], float]) -> RepeatSpread:
         """Return a measure over the repeats."""
-        return Spread.of([measure(repeat) for repeat in self.repeats])
+        return RepeatSpread.of([measure(repeat) for repeat in self.repeats])
 
     def mean(self, measure: Callable[[Pooled], float]) -> float:
         """Return the measure's mean over the repeats."""

@@ -25,7 +25,7 @@ from semstab.metrics import CATEGORIES, CATEGORY_COLORS, NOT_ASSESSED, categorie
 from semstab.metrics.image_space import mean_over_scenes
 from semstab.report.charts import Joint, Line, dot_chart, line_chart, sample, tree_chart
 from semstab.report.figures.located import Located
-from semstab.report.figures.maps import Overview, Views
+from semstab.report.figures.maps import Overview, TopViews
 from semstab.report.figures.topdown import FromAbove
 from semstab.report.filter_study import advice, filter_studies, of_interest
 from semstab.report.html import filled, jpeg, lone_pictures, png, table_block
@@ -217,7 +217,7 @@ def _of_images(records: Sequence[Record]) -> Iterator[tuple[str, str, str]]:
 
 
 def _scenes(result: Result, folder: Path, above: Mapping[str, FromAbove]) -> Iterator[dict[str, Any]]:
-    views = Views()
+    views = TopViews()
     stored = [record for record in result.select() if record.voxels_file is not None]
     share = min(BYTES, ALL_BYTES // max(1, len(stored)))
     for scene in result.scenes:

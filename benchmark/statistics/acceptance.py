@@ -170,7 +170,7 @@ def calibrate(
     for k, name in enumerate(names):
         rows = np.flatnonzero((label == k) & (true >= 0))
         evidence = {by: value[rows] for by, value in values.items()}
-        sample = _Labels(index[rows], true[rows] == k, evidence, size)
+        sample = _ClassLabels(index[rows], true[rows] == k, evidence, size)
         result[name] = sample.least(precision, 1 - confidence)
     thresholds = AcceptanceThresholds(
         schema=SCHEMA, precision=precision, confidence=confidence, voxel_size=size, calibrated_on=on, classes=result
@@ -184,7 +184,7 @@ def calibrate(
     return thresholds.model_copy(update={"left": retained, "classes": classes})
 
 
-class _Labels:
+class _ClassLabels:
     """The labels of one class: their location (n, 3), their correctness (n,), and their evidence (n,) of each kind."""
 
     def __init__(self, index: Int32, right: Mask, evidence: Mapping[Evidence, Float64], size: float) -> None:

@@ -69,7 +69,7 @@ def rendered(frames: Iterable[Frame], world: VoxelTable, views: Iterable[Frame] 
     Raises:
         DataError: If a view is missing or differs in size from its frame.
     """
-    labels = _Labels(world)
+    labels = _DominantLabels(world)
     for frame, view in ((frame, frame) for frame in frames) if views is None else _paired(frames, views):
         rendered_labels = np.full(view.shape, labels.ignore, dtype=labels.dtype)
         rendered_labels[view.valid] = labels.at(voxel_index(back_project(view), world.voxel_size, view))
@@ -99,7 +99,7 @@ def losses(table: VoxelTable, limit: VoxelTable) -> Losses:
     )
 
 
-class _Labels:
+class _DominantLabels:
     """The dominant label of a map's voxel by its index; `ignore` where the map has no voxel."""
 
     def __init__(self, world: VoxelTable) -> None:

@@ -18,7 +18,7 @@ from typing import Any, TypeGuard
 import numpy as np
 import numpy.typing as npt
 
-from semstab.core.arrays import Rows
+from semstab.core.arrays import GrowingRows
 from semstab.core.types import Float64, Int32, Int64, Mask, UInt16
 from semstab.data.frames import Frame
 from semstab.data.labels import fixed
@@ -155,7 +155,7 @@ class Sampler:
         self._edge = math.nan
         self._low: Int64 = np.zeros(3, np.int64)
         self._columns: dict[str, npt.NDArray[Any]] = {}
-        self._views = Rows(VIEW)
+        self._views = GrowingRows(VIEW)
         self._frames = 0
         self._anchor: Anchor | None = None
         self._seen: dict[bytes, Anchor] = {}

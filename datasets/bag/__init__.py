@@ -16,7 +16,7 @@ from semstab.core.types import Float64
 from semstab.data.frames import Intrinsics
 from semstab.datasets.bag.finding import OfBags
 from semstab.datasets.bag.index import Content, Int64, read_once
-from semstab.datasets.bag.messages import Folder, Messages
+from semstab.datasets.bag.messages import Messages, TopicFolder
 from semstab.datasets.bag.options import BagOptions
 from semstab.datasets.bag.reading import NANOSECONDS, seconds
 from semstab.datasets.files.labels import SceneEntry
@@ -105,14 +105,16 @@ class Recorded:
         bag, folders = content.bag, []
         if chosen.depth is not None:
             places = [streams[chosen.depth.topic].place(k) for k in primary_rows]
-            folders.append(Folder.of_images(bag, chosen.depth, places, color=False))
+            folders.append(TopicFolder.of_images(bag, chosen.depth, places, color=False))
         if chosen.color is not None:
-            folders.append(Folder.of_images(bag, chosen.color, [name_stream.place(k) for k in named_rows], color=True))
+            folders.append(
+                TopicFolder.of_images(bag, chosen.color, [name_stream.place(k) for k in named_rows], color=True)
+            )
         for source, images in chosen.labels.items():
             stream = streams[images.topic]
             near = stream.near(name_stream.stamps[named_rows], options.max_difference)
             label_places = [None if k is None else stream.place(k) for k in near]
-            folders.append(Folder.of_images(bag, images, label_places, color=False))
+            folders.append(TopicFolder.of_images(bag, images, label_places, color=False))
             count = len(near) - near.count(None)
             self.sources.append(f"labels   {source}: {images}, of {count} of {len(primary_rows)} frames")
         self.messages = Messages(bag, folders, self._names)

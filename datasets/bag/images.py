@@ -49,7 +49,7 @@ DEPTH_HEADER = struct.Struct("<iff")
 
 
 @dataclass(frozen=True)
-class Kind:
+class ImageKind:
     """How the images of a topic are stored.
 
     Attributes:
@@ -67,27 +67,27 @@ class Kind:
         return " ".join(word for word in (self.encoding, "" if self.transport == "raw" else self.transport) if word)
 
 
-def kind_of(message: Any, type_: str, where: str) -> Kind:
+def kind_of(message: Any, type_: str, where: str) -> ImageKind:
     """Return how an image message of that type is stored.
 
     Raises:
         DataError: For a compression that is not read, with `where`.
     """
     if type_ == RAW:
-        return Kind(message.encoding, "raw", ".npy")
+        return ImageKind(message.encoding, "raw", ".npy")
     encoding, _, how = (part.strip() for part in message.format.partition(";"))
     data = message.data.tobytes()
     if "compressedDepth" in how or data[DEPTH_HEADER.size :].startswith(PNG_SIGNATURE):
         if not data[DEPTH_HEADER.size :].startswith(PNG_SIGNATURE):
             raise DataError(f"{where}: compressed depth of format {message.format!r} is not PNG; record it as png")
-        return Kind(encoding or "16UC1", "compressedDepth", ".npy" if encoding == "32FC1" else ".png")
+        return ImageKind(encoding or "16UC1", "compressedDepth", ".npy" if encoding == "32FC1" else ".png")
     for signature, suffix in ((JPEG_SIGNATURE, ".jpg"), (PNG_SIGNATURE, ".png")):
         if data.startswith(signature):
-            return Kind(encoding if how else "", "compressed", suffix)
+            return ImageKind(encoding if how else "", "compressed", suffix)
     raise DataError(f"{where}: compression {message.format!r} is neither JPEG nor PNG; record it as one of them")
 
 
-def content(message: Any, kind: Kind, where: str, *, color: bool) -> bytes:
+def content(message: Any, kind: ImageKind, where: str, *, color: bool) -> bytes:
     """Return an image message as the content of a file: of `color` as RGB (H, W, 3) uint8, else as it is stored.
 
     Raises:

@@ -15,8 +15,8 @@ from semstab.core.types import Float64
 from semstab.datasets.bag.cameras import camera_of, is_rectified
 from semstab.datasets.bag.options import BagOptions
 from semstab.datasets.bag.poses import SensorPoses
-from semstab.datasets.bag.reading import NANOSECONDS, OpenBag, Place, stamp_of
-from semstab.datasets.bag.topics import Chosen, Images, choose
+from semstab.datasets.bag.reading import NANOSECONDS, MessagePosition, OpenBag, stamp_of
+from semstab.datasets.bag.topics import ChosenTopics, Images, choose
 from semstab.datasets.geometry.cameras import Camera, nearest
 from semstab.datasets.geometry.lenses import Lens
 from semstab.errors import DataError
@@ -24,7 +24,7 @@ from semstab.errors import DataError
 Int64 = npt.NDArray[np.int64]
 
 
-class Stream:
+class TopicIndex:
     """The messages of a topic in the order of their stamps; of equal stamps the first that was recorded.
 
     Attributes:
@@ -47,9 +47,9 @@ class Stream:
         """Return the number of messages."""
         return len(self.stamps)
 
-    def place(self, k: int) -> Place:
+    def place(self, k: int) -> MessagePosition:
         """Return where in the bag a message is."""
-        return Place(int(self._times[k]), int(self._ranks[k]))
+        return MessagePosition(int(self._times[k]), int(self._ranks[k]))
 
     def since(self, start: int) -> Float64:
         """Return (n,) seconds since a stamp."""
@@ -85,17 +85,17 @@ class Arrivals:
         self._topic, self._by_bag = topic, stamps == "bag"
         self._stamps, self._times, self._ranks = array("q"), array("q"), array("q")
 
-    def add(self, place: Place, message: Any) -> None:
+    def add(self, place: MessagePosition, message: Any) -> None:
         """Add a message."""
         self._stamps.append(place.time if self._by_bag else stamp_of(message))
         self._times.append(place.time)
         self._ranks.append(place.rank)
 
-    def stream(self, path: Path) -> Stream:
+    def stream(self, path: Path) -> TopicIndex:
         """Return them in order; raises DataError, with the path of the bag, if no header has a stamp."""
         if not self._by_bag and len(self._stamps) > 1 and not any(self._stamps):
             raise DataError(f"{path}: all stamps in the headers of {self._topic} are 0; set stamps: bag")
-        return Stream(self._stamps, self._times, self._ranks)
+        return TopicIndex(self._stamps, self._times, self._ranks)
 
 
 @dataclass
@@ -121,8 +121,8 @@ class Content:
     """A bag, the topics that are read, its image messages by topic, its poses, and its cameras by images."""
 
     bag: OpenBag
-    chosen: Chosen
-    streams: dict[str, Stream]
+    chosen: ChosenTopics
+    streams: dict[str, TopicIndex]
     poses: SensorPoses
     cameras: dict[str, Cameras]
 

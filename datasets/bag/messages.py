@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from semstab.datasets.bag.images import content
-from semstab.datasets.bag.reading import OpenBag, Place
+from semstab.datasets.bag.reading import MessagePosition, OpenBag
 from semstab.datasets.bag.topics import Images
 from semstab.datasets.files.options import Folders
 from semstab.datasets.formats.disk import digest
@@ -20,7 +20,7 @@ Content = Callable[[Any, str], bytes]
 
 
 @dataclass(frozen=True)
-class Folder:
+class TopicFolder:
     """A topic as a folder of files.
 
     Attributes:
@@ -35,10 +35,12 @@ class Folder:
     topic: str
     suffix: str
     content: Content
-    places: Sequence[Place | None]
+    places: Sequence[MessagePosition | None]
 
     @classmethod
-    def of_images(cls, bag: OpenBag, images: Images, places: Sequence[Place | None], *, color: bool) -> Folder:
+    def of_images(
+        cls, bag: OpenBag, images: Images, places: Sequence[MessagePosition | None], *, color: bool
+    ) -> TopicFolder:
         """Return the folder of the images of a topic, those of `color` as RGB."""
 
         def read(message: Any, where: str) -> bytes:
@@ -61,7 +63,7 @@ class Messages(Folders):
         frames: The names of the frames.
     """
 
-    def __init__(self, bag: OpenBag, folders: Sequence[Folder], frames: Sequence[str]) -> None:
+    def __init__(self, bag: OpenBag, folders: Sequence[TopicFolder], frames: Sequence[str]) -> None:
         super().__init__()
         topics = [folder.topic for folder in folders]
         self._shared = {topic for topic in topics if topics.count(topic) > 1}
@@ -99,7 +101,7 @@ class Messages(Folders):
         """Return a hash of the same."""
         return super().digest(path) if self._locate(path) is None else digest(self.read(path))
 
-    def _message(self, topic: str, place: Place) -> Any:
+    def _message(self, topic: str, place: MessagePosition) -> Any:
         """Return a message; of a topic that is several folders each thread keeps its last one for the next file."""
         if topic not in self._shared:
             return self._bag.message(topic, place)
@@ -107,7 +109,7 @@ class Messages(Folders):
             self._last.message, self._last.key = self._bag.message(topic, place), (topic, place)
         return self._last.message
 
-    def _locate(self, path: Path) -> tuple[Folder, Place] | None:
+    def _locate(self, path: Path) -> tuple[TopicFolder, MessagePosition] | None:
         folder, name = os.path.split(path)
         topic = self._topics.get(folder)
         if topic is None:

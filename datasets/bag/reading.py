@@ -115,7 +115,7 @@ class Topic:
 
 
 @dataclass(frozen=True, slots=True)
-class Place:
+class MessagePosition:
     """Where a message is: the nanoseconds of its bag time, and how many of its topic come before it at that time."""
 
     time: int
@@ -193,16 +193,18 @@ class OpenBag:
         more = f", {len(short) - MOST_LISTED} more" if len(short) > MOST_LISTED else ""
         return ", ".join(short[:MOST_LISTED]) + more or "none"
 
-    def messages(self, topics: Sequence[str]) -> Iterator[tuple[str, Place, Any]]:
+    def messages(self, topics: Sequence[str]) -> Iterator[tuple[str, MessagePosition, Any]]:
         """Yield topic, place and message of all messages of the topics, in order of bag time, each read once.
 
         Raises:
             DataError: If the bag is damaged there.
         """
-        ranks: dict[str, Place] = {}
+        ranks: dict[str, MessagePosition] = {}
         for name, time, raw, kind in self._raw(topics):
             before = ranks.get(name)
-            place = ranks[name] = Place(time, before.rank + 1 if before is not None and before.time == time else 0)
+            place = ranks[name] = MessagePosition(
+                time, before.rank + 1 if before is not None and before.time == time else 0
+            )
             with self._one_line(f"{name} at {seconds(time)}"):
                 message = self._deserialize(raw, kind)
             yield name, place, message
@@ -211,7 +213,7 @@ class OpenBag:
         """Return the first message of a topic, or None without messages. Raises DataError."""
         return next((message for _, _, message in self.messages([topic])), None)
 
-    def message(self, topic: str, place: Place) -> Any:
+    def message(self, topic: str, place: MessagePosition) -> Any:
         """Return one message of a topic.
 
         Raises:

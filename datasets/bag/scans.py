@@ -17,8 +17,8 @@ from pydantic import BaseModel, Field
 from semstab.datasets.bag.clouds import CLOUD, classes_of, field_of, label_field_of, points_of, size_of
 from semstab.datasets.bag.finding import OfBags
 from semstab.datasets.bag.images import npy
-from semstab.datasets.bag.index import Arrivals, Stream
-from semstab.datasets.bag.messages import Folder, Messages, topic_path
+from semstab.datasets.bag.index import Arrivals, TopicIndex
+from semstab.datasets.bag.messages import Messages, TopicFolder, topic_path
 from semstab.datasets.bag.options import PoseOptions
 from semstab.datasets.bag.poses import POSES, TF, TF_TYPE, SensorPoses
 from semstab.datasets.bag.reading import NANOSECONDS, OpenBag, seconds
@@ -131,13 +131,13 @@ class RecordedScans:
         names = [str(stamp) for stamp in stream.stamps.tolist()]
         self.sources = [f"points   {self._topic} of {self._frame}, classes: {self._field or 'no field'}"]
         places, folder = [stream.place(k) for k in range(len(stream))], topic_path(bag, self._topic)
-        folders = [Folder(folder, self._topic, ".npy", lambda cloud, where: npy(points_of(cloud, where)), places)]
+        folders = [TopicFolder(folder, self._topic, ".npy", lambda cloud, where: npy(points_of(cloud, where)), places)]
         self.labels: dict[str, Path] = {}
         if field := self._field:
             class_folder = Path(f"{folder}.{field}")
             self.labels = {options.label_source or field: class_folder}
             folders.append(
-                Folder(
+                TopicFolder(
                     class_folder, self._topic, ".npy", lambda cloud, where: npy(classes_of(cloud, field, where)), places
                 )
             )
@@ -154,7 +154,7 @@ class RecordedScans:
             field_of(first, field_name, f"{self._bag.path}, {self._topic}, option label_field")
         return label_field_of(first) if field_name is None else field_name or None
 
-    def _stream(self) -> Stream:
+    def _stream(self) -> TopicIndex:
         """Return the clouds that have points, and read the poses."""
         arrivals, empty = Arrivals(self._topic, self._options.stamps), 0
         for topic, place, message in self._bag.messages(sorted({self._topic, *self._poses.topics})):
@@ -168,7 +168,7 @@ class RecordedScans:
             logger.warning("%s: %d clouds of %s have no point; left out", self._bag.path, empty, self._topic)
         return arrivals.stream(self._bag.path)
 
-    def _scans(self, stream: Stream, names: Sequence[str]) -> list[ScanSource]:
+    def _scans(self, stream: TopicIndex, names: Sequence[str]) -> list[ScanSource]:
         if not names:
             return []
         stamps, folder = stream.stamps.tolist(), topic_path(self._bag, self._topic)

@@ -7,7 +7,7 @@ from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 
 from semstab.config import nearest
-from semstab.datasets.bag.images import COMPRESSED, DEPTH_ENCODINGS, ID_ENCODINGS, IMAGES, RAW, Kind, kind_of
+from semstab.datasets.bag.images import COMPRESSED, DEPTH_ENCODINGS, ID_ENCODINGS, IMAGES, RAW, ImageKind, kind_of
 from semstab.datasets.bag.options import BagOptions
 from semstab.datasets.bag.poses import POSES, TF, TF_TYPE
 from semstab.datasets.bag.reading import OpenBag
@@ -30,7 +30,7 @@ class Images:
     """A topic of images: how they are stored, and the frame of the first one."""
 
     topic: str
-    kind: Kind
+    kind: ImageKind
     frame: str
 
     @property
@@ -44,7 +44,7 @@ class Images:
 
 
 @dataclass(frozen=True)
-class Chosen:
+class ChosenTopics:
     """The topics that a scene is read from; None or empty for a missing topic.
 
     Attributes:
@@ -64,7 +64,7 @@ class Chosen:
     others: tuple[str, ...]
 
 
-def choose(bag: OpenBag, options: BagOptions) -> Chosen:
+def choose(bag: OpenBag, options: BagOptions) -> ChosenTopics:
     """Return the topics of a bag that options name, else the likeliest ones.
 
     Raises:
@@ -110,7 +110,7 @@ def choose(bag: OpenBag, options: BagOptions) -> Chosen:
             f" (docs/datasets.md, TUM RGB-D); its topics: {bag.listed()}"
         )
     other_topics = [candidate.topic for candidate in depths + colors if candidate not in (depth, color)]
-    return Chosen(depth, color, labels, depth_info, color_info, tuple(other_topics))
+    return ChosenTopics(depth, color, labels, depth_info, color_info, tuple(other_topics))
 
 
 def has_depth(bag: OpenBag) -> bool:

@@ -24,8 +24,8 @@ from semstab.datasets.city.flight import FLIGHTS
 from semstab.datasets.city.labellers import relabelled
 from semstab.datasets.city.mesh import uavid8
 from semstab.datasets.city.options import CityOptions, SimulatedModel
-from semstab.datasets.city.rendering import LIGHTS, Caster, Rendered, render
-from semstab.datasets.city.simulation import Simulation, View
+from semstab.datasets.city.rendering import LIGHTS, CityCaster, Rendered, render
+from semstab.datasets.city.simulation import CityView, Simulation
 from semstab.datasets.city.town import Town, build_town
 from semstab.datasets.scene import GROUND_TRUTH, Dataset, Scene, fingerprint
 from semstab.errors import ConfigError, DataError
@@ -128,7 +128,7 @@ class CityScene(Scene):
         labels: UInt8 | None = rendered.classes
         scores = None
         if simulated is not None:
-            view = View(index, rendered, self.camera, T)
+            view = CityView(index, rendered, self.camera, T)
             simulation = Simulation(simulated, self._options.seed, model, self.name)
             labels = None if simulated.softness else relabelled(simulation, view)
             scores = simulation.scores(view) if simulated.softness else None
@@ -162,9 +162,9 @@ class CityScene(Scene):
         return build_town(self._options.seed, self._flight)
 
     @cached_property
-    def still(self) -> Caster:
+    def still(self) -> CityCaster:
         """Return the still part of the town, at which rays are cast."""
-        return Caster(self.town.still)
+        return CityCaster(self.town.still)
 
     def _share(self, index: int) -> float:
         """Return the share of the flight that is over at a frame."""
@@ -186,7 +186,7 @@ class CityScene(Scene):
         with self._lock:
             if index in self.rendered:
                 return self.rendered[index]
-            moving = Caster(self.town.moving(self._share(index) * self._flight.seconds, T[:3, 3]))
+            moving = CityCaster(self.town.moving(self._share(index) * self._flight.seconds, T[:3, 3]))
             size = (self._options.height, self._options.width)
             rendered = render((self.still, moving), T, self.camera, size, LIGHTS[self._options.light])
             stored = sum(other.nbytes for other in self.rendered.values())

@@ -8,7 +8,7 @@ import numpy as np
 import numpy.typing as npt
 
 from semstab.core.types import Float64, Int64
-from semstab.datasets.city.mesh import LOW_VEGETATION, ROAD, Surface, surface
+from semstab.datasets.city.mesh import LOW_VEGETATION, ROAD, TriangleSurface, surface
 
 SPACING = 4.0
 """Metres between vertices of the ground; layers on it lie further apart than its triangles stray from `height`."""
@@ -75,12 +75,14 @@ class Ground:
         x, y = c * s - d * t, d * s + c * t
         return np.stack([x, y, self.height(x, y) + above], axis=-1)
 
-    def stand(self, template: Surface, spots: Float64, size: Float64, tint: Float64, above: float) -> Surface:
+    def stand(
+        self, template: TriangleSurface, spots: Float64, size: Float64, tint: Float64, above: float
+    ) -> TriangleSurface:
         """Return upright copies of a template at `spots` (n, 3): plan coordinates s, t, and an angle in the plan."""
         s, t, angle = spots.T
         return template.place(self.points(s, t, above), self.yaw + angle, size, tint)
 
-    def drape(self, area: Rectangle, above: float, class_id: int, color: npt.ArrayLike) -> Surface:
+    def drape(self, area: Rectangle, above: float, class_id: int, color: npt.ArrayLike) -> TriangleSurface:
         """Return a rectangle of the plan laid over the ground, in cells of at most SPACING."""
         s, t = (
             np.linspace(low, high, int(np.ceil((high - low) / SPACING)) + 1)
@@ -88,7 +90,7 @@ class Ground:
         )
         return surface(self._grid(s, t, above), _grid_faces(len(s), len(t)), class_id, color)
 
-    def land(self, town: Rectangle) -> Surface:
+    def land(self, town: Rectangle) -> TriangleSurface:
         """Return asphalt under the whole town, and grass around it in ever larger triangles up to the horizon."""
         far = np.cumsum(SPACING * 1.25 ** np.arange(1, 21))
         far = far[far < HORIZON]
@@ -98,7 +100,7 @@ class Ground:
         middle = np.stack(np.meshgrid(s, t, indexing="ij"), axis=-1).reshape(-1, 2)[faces].mean(axis=1)
         paved = ((middle > (town.s0, town.t0)) & (middle < (town.s1, town.t1))).all(axis=1)
         classes = np.where(paved, ROAD, LOW_VEGETATION).astype(np.uint8)
-        return Surface(self._grid(s, t, 0.0), faces, classes, np.where(paved[:, None], ASPHALT, GRASS))
+        return TriangleSurface(self._grid(s, t, 0.0), faces, classes, np.where(paved[:, None], ASPHALT, GRASS))
 
     def _grid(self, s: Float64, t: Float64, above: float) -> Float64:
         gs, gt = np.meshgrid(s, t, indexing="ij")

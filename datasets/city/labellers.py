@@ -13,45 +13,45 @@ from semstab.core.types import UInt8
 from semstab.data.labels import IGNORE_8BIT
 from semstab.datasets.city.hashing import hash_integers
 from semstab.datasets.city.mesh import BUILDING, ROAD, TREE
-from semstab.datasets.city.simulation import Simulation, View
+from semstab.datasets.city.simulation import CityView, Simulation
 
 CLASSES, BORDER, CELL, DRAWS = 8, 4, 2.0, 3
 """Classes of the taxonomy; pixels about a border without label; metres of a cell of one label; predictions to agree."""
 
-Labeller = Callable[[UInt8, View, Simulation], UInt8]
+Labeller = Callable[[UInt8, CityView, Simulation], UInt8]
 
 
-def _blurred(predicted: UInt8, _view: View, _model: Simulation, size: int) -> UInt8:
+def _blurred(predicted: UInt8, _view: CityView, _model: Simulation, size: int) -> UInt8:
     """Return the class that most pixels of a window have."""
     shares = [cv2.blur((predicted == k).astype(np.float32), (size, size)) for k in range(CLASSES)]
     return np.asarray(np.argmax(shares, axis=0), np.uint8)
 
 
-def _coarse(predicted: UInt8, _view: View, _model: Simulation, size: int) -> UInt8:
+def _coarse(predicted: UInt8, _view: CityView, _model: Simulation, size: int) -> UInt8:
     """Return the label of the pixel in the middle of a block, for all of it."""
     v, u = (np.minimum(np.arange(n) // size * size + size // 2, n - 1) for n in predicted.shape)
     return np.asarray(predicted[v[:, None], u])
 
 
-def _without_borders(predicted: UInt8, _view: View, _model: Simulation) -> UInt8:
+def _without_borders(predicted: UInt8, _view: CityView, _model: Simulation) -> UInt8:
     window = np.ones((2 * BORDER + 1, 2 * BORDER + 1), np.uint8)
     border = cv2.dilate(predicted, window) != cv2.erode(predicted, window)
     return np.where(border, np.uint8(IGNORE_8BIT), predicted)
 
 
-def _without_doubt(predicted: UInt8, view: View, model: Simulation) -> UInt8:
+def _without_doubt(predicted: UInt8, view: CityView, model: Simulation) -> UInt8:
     """Return labels without the pixels that the model would label otherwise in another frame from the same position."""
     redrawn = [model.labels(dataclasses.replace(view, frame=view.frame + 10**6 * k)) for k in range(1, DRAWS)]
     sure = np.all([other == predicted for other in redrawn], axis=0) & (view.rendered.incidence > 0.5)
     return np.where(sure, predicted, np.uint8(IGNORE_8BIT))
 
 
-def _locked_to_the_world(predicted: UInt8, view: View, _model: Simulation) -> UInt8:
+def _locked_to_the_world(predicted: UInt8, view: CityView, _model: Simulation) -> UInt8:
     cells = (np.floor(axis / CELL).astype(np.int64) for axis in view.positions(slice(0, len(predicted))))
     return (hash_integers(11, *cells) % np.uint64(CLASSES)).astype(np.uint8)
 
 
-def _by_row(predicted: UInt8, _view: View, _model: Simulation) -> UInt8:
+def _by_row(predicted: UInt8, _view: CityView, _model: Simulation) -> UInt8:
     third = np.arange(len(predicted)) * 3 // len(predicted)
     return np.broadcast_to(np.array([BUILDING, TREE, ROAD], np.uint8)[third, None], predicted.shape)
 
@@ -71,7 +71,7 @@ LABELLERS: Mapping[str, Labeller] = {
 """The labellers by name; each changes a model's labels."""
 
 
-def relabelled(model: Simulation, view: View) -> UInt8:
+def relabelled(model: Simulation, view: CityView) -> UInt8:
     """Return the labels of a model, changed by its labeller if it has one; 255 for pixels without a surface."""
     predicted = model.labels(view)
     if not model.model.labeller:

@@ -12,7 +12,7 @@ from semstab.core.types import Float32, Float64, Int64, Mask, UInt8
 from semstab.data.frames import Intrinsics
 from semstab.data.labels import IGNORE_8BIT
 from semstab.datasets.city.hashing import hash_integers, uniform
-from semstab.datasets.city.mesh import LOW_VEGETATION, TREE, Surface
+from semstab.datasets.city.mesh import LOW_VEGETATION, TREE, TriangleSurface
 
 CHUNK = 1 << 18
 """Rays cast at a time, which bounds the memory of a large image."""
@@ -75,10 +75,10 @@ class Rendered:
         return self.depth.nbytes + self.classes.nbytes + self.incidence.nbytes + self.color.nbytes
 
 
-class Caster:
+class CityCaster:
     """Triangles to cast rays at: embree finds the triangle in float32, its plane gives the position in float64."""
 
-    def __init__(self, surface: Surface) -> None:
+    def __init__(self, surface: TriangleSurface) -> None:
         import trimesh
         from trimesh.ray.ray_pyembree import RayMeshIntersector
 
@@ -109,7 +109,7 @@ class Caster:
 
 
 def render(
-    casters: tuple[Caster, ...], T: Float64, intrinsics: Intrinsics, shape: tuple[int, int], light: Light
+    casters: tuple[CityCaster, ...], T: Float64, intrinsics: Intrinsics, shape: tuple[int, int], light: Light
 ) -> Rendered:
     """Render (H, W) pixels from the pose T (4, 4), relative to the town's origin."""
     depth, incidence = np.zeros((2, *shape), dtype=np.float32)
@@ -132,7 +132,7 @@ def row_chunks(shape: tuple[int, ...]) -> list[slice]:
 
 
 def _cast(
-    casters: tuple[Caster, ...], origin: Float64, directions: Float64, light: Light
+    casters: tuple[CityCaster, ...], origin: Float64, directions: Float64, light: Light
 ) -> tuple[Float64, Float64, UInt8, UInt8]:
     """Return depth (0 where nothing is), incidence, class and colour for each ray (n, 3)."""
     n = len(directions)
@@ -156,7 +156,7 @@ def _cast(
 
 
 def _brightness(
-    casters: tuple[Caster, ...], points: Float64, normals: Float64, classes: UInt8, light: Light
+    casters: tuple[CityCaster, ...], points: Float64, normals: Float64, classes: UInt8, light: Light
 ) -> Float64:
     """Return (n, 3) Lambert's law under one sun with cast shadows, with grain that is tied to the position."""
     facing = np.maximum(normals @ light.sun, 0.0)

@@ -23,7 +23,7 @@ BORDER_SCALE = 12
 
 
 @dataclass(frozen=True)
-class View:
+class CityView:
     """One frame as a model is given it.
 
     Attributes:
@@ -57,14 +57,14 @@ class Simulation:
         """(8, 8): for a true class in its row, the probability of each wrong class."""
         self._factors = np.array([model.difficulty.get(name, 1.0) for name in names] + [0.0])
 
-    def labels(self, view: View) -> UInt8:
+    def labels(self, view: CityView) -> UInt8:
         """Return predicted ids (H, W); 255 for pixels without a surface."""
         predicted = self._displaced_borders(view)
         for rows in row_chunks(predicted.shape):
             self._put_errors(view, rows, predicted[rows])
         return predicted
 
-    def scores(self, view: View) -> Float32:
+    def scores(self, view: CityView) -> Float32:
         """Return soft scores (H, W, 8) that sum to 1, the predicted class the largest; 0 without a surface."""
         predicted = self.labels(view)
         scores = np.zeros((*predicted.shape, len(self._weights)), dtype=np.float32)
@@ -79,7 +79,7 @@ class Simulation:
             scores[rows][labelled] = spread
         return scores
 
-    def _put_errors(self, view: View, rows: slice, predicted: UInt8) -> None:
+    def _put_errors(self, view: CityView, rows: slice, predicted: UInt8) -> None:
         """Put errors of place, view and frame into rows of predictions."""
         model, true = self.model, view.rendered.classes[rows]
         spot, cells = self._spots(view, rows)
@@ -99,15 +99,15 @@ class Simulation:
         u = uniform(rehash(hashes[struck], 1))
         predicted[struck] = (u[:, None] >= np.cumsum(self._weights, axis=1)[true[struck]]).sum(axis=1)
 
-    def _spots(self, view: View, rows: slice) -> tuple[UInt64, Int64]:
+    def _spots(self, view: CityView, rows: slice) -> tuple[UInt64, Int64]:
         """Return a hash of each pixel's cell, and the cell (3, h, W)."""
         cells = np.floor(view.positions(rows) / self.model.cell).astype(np.int64)
         return hash_integers(0, *cells), cells
 
-    def _of_frame(self, spot: UInt64, view: View, kind: str) -> UInt64:
+    def _of_frame(self, spot: UInt64, view: CityView, kind: str) -> UInt64:
         return rehash(rehash(spot, self._salts[kind]), view.frame)
 
-    def _displaced_borders(self, view: View) -> UInt8:
+    def _displaced_borders(self, view: CityView) -> UInt8:
         """Return the true label map, read at pixels displaced by a smooth field of at most `border` pixels an axis."""
         true = view.rendered.classes
         if not self.model.border:

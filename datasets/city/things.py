@@ -6,7 +6,7 @@ import numpy as np
 
 from semstab.core.types import Float64
 from semstab.datasets.city.ground import Ground
-from semstab.datasets.city.mesh import BUILDING, TREE, Surface, blob, box, join, surface
+from semstab.datasets.city.mesh import BUILDING, TREE, TriangleSurface, blob, box, join, surface
 
 STOREY = 2.9
 FOUNDATION = 2.0
@@ -28,7 +28,7 @@ def choose(colors: Float64, count: int, rng: np.random.Generator) -> Float64:
     return np.asarray(colors[rng.integers(len(colors), size=count)] * rng.uniform(0.88, 1.12, size=(count, 1)))
 
 
-def houses(rows: Float64, ground: Ground, rng: np.random.Generator) -> list[Surface]:
+def houses(rows: Float64, ground: Ground, rng: np.random.Generator) -> list[TriangleSurface]:
     """Return buildings under hip roofs; rows (n, 5) are s, t, and the extent along s, along t, and up to the eaves."""
     eaves = np.array([[-0.5, -0.5, 0], [0.5, -0.5, 0], [0.5, 0.5, 0], [-0.5, 0.5, 0], [-0.2, 0, 1], [0.2, 0, 1]])
     roof = surface(eaves, [[0, 1, 5], [0, 5, 4], [2, 3, 4], [2, 4, 5], [1, 2, 5], [3, 0, 4]], BUILDING)
@@ -36,15 +36,15 @@ def houses(rows: Float64, ground: Ground, rng: np.random.Generator) -> list[Surf
     return _buildings(rows, roof, size, TILES, ground, rng)
 
 
-def flats(rows: Float64, ground: Ground, rng: np.random.Generator) -> list[Surface]:
+def flats(rows: Float64, ground: Ground, rng: np.random.Generator) -> list[TriangleSurface]:
     """Return buildings under flat roofs; rows (n, 5) are as for houses."""
     size = np.stack([rows[:, 2] - 1, rows[:, 3] - 1, np.full(len(rows), 0.5)], axis=1)
     return _buildings(rows, box(BUILDING), size, FELT, ground, rng)
 
 
 def _buildings(
-    rows: Float64, roof: Surface, size: Float64, roofing: Float64, ground: Ground, rng: np.random.Generator
-) -> list[Surface]:
+    rows: Float64, roof: TriangleSurface, size: Float64, roofing: Float64, ground: Ground, rng: np.random.Generator
+) -> list[TriangleSurface]:
     """Return walls, roofs of a size, and a band of windows 3 cm in front of the walls on each storey."""
     foundation, spots = np.array([0, 0, FOUNDATION]), np.concatenate([rows[:, :2], np.zeros((len(rows), 1))], axis=1)
     walls, tiles = choose(WALLS, len(rows), rng), choose(roofing, len(rows), rng)
@@ -60,7 +60,7 @@ def _buildings(
     return surfaces
 
 
-def trees(rows: Float64, ground: Ground, rng: np.random.Generator) -> list[Surface]:
+def trees(rows: Float64, ground: Ground, rng: np.random.Generator) -> list[TriangleSurface]:
     """Return trees of four forms; rows (n, 3) are s, t and a size, 1 for 9 m."""
     surfaces = []
     for form_rows in np.array_split(rows, 4):
@@ -75,7 +75,7 @@ def trees(rows: Float64, ground: Ground, rng: np.random.Generator) -> list[Surfa
     return surfaces
 
 
-def car(class_id: int) -> Surface:
+def car(class_id: int) -> TriangleSurface:
     """Return a car 4.4 m long, 1.8 m wide, 1.45 m high; it drives along x and takes its paint as tint."""
     return join([
         box(class_id, (-2.2, 2.2), (-0.9, 0.9), (0, 0.82), taper=0.96),
@@ -84,7 +84,7 @@ def car(class_id: int) -> Surface:
     ])  # fmt: skip
 
 
-def person(class_id: int) -> Surface:
+def person(class_id: int) -> TriangleSurface:
     """Return a person 1.75 m high who takes the colour of their clothes as tint."""
     body = box(class_id, (-0.15, 0.15), (-0.25, 0.25), (0, 1.47), taper=0.9)
     return join([body, box(class_id, (-0.11, 0.11), (-0.1, 0.1), (1.47, 1.75), color=SKIN)])

@@ -13,7 +13,7 @@ import numpy as np
 from semstab.core.types import Float64
 from semstab.datasets.city.flight import Flight
 from semstab.datasets.city.ground import GRASS, Ground, Rectangle
-from semstab.datasets.city.mesh import CLUTTER, LOW_VEGETATION, ROAD, STATIC_CAR, Surface, join, surface
+from semstab.datasets.city.mesh import CLUTTER, LOW_VEGETATION, ROAD, STATIC_CAR, TriangleSurface, join, surface
 from semstab.datasets.city.things import PAINT, car, choose, flats, houses, trees
 from semstab.datasets.city.traffic import Movers, Street, traffic
 
@@ -35,10 +35,10 @@ class Town:
     """The ground, everything that stands still as one surface (metres, relative to the origin), and what moves."""
 
     ground: Ground
-    still: Surface
+    still: TriangleSurface
     movers: tuple[Movers, Movers]
 
-    def moving(self, seconds: float, camera: Float64) -> Surface:
+    def moving(self, seconds: float, camera: Float64) -> TriangleSurface:
         """Return the moving cars and people near the camera (x, y, z) at a time."""
         return join([movers.at(seconds, camera, self.ground) for movers in self.movers])
 
@@ -70,7 +70,7 @@ def _streets(low: float, high: float, rng: np.random.Generator) -> list[float]:
     return middles
 
 
-def _dashes(street: Street, ground: Ground) -> Surface:
+def _dashes(street: Street, ground: Ground) -> TriangleSurface:
     """Return the marking in the middle of a street: every second cell of a narrow strip."""
     ends, sides = (street.low, street.high), (street.at - 0.08, street.at + 0.08)
     strip = Rectangle(*ends, *sides) if street.along_s else Rectangle(*sides, *ends)
@@ -110,13 +110,13 @@ class _Site:
 
     ground: Ground
     rng: np.random.Generator
-    laid: list[Surface]
+    laid: list[TriangleSurface]
     houses: Rows = field(default_factory=list)
     flats: Rows = field(default_factory=list)
     trees: Rows = field(default_factory=list)
     cars: Rows = field(default_factory=list)
 
-    def surfaces(self) -> list[Surface]:
+    def surfaces(self) -> list[TriangleSurface]:
         """Return all that was laid out and put up."""
         g, rng = self.ground, self.rng
         cars, size = np.array(self.cars), rng.uniform([0.86, 0.95, 0.97], [1.08, 1.04, 1.2], size=(len(self.cars), 3))

@@ -10,7 +10,7 @@ import numpy as np
 
 from semstab.core.types import Float64
 from semstab.datasets.city.ground import Ground
-from semstab.datasets.city.mesh import HUMAN, MOVING_CAR, Surface
+from semstab.datasets.city.mesh import HUMAN, MOVING_CAR, TriangleSurface
 from semstab.datasets.city.things import PAINT, car, choose, person
 
 SIGHT = 140.0
@@ -26,10 +26,10 @@ class Street(NamedTuple):
     high: float
 
 
-class Kind(NamedTuple):
+class MoverKind(NamedTuple):
     """A kind of movers: surface; height, mean spacing and offset from a street's middle in metres; possible speeds."""
 
-    template: Surface
+    template: TriangleSurface
     above: float
     spacing: float
     offset: float
@@ -46,13 +46,13 @@ class Movers:
         size, tint: (n, 3) each.
     """
 
-    kind: Kind
+    kind: MoverKind
     lanes: Float64
     size: Float64
     tint: Float64
 
     @classmethod
-    def random(cls, kind: Kind, streets: Sequence[Street], rng: np.random.Generator) -> Movers:
+    def random(cls, kind: MoverKind, streets: Sequence[Street], rng: np.random.Generator) -> Movers:
         """Return movers on both sides of each street, who keep right; movers on one lane share a speed."""
         rows: list[tuple[float, ...]] = []
         for street in streets:
@@ -72,7 +72,7 @@ class Movers:
         heading = np.where(along_s, 0.0, np.pi / 2) + np.where(speed < 0, np.pi, 0.0)
         return np.stack([np.where(along_s, along, across), np.where(along_s, across, along), heading], axis=1)
 
-    def at(self, seconds: float, camera: Float64, ground: Ground) -> Surface:
+    def at(self, seconds: float, camera: Float64, ground: Ground) -> TriangleSurface:
         """Return the things at a time, those within SIGHT of the camera at (x, y, z)."""
         spots = self.spots(seconds)
         k = np.hypot(*(ground.points(*spots[:, :2].T)[:, :2] - camera[:2]).T) < SIGHT
@@ -81,6 +81,6 @@ class Movers:
 
 def traffic(streets: Sequence[Street], kerb: float, rng: np.random.Generator) -> tuple[Movers, Movers]:
     """Return cars on the lanes, and people on the sidewalks, which begin `kerb` metres from a street's middle."""
-    cars = Kind(car(MOVING_CAR), 0.0, spacing=38.0, offset=2.0, speeds=(6.0, 13.0))
-    people = Kind(person(HUMAN), 0.12, spacing=22.0, offset=kerb + 1.0, speeds=(0.9, 1.7))
+    cars = MoverKind(car(MOVING_CAR), 0.0, spacing=38.0, offset=2.0, speeds=(6.0, 13.0))
+    people = MoverKind(person(HUMAN), 0.12, spacing=22.0, offset=kerb + 1.0, speeds=(0.9, 1.7))
     return Movers.random(cars, streets, rng), Movers.random(people, streets, rng)

@@ -21,7 +21,7 @@ from semstab.datasets.files.options import (
     FrameSource,
     LabelOptions,
     Template,
-    Truth,
+    TruthSource,
     inside,
     matching_folders,
 )
@@ -284,7 +284,7 @@ class LabelMaps:
         frames: Sequence[Named],
         folders: Folders,
         own: Mapping[str, Path],
-        truth: Truth = NO_TRUTH,
+        truth: TruthSource = NO_TRUTH,
     ) -> None:
         labels, base = find_sources(options, entry, frames, folders, own), options.labels_root or entry.folder
         template = Template("regions", REGIONS, ("model", "name"), ("model", "name"))

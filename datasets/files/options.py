@@ -328,7 +328,7 @@ LabelReader = Callable[[FrameSource, Path, Read], Labels]
 
 
 @dataclass(frozen=True, eq=False)
-class Truth:
+class TruthSource:
     """Description of ground truth that a format brings in files that are not label maps of a taxonomy's ids.
 
     Attributes:
@@ -344,4 +344,4 @@ class Truth:
     moving: Collection[int] = ()
 
 
-NO_TRUTH = Truth()
+NO_TRUTH = TruthSource()

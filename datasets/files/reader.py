@@ -16,7 +16,7 @@ from semstab.config import nearest
 from semstab.core.files import cache_folder
 from semstab.data.georeference import Georeference
 from semstab.datasets.files.labels import SceneEntry
-from semstab.datasets.files.options import NO_TRUTH, FileOptions, Folders, FrameSource, Truth, inside
+from semstab.datasets.files.options import NO_TRUTH, FileOptions, Folders, FrameSource, TruthSource, inside
 from semstab.datasets.files.scene import FileScene
 from semstab.datasets.files.surfaces import SEEN_FROM_ABOVE, Surface
 from semstab.datasets.formats.disk import files_named, natural, subfolders
@@ -167,7 +167,7 @@ class FileDataset(ScenesBelow[OwnOptions]):
         """Return whether a folder of depth images is there, or is not needed, as a surface gives the depth."""
         return self.options.surface is not None or folder.is_dir()
 
-    def truth(self, folder: Path) -> Truth:
+    def truth(self, folder: Path) -> TruthSource:
         """Return what the format says of the ground truth of a scene's folder; raises DataError with the file."""
         return NO_TRUTH
 

@@ -21,8 +21,8 @@ from semstab.data.frames import Frame, Intrinsics
 from semstab.data.labels import LabelSpace
 from semstab.datasets.files.depth import shape_of, stored_depth, stored_scale
 from semstab.datasets.files.labels import LabelMaps, SceneEntry, label_paths
-from semstab.datasets.files.options import NO_TRUTH, FileOptions, Folders, FrameSource, Truth
-from semstab.datasets.files.surfaces import Surface, View
+from semstab.datasets.files.options import NO_TRUTH, FileOptions, Folders, FrameSource, TruthSource
+from semstab.datasets.files.surfaces import CameraView, Surface
 from semstab.datasets.formats import disk
 from semstab.datasets.formats.disk import read_pose
 from semstab.datasets.formats.images import (
@@ -89,7 +89,7 @@ class FileScene(Scene):
         entry: SceneEntry,
         frames: Sequence[FrameSource],
         options: FileOptions,
-        truth: Truth = NO_TRUTH,
+        truth: TruthSource = NO_TRUTH,
         surface: Surface | None = None,
         folders: Folders | None = None,
         label_folders: Mapping[str, Path] | None = None,
@@ -428,9 +428,9 @@ class FileScene(Scene):
         files |= {FEATURES + model: self._maps.features_file(source, model)}
         return {(index, what): path for what, path in files.items() if path is not None}
 
-    def _view(self, index: int) -> View:
+    def _view(self, index: int) -> CameraView:
         shape = shape_of(self._frame(index), self.options)
-        return View(self.intrinsics(index, shape), self.T_wc(index), shape)
+        return CameraView(self.intrinsics(index, shape), self.T_wc(index), shape)
 
     def _framed(
         self,

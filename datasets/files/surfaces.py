@@ -338,7 +338,7 @@ FAR = 1e30
 
 
 @dataclass(frozen=True, eq=False)
-class View:
+class CameraView:
     """A camera: T_wc (4, 4) camera-to-world, and its image of shape (H, W)."""
 
     intrinsics: Intrinsics
@@ -359,7 +359,7 @@ class Caster:
         nothing = np.zeros((1, 3), dtype=np.float32)
         self._scene.run(nothing, nothing + 1, query="DISTANCE")  # builds the tree, which one thread must do
 
-    def depth(self, view: View) -> Float32:
+    def depth(self, view: CameraView) -> Float32:
         """Return depth (H, W) along the optical axis in metres, 0 where a ray hits nothing."""
         (H, W), K, R = view.shape, view.intrinsics, view.T_wc[:3, :3]
         x = (np.arange(W) - K.cx) / K.fx
@@ -399,7 +399,7 @@ class Casts:
         self._folder = None if folder is None else folder / hashlib.blake2b(surface, digest_size=8).hexdigest()
         self._surface = surface
 
-    def get(self, view: View) -> Float32 | None:
+    def get(self, view: CameraView) -> Float32 | None:
         """Return the depth (H, W) of a view, or None if it is missing or damaged."""
         import pyarrow as pa
 
@@ -416,7 +416,7 @@ class Casts:
         change = np.ascontiguousarray(planes.T).view(np.uint32).reshape(H, W)
         return np.cumsum(change, axis=1, dtype=np.uint32).view(np.float32)
 
-    def put(self, view: View, depth: Float32) -> None:
+    def put(self, view: CameraView, depth: Float32) -> None:
         """Store the depth of a view."""
         import pyarrow as pa
 
@@ -432,7 +432,7 @@ class Casts:
             logger.warning("%s: cast depth cannot be stored (%s); set casts to a folder", self._folder, error.strerror)
             self._folder = None
 
-    def _file(self, view: View) -> Path | None:
+    def _file(self, view: CameraView) -> Path | None:
         if self._folder is None:
             return None
         digest = hashlib.blake2b(self._surface, digest_size=16)
@@ -494,7 +494,7 @@ class Surface:
             triangles, vertices=self._georeference.in_scene(triangles.vertices + np.array(self._mesh_origin))
         )
 
-    def depth(self, view: View) -> Float32:
+    def depth(self, view: CameraView) -> Float32:
         """Return depth (H, W) of a view along the optical axis in metres, 0 for pixels that see no surface."""
         depth = self._casts.get(view)
         if depth is None:
@@ -502,18 +502,18 @@ class Surface:
             self._casts.put(view, depth)
         return depth
 
-    def require_seen(self, views: Iterable[View]) -> None:
+    def require_seen(self, views: Iterable[CameraView]) -> None:
         """Raise DataError with the distance of the cameras if no view sees the surface."""
         centres = []
         for view in views:
             (H, W), (rows, columns), K = view.shape, PROBE, view.intrinsics
             small = min(H, W) <= max(PROBE)
-            if self._cast(view if small else View(K.resized((W, H), (columns, rows)), view.T_wc, PROBE)).any():
+            if self._cast(view if small else CameraView(K.resized((W, H), (columns, rows)), view.T_wc, PROBE)).any():
                 return
             centres.append(view.T_wc[:3, 3])
         raise DataError(f"{self.path}: no frame sees it: {_apart(self.triangles, np.array(centres))}")
 
-    def _cast(self, view: View) -> Float32:
+    def _cast(self, view: CameraView) -> Float32:
         with self._lock:
             if self._caster is None:
                 self._caster = Caster(self.triangles)

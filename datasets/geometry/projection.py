@@ -22,7 +22,7 @@ BEHIND, BEHIND_METRES = 1.1, 0.3
 
 
 @dataclass(frozen=True, eq=False)
-class Seen:
+class SeenPoints:
     """The points of a cloud that a camera sees, one a pixel.
 
     Attributes:
@@ -46,7 +46,9 @@ class Seen:
         return image
 
 
-def seen_points(points: npt.NDArray[np.floating[Any]], T_cl: Float64, K: Intrinsics, shape: tuple[int, int]) -> Seen:
+def seen_points(
+    points: npt.NDArray[np.floating[Any]], T_cl: Float64, K: Intrinsics, shape: tuple[int, int]
+) -> SeenPoints:
     """Return what a camera of an image (H, W) sees of points (N, 3), metres, that T_cl (4, 4) brings to its axes.
 
     Of the points on one pixel the nearest is seen. A LiDAR stands elsewhere than the camera and sees past edges: a
@@ -65,4 +67,4 @@ def seen_points(points: npt.NDArray[np.floating[Any]], T_cl: Float64, K: Intrins
     nearest[v, u], last[v, u] = z, np.arange(len(z))
     hidden = z > BEHIND * minimum_filter(nearest, size=AROUND)[v, u] + BEHIND_METRES
     visible = (last[v, u] == np.arange(len(z))) & ~hidden
-    return Seen(v[visible], u[visible], z[visible], inside[visible], shape)
+    return SeenPoints(v[visible], u[visible], z[visible], inside[visible], shape)

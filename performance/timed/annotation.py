@@ -20,7 +20,7 @@ from semstab.backends.shared.association import back_project
 from semstab.data.information import entropy_bits
 from semstab.exports.annotation import annotation_tasks
 from semstab.exports.relabel import task_of
-from semstab.exports.voxels import Chosen
+from semstab.exports.voxels import ExportedUnit
 from semstab.task import read, truth_task
 
 NONE = -1
@@ -101,8 +101,8 @@ def main(run: Path, model: str = "fcn", scores: str = "fcn-scores", most: int = 
         task, soft_task = (
             open_tasks.enter_context(task_of(run, own, result.manifest["inputs"]))[0] for own in (record, soft)
         )
-        tasks = annotation_tasks(Chosen(result, record, columns=("op",)), task, most)
-        images = Images(task, soft_task, Chosen(result, record, columns=("op",)).first.table.voxel_size)
+        tasks = annotation_tasks(ExportedUnit(result, record, columns=("op",)), task, most)
+        images = Images(task, soft_task, ExportedUnit(result, record, columns=("op",)).first.table.voxel_size)
     masks = []
     for one in tasks:
         mask = np.zeros(one.size[::-1], np.uint8)

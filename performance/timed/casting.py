@@ -21,7 +21,7 @@ from embreex.mesh_construction import TriangleMesh
 from embreex.rtcore_scene import EmbreeScene
 
 from semstab.data.frames import Intrinsics
-from semstab.datasets.files.surfaces import Surface, View
+from semstab.datasets.files.surfaces import CameraView, Surface
 
 HEIGHT = 45.0
 
@@ -43,7 +43,7 @@ def main(size: str = "4000x2250", triangles: int = 400_000, rounds: int = 3) -> 
     K = Intrinsics(0.745 * W, 0.745 * W, (W - 1) / 2, (H - 1) / 2)
     T_wc = np.diag([1.0, -1, -1, 1])
     T_wc[2, 3] = HEIGHT
-    views = [View(K, T_wc + 0.1 * k * np.eye(4)[:, 3:] * [[0, 0, 0, 1]], (H, W)) for k in range(rounds)]
+    views = [CameraView(K, T_wc + 0.1 * k * np.eye(4)[:, 3:] * [[0, 0, 0, 1]], (H, W)) for k in range(rounds)]
     v, u = np.mgrid[:H, :W]
     rays = np.stack([(u - K.cx) / K.fx, -(v - K.cy) / K.fy, np.full((H, W), -1.0)], axis=-1).astype(np.float32)
     rays = rays.reshape(-1, 3)
@@ -77,7 +77,7 @@ def main(size: str = "4000x2250", triangles: int = 400_000, rounds: int = 3) -> 
 
         def built() -> Surface:
             surface = Surface(path, casts=Path(folder))
-            surface.depth(View(K, T_wc, (2, 2)))
+            surface.depth(CameraView(K, T_wc, (2, 2)))
             return surface
 
         say("reading the mesh, building the tree", measuring.cpu_ms(built))

@@ -21,7 +21,7 @@ from semstab.data.frames import Intrinsics
 from semstab.data.labels import LabelSpace
 from semstab.data.voxels import VoxelTable
 from semstab.datasets import open_dataset
-from semstab.datasets.files.surfaces import Casts, View
+from semstab.datasets.files.surfaces import CameraView, Casts
 from semstab.engine.series import NUMBERS
 from semstab.engine.tiles import TileResult
 from semstab.engine.units import make_plan
@@ -48,7 +48,7 @@ def of_kept(folder: Path) -> Iterator[Kind]:
     result = folder / "8_frames.npz"
     TileResult({"a.csv": "0"}, series=np.zeros((3, len(NUMBERS))), sums={"strata": np.zeros(4)}).save(result)
     yield Kind("result of a tile", (result,), TileResult.load)
-    view = View(Intrinsics(12, 12, 7.5, 5.5), np.eye(4), (12, 16))
+    view = CameraView(Intrinsics(12, 12, 7.5, 5.5), np.eye(4), (12, 16))
     casts = Casts(folder / "casts", b"surface")
     casts.put(view, np.ones((12, 16), np.float32))
     yield Kind("cast depth", (next((folder / "casts").rglob("*.cast")),), lambda _: casts.get(view))

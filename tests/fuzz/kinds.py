@@ -141,9 +141,9 @@ def read_surface(path: Path, georeference: Georeference | None) -> None:
 
 
 def odm_view() -> Any:
-    from semstab.datasets.files.surfaces import View
+    from semstab.datasets.files.surfaces import CameraView
 
-    return View(CAMERA, down.pose(0), SHAPE)
+    return CameraView(CAMERA, down.pose(0), SHAPE)
 
 
 def of_settings(folder: Path) -> Iterator[Kind]:

@@ -20,7 +20,7 @@ from semstab.report.figures.distributions import (
     informative,
     together,
 )
-from semstab.report.figures.maps import Overview, Views, draw_overview, draw_stability
+from semstab.report.figures.maps import Overview, TopViews, draw_overview, draw_stability
 from semstab.report.figures.style import Figure
 from semstab.report.filter_study import of_interest
 from semstab.report.means import ENOUGH, by_model, complete_scenes, levels, swept
@@ -29,7 +29,7 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure as Canvas
 
 
-__all__ = ["Figure", "Views", "figures", "write_figures"]
+__all__ = ["Figure", "TopViews", "figures", "write_figures"]
 
 
 def write_figures(result: Result, folder: str | Path, out: Path | None = None, *, svg: bool = False) -> list[Path]:
@@ -50,7 +50,7 @@ def figures(result: Result, folder: str | Path) -> list[Figure]:
 
     Saved frames are taken from the study folder.
     """
-    views, result = Views(), of_interest(result)
+    views, result = TopViews(), of_interest(result)
     with_voxels = [record for record in result.select() if record.voxels_file is not None]
     return [
         *_overviews(result, with_voxels, views, Path(folder) / OVERVIEW),
@@ -60,7 +60,7 @@ def figures(result: Result, folder: str | Path) -> list[Figure]:
     ]
 
 
-def _overviews(result: Result, with_voxels: list[Record], views: Views, folder: Path) -> Iterator[Figure]:
+def _overviews(result: Result, with_voxels: list[Record], views: TopViews, folder: Path) -> Iterator[Figure]:
     """Yield one figure for each model, of the first scene that has a saved frame."""
     for model, records in by_model(with_voxels).items():
         for record in records:
@@ -70,7 +70,7 @@ def _overviews(result: Result, with_voxels: list[Record], views: Views, folder: 
                 break
 
 
-def _overview(record: Record, result: Result, views: Views, path: Path) -> Figure:
+def _overview(record: Record, result: Result, views: TopViews, path: Path) -> Figure:
     scene, model = record.unit.scene, record.unit.model
     up, georeference = result.up[scene], result.georeference.get(scene)
     return Figure(
@@ -86,7 +86,7 @@ def _overview(record: Record, result: Result, views: Views, path: Path) -> Figur
     )
 
 
-def _distributions(with_voxels: list[Record], views: Views) -> Iterator[Figure]:
+def _distributions(with_voxels: list[Record], views: TopViews) -> Iterator[Figure]:
     if not with_voxels:
         return
 
@@ -124,7 +124,7 @@ def _distributions(with_voxels: list[Record], views: Views) -> Iterator[Figure]:
     )
 
 
-def _maps(result: Result, with_voxels: list[Record], views: Views) -> Iterator[Figure]:
+def _maps(result: Result, with_voxels: list[Record], views: TopViews) -> Iterator[Figure]:
     panels = " and ".join(measure.title for measure in measures() if measure.panel)
     for record in with_voxels:
         scene, model = record.unit.scene, record.unit.model
@@ -141,7 +141,7 @@ def _maps(result: Result, with_voxels: list[Record], views: Views) -> Iterator[F
             )
 
 
-def _draw_map(record: Record, result: Result, views: Views) -> Canvas:
+def _draw_map(record: Record, result: Result, views: TopViews) -> Canvas:
     scene = record.unit.scene
     return draw_stability(views.above(record, result.up[scene]), result.georeference.get(scene))
 

@@ -342,7 +342,7 @@ def _handles(entries: Sequence[tuple[str, Any]]) -> list[Any]:
 # Figures show the voxels of units. Each table is read once: the figures of a unit are drawn one after the other.
 
 
-class Views:
+class TopViews:
     """The sums of every unit that was asked for, and the view from above of the last one."""
 
     def __init__(self) -> None:

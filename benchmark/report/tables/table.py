@@ -15,7 +15,7 @@ from typing import Any, Literal
 
 from semstab.core.files import csv_text
 from semstab.data.measures import Quantity
-from semstab.report.means import Spread
+from semstab.report.means import RepeatSpread
 from semstab.statistics import Estimate
 
 UNDEFINED = "--"
@@ -27,7 +27,7 @@ ALL_VOXELS, OF_ROW = "All voxels", "Of these voxels"
 POPULATIONS = {ALL_VOXELS: "_all", OF_ROW: "", "OP>=2": "_op2", "OP>=3": "_op3"}
 """Headings over columns of measures, and the suffix that their keys have for it."""
 
-Cell = str | int | float | Spread | Estimate
+Cell = str | int | float | RepeatSpread | Estimate
 Row = tuple[Cell, ...]
 
 
@@ -79,7 +79,7 @@ class Column:
         if isinstance(cell, Estimate):
             ends = "" if math.isnan(cell.low) else f" ({self.number(cell.low)}, {self.number(cell.high)})"
             return self.number(cell.value) + ends
-        if not isinstance(cell, Spread):
+        if not isinstance(cell, RepeatSpread):
             return self.number(cell)
         spread = "" if math.isnan(cell.sd) else f" ± {cell.sd:,.{self.digits}f}"
         return self.number(cell.mean) + spread
@@ -272,7 +272,7 @@ def sections(table: Table) -> Iterator[tuple[str, list[list[str]]]]:
 
 
 def _json_cell(cell: Cell) -> Any:
-    return dataclasses.asdict(cell) if isinstance(cell, Spread | Estimate) else cell
+    return dataclasses.asdict(cell) if isinstance(cell, RepeatSpread | Estimate) else cell
 
 
 def _leading(table: Table, cell: str) -> list[str]:
@@ -285,7 +285,7 @@ def _csv_parts(cells: Sequence[Cell]) -> list[str]:
 
     Its own field comes first, then that of the standard deviation over repeats, or those of the interval.
     """
-    if any(isinstance(cell, Spread) for cell in cells):
+    if any(isinstance(cell, RepeatSpread) for cell in cells):
         return ["", "_sd"]
     return ["", "_low", "_high"] if any(isinstance(cell, Estimate) for cell in cells) else [""]
 
@@ -296,7 +296,7 @@ def _csv_cells(column: Column, cell: Cell, parts: Sequence[str]) -> list[str]:
     if isinstance(cell, Estimate):
         values = [cell.value, cell.low, cell.high]
     else:
-        values = [cell.mean, cell.sd] if isinstance(cell, Spread) else [cell, math.nan, math.nan]
+        values = [cell.mean, cell.sd] if isinstance(cell, RepeatSpread) else [cell, math.nan, math.nan]
     return ["" if math.isnan(value) else column.number(value).replace(",", "") for value in values[: len(parts)]]
 
 
