@@ -59,6 +59,14 @@ def test_an_option_of_the_dataset_is_told_from_a_setting(tmp_path) -> None:
     assert "depth_scale is an option of the dataset; write --option depth_scale=500" in refused
 
 
+def test_a_template_of_paths_needs_no_quotes(tmp_path) -> None:
+    wall = tiny_scene.write(tmp_path / "wall", models=("a",))
+    (wall / "labels/a").rename(tmp_path / "a")
+    words = ("--option", f"labels_root={tmp_path}", "--option", "labels={model}/{name}.png", "--out", "run")
+    bench("--data", wall, *words, cwd=tmp_path)
+    assert (tmp_path / "run/summary.json").exists()
+
+
 def test_stored_labels_that_predictions_stand_for_are_named(tmp_path) -> None:
     wall = tiny_scene.write(tmp_path / "wall", models=("a",))
     words = "--data", wall, "--predict", "colour-clusters", "--model", "a"

@@ -241,7 +241,7 @@ def _open(comparisons: Sequence[Comparison]) -> str | None:
     says = [comparison.hypothesis.name for comparison in comparisons if comparison.is_open]
     if len(says) > MOST_OPEN:
         return "their edges lie on those of depth and colour no better than mirrored, turned or of another frame"
-    return f"these frames cannot tell whether they {', or '.join(says)}" if says else None
+    return f"their edges fit as well if they {', or '.join(says)}: these frames do not exclude it" if says else None
 
 
 def label_findings(

@@ -314,7 +314,8 @@ def chosen(
             inner = inner.setdefault(group, {})
             if not isinstance(inner, dict):
                 raise ConfigError(f"--set {setting}: '{group}' is given as an option too; use one of the two")
-        inner[key] = parse_yaml(text, f"--set {setting}")
+        template = "{name}" in text or "{model}" in text  # of paths, in which braces are no YAML
+        inner[key] = text if template else parse_yaml(text, f"--set {setting}")
     select_dataset(content, dataset, data, seed)
     _require_settings(settings or (), content)
     if frames is not None:
