@@ -1,14 +1,16 @@
-"""The README's pictures of the viewer: a run each, shown by a viewer without a window, and what it paints.
+"""The README's pictures of the viewer and of the report: a run each, shown without a window.
 
-    python scripts/viewer_pictures.py SHELF [--folder docs]
+    python scripts/viewer_pictures.py SHELF FLIGHT [--folder docs] [--only viewer.png viewer-compare.png report.png]
 
-SHELF is the folder of the shelf with its labels (docs/datasets.md says how it is laid out). Without a graphics card it
-takes Mesa's lavapipe (Debian: mesa-vulkan-drivers), a minute or two, and cores that are free.
+SHELF is the folder of the shelf with its labels, FLIGHT a drone flight with depth (docs/datasets.md says how both are
+laid out). Without a graphics card the viewer takes Mesa's lavapipe (Debian: mesa-vulkan-drivers), a minute or two, and
+cores that are free; the report takes Chromium and playwright.
 """
 
 from __future__ import annotations
 
 import argparse
+import shutil
 import subprocess
 import sys
 import tempfile
@@ -21,12 +23,13 @@ from rerun.experimental import ViewerClient
 
 from semstab.recording.screenshot import SETTLED_S, headless, paint
 
-WIDTH = 1200
-"""Pixels of a picture."""
+WIDTH, REPORT = 1200, (1000, 1480)
+"""Pixels of a picture of the viewer, and of the report."""
 
 CITY = ["--scene", "scene0", "--check", "none"]
 SHELF = ["--voxel-size", "0.01", "--model", "fcn", "--backend", "numba", "--backend", "open3d-projective",
          "--check", "none"]  # fmt: skip
+FLIGHT = ["--predict", "colour-clusters", "--model", "colour-clusters", "--rerun", "off"]
 
 
 def show(client: ViewerClient, tab: str) -> None:
@@ -51,23 +54,41 @@ def small(path: Path) -> None:
     smaller.save(path, optimize=True)
 
 
+def report(run: Path, picture: Path) -> None:
+    """Take a picture of the beginning of a run's report."""
+    from playwright.sync_api import sync_playwright
+
+    with sync_playwright() as started:
+        browser = started.chromium.launch(executable_path=shutil.which("chromium"), args=["--no-sandbox"])
+        page = browser.new_page(viewport={"width": REPORT[0], "height": REPORT[1]})
+        page.goto((run / "report.html").absolute().as_uri())
+        page.wait_for_timeout(1000.0 * SETTLED_S)
+        page.screenshot(path=picture)
+        browser.close()
+
+
 def main() -> None:
-    """Make both."""
+    """Make the pictures."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("shelf")
+    parser.add_argument("flight")
+    parser.add_argument("--only", nargs="+", default=["viewer.png", "viewer-compare.png", "report.png"])
     parser.add_argument("--folder", type=Path, default=Path(__file__).parents[1] / "docs")
     arguments = parser.parse_args()
     arguments.folder.mkdir(parents=True, exist_ok=True)
     pictures = {
         "viewer.png": (CITY, ""),
         "viewer-compare.png": (["--data", arguments.shelf, *SHELF], "fcn: numba and open3d-projective"),
+        "report.png": (["--data", arguments.flight, *FLIGHT], ""),
     }
-    for name, (words, tab) in pictures.items():
+    for name in arguments.only:
+        words, tab = pictures[name]
         with tempfile.TemporaryDirectory() as folder:
             run = Path(folder) / "run"
-            subprocess.run(
-                [sys.executable, "-m", "semstab", *words, "--report", "off", "--quiet", "--out", str(run)], check=True
-            )
+            subprocess.run([sys.executable, "-m", "semstab", *words, "--quiet", "--out", str(run)], check=True)
+            if name == "report.png":
+                report(run, arguments.folder / name)
+                continue
             with headless(run / "recording.rrd") as client:
                 if tab:
                     show(client, tab)
