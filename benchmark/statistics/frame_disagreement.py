@@ -34,7 +34,7 @@ LEAST_EXCESS = 0.03
 """Share of its places by which a frame stands out at least: 3 in 100."""
 
 LEVEL = 0.025
-"""Nominal level at which a frame is named if no frame is bad; 0 to 5 of 100 simulated runs (docs/validity.md)."""
+"""Nominal level at which a frame is named if no frame is bad; 1 to 7 of 100 simulated runs (docs/validity.md)."""
 
 LEAST_ODDS = 0.001
 """Added to both shares of the odds, so that they are finite; a few places then hardly move the odds."""
