@@ -36,9 +36,9 @@ def tables(agreements: tuple[MapAgreement, ...], run: str) -> list[Table]:
 def overview(agreements: tuple[MapAgreement, ...], run: str) -> Table:
     """Return the table with a row for each map."""
     columns = (
-        Column("map", "Map"), Column("voxels", "Voxels", 0), Column("covers", "Holds %", 1),
+        Column("map", "Map"), Column("voxels", "Voxels", 0), Column("covers", "Has of run %", 1),
         Column("covered", "In run %", 1), Column("outside", "Points outside %", 1),
-        Column("unlabelled", "No class %", 1), Column("same", "Same %", 1),
+        Column("unlabelled", "No class %", 1), Column("same", "Same class %", 1),
         Column("accuracy_run", "run", 3, over="Acc."), Column("accuracy_map", "map", 3, over="Acc."),
         Column("miou_run", "run", 3, over="mIoU"), Column("miou_map", "map", 3, over="mIoU"),
     )  # fmt: skip
@@ -48,8 +48,8 @@ def overview(agreements: tuple[MapAgreement, ...], run: str) -> Table:
         for row in agreements
     )  # fmt: skip
     caption = (
-        f"Holds: the share of the voxels of {run} that the map holds; in run: the share of the map's voxels that {run}"
-        " holds. Same: the share with one class, of the voxels that both hold and label. Accuracy (acc.) and mIoU are"
+        f"Has of run: the share of the voxels of {run} that are in the map; in run: the share of the map's voxels that"
+        f" are in {run}. Same class: of the voxels that both have and label. Accuracy (acc.) and mIoU are"
         " of those voxels whose true class is known."
     )
     return Table("maps", f"Maps of other programs and {run}", caption, columns, (Group("", rows),), "")
@@ -57,7 +57,7 @@ def overview(agreements: tuple[MapAgreement, ...], run: str) -> Table:
 
 def _classes(agreements: tuple[MapAgreement, ...], run: str) -> Table:
     columns = (
-        Column("class", "Class"), Column("voxels", "Voxels", 0), Column("same", "Same %", 1),
+        Column("class", "Class"), Column("voxels", "Voxels", 0), Column("same", "Same class %", 1),
         Column("instead", "Most often instead"), Column("recall_run", "run", 3, over="Recall"),
         Column("recall_map", "map", 3, over="Recall"),
     )  # fmt: skip
@@ -65,14 +65,14 @@ def _classes(agreements: tuple[MapAgreement, ...], run: str) -> Table:
         Group(agreement.name, tuple((c.name, c.voxels, 100 * c.same, c.instead, *c.recall) for c in agreement.classes))
         for agreement in agreements
     )
-    caption = f"Voxels that both hold and label, by their class in {run}; recall is by the true class."
+    caption = f"Voxels that both have and label, by their class in {run}; recall is by the true class."
     return Table("maps_classes", "By class", caption, columns, groups, "map")
 
 
 def _strata(agreements: tuple[MapAgreement, ...], run: str) -> Table:
     columns = (
-        Column("op", "OP"), Column("voxels", "Voxels", 0), Column("covers", "Holds %", 1),
-        Column("same", "Same %", 1), Column("accuracy_run", "run", 3, over="Acc."),
+        Column("op", "OP"), Column("voxels", "Voxels", 0), Column("covers", "Has of run %", 1),
+        Column("same", "Same class %", 1), Column("accuracy_run", "run", 3, over="Acc."),
         Column("accuracy_map", "map", 3, over="Acc."),
     )  # fmt: skip
     groups = tuple(
@@ -82,7 +82,7 @@ def _strata(agreements: tuple[MapAgreement, ...], run: str) -> Table:
         )
         for agreement in agreements
     )
-    caption = f"Voxels of {run} by the number of frames that saw them; holds: the share that the other map holds."
+    caption = f"Voxels of {run} by the number of frames that saw them; has of run: the share that is in the other map."
     return Table("maps_op", "By OP", caption, columns, groups, "map")
 
 
