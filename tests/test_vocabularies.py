@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import dataclasses
+
 import numpy as np
 import pytest
 import yaml
@@ -140,6 +142,103 @@ def test_the_network_runs_once(tmp_path):
           "--vocabulary", "three.yaml", cwd=tmp_path)  # fmt: skip
     assert (tmp_path / "calls").read_text() == "x" * 12
     assert [*semstab.load_result(tmp_path / "run").models] == ["net", "net@five", "net@three"]
+
+
+def test_each_name_is_left_out_in_one_run(tmp_path):
+    """A name that is mixed up with another one costs alpha; what leaving it out changes is counted by hand."""
+    from semstab.report.tables import tables
+    from semstab.statistics import SpotObservations
+
+    room(tmp_path / "room")
+    mixed = EMBEDDINGS.copy()
+    mixed[3] = mixed[0] + 0.05 * mixed[3]  # 'crate' is much like 'room'
+    vocabulary(tmp_path, embeddings=mixed)
+    words = "room", "--voxel-size", "0.2", "-o", "run", "--no-truth"
+    bench(*words, "--vocabulary", "five.yaml,without=each", cwd=tmp_path)
+    result = semstab.load_result(tmp_path / "run")
+    assert [*result.models] == ["net", "net@five", *(f"net@five,without={name}" for name in CLASSES)]
+    (table,) = (table for table in tables(result) if table.name == "prompts")
+    (group,) = table.groups
+    assert group.name == "net@five"
+    assert group.rows[0][0] == "all names"
+    rows = {row[0]: row for row in group.rows[1:]}
+    assert {*rows} == {f"without {name}" for name in CLASSES}
+    assert {group.rows[1][0], group.rows[2][0]} == {"without room", "without crate"}
+    full, less = (
+        SpotObservations.load(result.record(model=name).observations_file)
+        for name in ("net@five", "net@five,without=crate")
+    )
+    alpha = [value(sums_of_spots(sample), "alpha") for sample in (full, less)]
+    _, _, change, changed, most, share = rows["without crate"]
+    assert change.value == pytest.approx(alpha[1] - alpha[0], abs=1e-6)
+    assert 0 < change.low < change.value < change.high
+    assert changed == pytest.approx(100 * np.mean(full.label == CLASSES.index("crate")))  # others keep their label
+    assert most == "crate to room"
+    assert share > 90
+    shown = bench("show", "run", "prompts", cwd=tmp_path).stdout
+    assert "without shelf" in shown
+
+
+def test_names_change_as_the_text_beside_the_file_says(tmp_path, monkeypatch):
+    """Names are left out, added and renamed; a new name is encoded, the others are not encoded again."""
+    from semstab.predict import vocabulary as module
+
+    known = {
+        name: row.astype(np.float32)
+        for name, row in zip((*CLASSES, "lamp", "rack"), [*EMBEDDINGS, *EMBEDDINGS[:2] + 1], strict=True)
+    }
+    asked = []
+    monkeypatch.setattr(
+        module, "_encoded", lambda encoder, words, path: (asked.append(words), np.stack([known[w] for w in words]))[1]
+    )
+    path = tmp_path / "five.yaml"
+    path.write_text(yaml.safe_dump({"names": [*CLASSES], "encoder": {"checkpoint": "clip"}}))
+    texts = ["", ",without=crate,add=lamp", ",rename=shelf:rack"]
+    full, other, renamed = module.named([f"{path}{text}" for text in texts]).values()
+    assert other.space.name == "five,without=crate,add=lamp"
+    assert other.space.classes == (*(name for name in CLASSES if name != "crate"), "lamp")
+    assert renamed.space.classes == tuple("rack" if name == "shelf" else name for name in CLASSES)
+    assert asked == [[*CLASSES], ["lamp"], ["rack"]]
+    for words in (full, other, renamed):
+        expected = np.stack([known[name] / np.linalg.norm(known[name]) for name in words.space.classes])
+        assert words.embeddings == pytest.approx(expected, abs=1e-6)
+
+
+def test_a_name_in_other_words_is_no_change(tmp_path):
+    """Renaming with the same labels changes none; a label that is taken away becomes another one, or none."""
+    from semstab.comparison.prompts import effect
+    from semstab.predict.prompts import Changes
+    from semstab.statistics import SpotObservations
+
+    room(tmp_path / "room")
+    bench("room", "--voxel-size", "0.2", "-o", "run", "--no-truth", "--vocabulary", vocabulary(tmp_path), cwd=tmp_path)
+    full = SpotObservations.load(semstab.load_result(tmp_path / "run").record(model="net@five").observations_file)
+    same = dataclasses.replace(full, classes=("space", *full.classes[1:]))
+    found = effect(full, same, Changes(rename=((full.classes[0], "space"),)))
+    assert (found.changed, found.most, found.difference.value) == (0, "", 0)
+    silent = dataclasses.replace(full, label=np.where(full.label == 1, full.K, full.label).astype(np.uint16))
+    found = effect(full, silent, Changes(without=(full.classes[1],)))
+    assert found.changed == pytest.approx(np.mean(full.label == 1))
+    assert found.most == f"{full.classes[1]} to no label"
+
+
+@pytest.mark.parametrize(
+    ("text", "line"),
+    [
+        ("without=crat", "no name 'crat'; did you mean 'crate'?"),
+        ("without=", "'without=' says no name; write without=NAME"),
+        ("rename=crate", "'rename=crate' says no name; write rename=OLD:NEW"),
+        ("add=lamp", "five.yaml holds embeddings, of its own names alone; give it an encoder, or put 'lamp' into the"),
+        ("without=each,without=crate", "without=each stands alone"),
+        (",".join(f"without={name}" for name in CLASSES[1:]), "leaves 1 name; at least 2 are needed"),
+    ],
+)
+def test_a_bad_change_of_names_is_one_line(tmp_path, text, line):
+    room(tmp_path / "room", frames=2)
+    vocabulary(tmp_path)
+    error = error_of("room", "--voxel-size", "0.2", "-o", "run", "--vocabulary", f"five.yaml,{text}", cwd=tmp_path)
+    assert line in error
+    assert not (tmp_path / "run").exists()
 
 
 @pytest.mark.parametrize(
