@@ -14,7 +14,7 @@ import semstab
 from semstab.core.files import write_image
 from semstab.data.features import Features
 from semstab.errors import ConfigError, DataError
-from semstab.predict.vocabulary import Vocabulary
+from semstab.predict.vocabulary import Vocabulary, named
 from semstab.statistics.accumulate import sums_of_spots
 from semstab.statistics.cluster_sums import value
 
@@ -275,8 +275,6 @@ def test_without_features_there_is_nothing_to_name(tmp_path):
 
 
 def test_two_vocabularies_have_two_names(tmp_path):
-    from semstab.predict.vocabulary import named
-
     one, other = vocabulary(tmp_path), vocabulary(tmp_path, "other", name_="five")
     other.write_text(other.read_text().replace("name_", "name"))
     with pytest.raises(ConfigError, match="two vocabularies are called 'five'"):
@@ -305,3 +303,44 @@ def test_a_text_encoder_makes_embeddings(tmp_path):
             mean = torch.stack(parts).mean(dim=0)
         assert row == pytest.approx((mean / mean.norm()).numpy(), abs=1e-5)
     assert words.of.tolist() == [0, 1, 1]
+    changed = named([f"{path},without=road,add=grass,add=sky", f"{path},rename=road:street"])
+    less, more = changed.values()
+    assert less.space.classes == ("tree", "grass", "sky")
+    assert np.array_equal(less.embeddings[:2], words.embeddings[1:])
+    assert more.space.classes == ("street", "tree")
+    other = tmp_path / "other.yaml"
+    other.write_text(yaml.safe_dump({"names": ["street", "grass", "sky"], "encoder": encoder}))
+    expected = Vocabulary.load(other).embeddings
+    assert np.stack([more.embeddings[0], *less.embeddings[2:]]) == pytest.approx(expected, abs=1e-6)
+
+
+@pytest.mark.parametrize(("model", "options"), [("segearth-ov", ",resize=64"), ("transformers", "")])
+def test_prompts_of_a_model_with_its_own_text_encoder_are_ranked(tmp_path, model, options):
+    """SegEarth-OV and CLIPSeg with two lists of prompts, called NET@PROMPTS: ranked beyond chance."""
+    pytest.importorskip("torch")
+    from model_folders import tiny
+
+    write(tmp_path / "room", Room(poses=walk(4)))
+    (tmp_path / "room/color").mkdir()
+    rng = np.random.default_rng(0)
+    for i in range(4):
+        image = np.kron(rng.integers(0, 255, (9, 12, 3)), np.ones((8, 8, 1)))
+        write_image(tmp_path / f"room/color/{i:03d}.png", image.astype(np.uint8))
+    lists = {"few": ["road", "tree"], "many": ["road", "tree", "car", "building"]}
+    words = []
+    for name, prompts in lists.items():
+        (tmp_path / f"{name}.yaml").write_text(yaml.safe_dump({"classes": prompts, "templates": ["a {}."]}))
+        value_of = f"{name}.yaml" if model == "segearth-ov" else f"[{','.join(prompts)}]"
+        checkpoint = tiny("clip" if model == "segearth-ov" else "clipseg")
+        words += ["--predict", f"{model},checkpoint={checkpoint},prompts={value_of},name=net@{name}{options}"]
+    screen = bench("room", "--voxel-size", "0.2", "-o", "run", "--no-truth", *words, cwd=tmp_path).stdout
+    from semstab.comparison.ranking import rank_models
+
+    result = semstab.load_result(tmp_path / "run")
+    assert [*result.models] == ["net@few", "net@many"]
+    for name, prompts in lists.items():
+        assert len(prompts) == result.record(model=f"net@{name}").summary.table.K
+    (difference,) = rank_models(result).differences
+    assert {difference.model, difference.other} == {"net@few", "net@many"}
+    assert difference.low < difference.value < difference.high
+    assert "net@many: 4 names, as many as" in screen
