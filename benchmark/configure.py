@@ -197,7 +197,7 @@ def with_vocabularies(config: Config, files: Sequence[Path]) -> Config:
     Raises:
         ConfigError: If a file is no vocabulary.
     """
-    vocabularies = named([*files])
+    vocabularies = named(files)
     options = {"dataset": config.dataset.model_dump(mode="json"), "vocabularies": [str(file) for file in files]}
     models = config.models
     if models is not None:

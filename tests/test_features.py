@@ -16,6 +16,7 @@ from simulated_events import grid, spots_at
 import semstab
 from semstab.core.files import write_image
 from semstab.data.features import FeatureColours, Features
+from semstab.data.statistics import Estimate
 from semstab.errors import DataError
 from semstab.online.metric import TemporalStability
 from semstab.statistics import Sampler
@@ -440,12 +441,90 @@ def test_a_network_that_says_that_it_has_features_gives_them(tmp_path):
     assert "gives_features = True let it give a dict with features and labels" in error
 
 
-def test_features_alone_are_not_compared_as_labels(tmp_path):
+def noisy(deviation, components=K):
+    """Return features: the true classes with noise, and further components that hold nothing."""
+    rng = np.random.default_rng(5)
+
+    def make(labels):
+        cells = of_classes(labels, components)[4::8, 4::8]
+        return (cells + deviation * rng.normal(size=cells.shape)).astype(np.float32)
+
+    return make
+
+
+@pytest.fixture(scope="module")
+def runs_of_features(tmp_path_factory):
+    """Runs of one room: a network at two settings, another network, and the same name with other components."""
+    folder = tmp_path_factory.mktemp("features")
+    settings = {"base": ("clip", noisy(0.1)), "noise": ("clip", noisy(0.6)), "other": ("dino", noisy(0.6)),
+                "wide": ("clip", noisy(0.1, K + 2))}  # fmt: skip
+    for run, (model, make) in settings.items():
+        shutil.rmtree(folder / "room", ignore_errors=True)
+        written(folder / "room", **{model: make})
+        bench("room", "--voxel-size", "0.2", "-o", run, "--model", model, cwd=folder)
+    return folder
+
+
+def test_features_of_one_network_at_two_settings_are_compared(runs_of_features):
+    base, noise = (
+        semstab.load_result(runs_of_features / run).record().statistics.features.alpha for run in ("base", "noise")
+    )
+    said = " ".join(bench("compare", "base", "noise", cwd=runs_of_features).stdout.split())
+    change = noise.value - base.value
+    low = change - np.hypot(noise.value - noise.low, base.high - base.value)
+    high = change + np.hypot(noise.high - noise.value, base.value - base.low)
+    assert high < 0
+    expected = Estimate(change, low, high)
+    assert f"features of noise are less stable than of base: alpha of features {expected.text('+')}" in said
+    assert f"{base.value:.3f} ({base.low:.3f}, {base.high:.3f})" in said
+    same = bench("compare", "base", "base", cwd=runs_of_features).stdout
+    assert "do not differ significantly in stability" in same
+    markdown = bench("compare", "base", "noise", "--markdown", cwd=runs_of_features).stdout
+    assert "- features of noise are less stable" in markdown
+    assert "| base |" in markdown
+
+
+@pytest.mark.parametrize(("other", "why"), [
+    ("other", "clip and dino are two networks"), ("wide", f"clip has {K} and {K + 2} components"),
+])  # fmt: skip
+def test_features_of_two_networks_are_not_compared_by_size(runs_of_features, other, why):
+    said = " ".join(bench("compare", "base", other, cwd=runs_of_features).stdout.split())
+    assert why in said
+    assert "networks are not compared by its size" in said
+    assert "+0." not in said
+    rule = "alpha of features drop < .02"
+    line = error_of("gate", other, "--against", "base", "--rule", rule, cwd=runs_of_features)
+    assert f"{why}, and features of different networks cannot be compared by size" in line
+
+
+def test_a_gate_judges_alpha_of_features(runs_of_features):
+    alpha = semstab.load_result(runs_of_features / "base").record().statistics.features.alpha
+    passed = bench("gate", "base", "--rule", f"alpha of features > {alpha.low - 0.02:.3f}", cwd=runs_of_features)
+    assert "the gate passes" in passed.stdout
+    assert f"{alpha.value:.3f} [" in passed.stdout
+    failed = bench("gate", "base", "--rule", f"feature_alpha > {alpha.high + 0.02:.3f}", cwd=runs_of_features, code=4)
+    assert "the gate fails" in failed.stdout
+    rule = "alpha of features drop < .02"
+    assert "fails" in bench("gate", "noise", "--against", "base", "--rule", rule, cwd=runs_of_features, code=4).stdout
+    result = semstab.gate(runs_of_features / "base", None, semstab.GateConfig(rules=("alpha of features > .1",)))
+    interval = result.judgements[0].interval
+    assert alpha.low < interval.low < alpha.value < interval.high < alpha.high  # each end at 5 %, not at 2.5 %
+
+
+def test_what_features_alone_have_not_is_one_line(runs_of_features):
+    assert "clip gives features" in error_of("gate", "base", "--rule", "alpha > .8", cwd=runs_of_features)
+    both = "base", "--rule", "alpha of features > .1", "--scope", "other-scenes"
+    assert "base states it for this scene; leave out --scope" in error_of("gate", *both, cwd=runs_of_features)
+    assert "leave out --out and --scope" in error_of("compare", "base", "noise", "-o", "out", cwd=runs_of_features)
+    assert not (runs_of_features / "out").exists()
+
+
+def test_features_alone_are_not_compared_with_labels(tmp_path):
     written(tmp_path / "room", clip=coarse)
-    bench("room", "--voxel-size", "0.2", "-o", "run", "--model", "clip", cwd=tmp_path)
-    line = error_of("compare", "run", "run", cwd=tmp_path)
+    bench("room", "--voxel-size", "0.2", "-o", "run", cwd=tmp_path)
+    line = error_of("compare", "run:clip", "run:net", cwd=tmp_path)
     assert "clip gives features and no labels, and what is compared is of labels" in line
-    assert "clip gives features" in error_of("gate", "run", "--rule", "alpha > .8", cwd=tmp_path)
+    assert "has no alpha of features" in error_of("gate", "run:net", "--rule", "feature_alpha > .8", cwd=tmp_path)
 
 
 def test_tiles_have_the_features_of_the_whole_map(tmp_path):

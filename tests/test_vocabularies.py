@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import dataclasses
+
 import numpy as np
 import pytest
 import yaml
@@ -12,7 +14,7 @@ import semstab
 from semstab.core.files import write_image
 from semstab.data.features import Features
 from semstab.errors import ConfigError, DataError
-from semstab.predict.vocabulary import Vocabulary
+from semstab.predict.vocabulary import Vocabulary, named
 from semstab.statistics.accumulate import sums_of_spots
 from semstab.statistics.cluster_sums import value
 
@@ -142,6 +144,103 @@ def test_the_network_runs_once(tmp_path):
     assert [*semstab.load_result(tmp_path / "run").models] == ["net", "net@five", "net@three"]
 
 
+def test_each_name_is_left_out_in_one_run(tmp_path):
+    """A name that is mixed up with another one costs alpha; what leaving it out changes is counted by hand."""
+    from semstab.report.tables import tables
+    from semstab.statistics import SpotObservations
+
+    room(tmp_path / "room")
+    mixed = EMBEDDINGS.copy()
+    mixed[3] = mixed[0] + 0.05 * mixed[3]  # 'crate' is much like 'room'
+    vocabulary(tmp_path, embeddings=mixed)
+    words = "room", "--voxel-size", "0.2", "-o", "run", "--no-truth"
+    bench(*words, "--vocabulary", "five.yaml,without=each", cwd=tmp_path)
+    result = semstab.load_result(tmp_path / "run")
+    assert [*result.models] == ["net", "net@five", *(f"net@five,without={name}" for name in CLASSES)]
+    (table,) = (table for table in tables(result) if table.name == "prompts")
+    (group,) = table.groups
+    assert group.name == "net@five"
+    assert group.rows[0][0] == "all names"
+    rows = {row[0]: row for row in group.rows[1:]}
+    assert {*rows} == {f"without {name}" for name in CLASSES}
+    assert {group.rows[1][0], group.rows[2][0]} == {"without room", "without crate"}
+    full, less = (
+        SpotObservations.load(result.record(model=name).observations_file)
+        for name in ("net@five", "net@five,without=crate")
+    )
+    alpha = [value(sums_of_spots(sample), "alpha") for sample in (full, less)]
+    _, _, change, changed, most, share = rows["without crate"]
+    assert change.value == pytest.approx(alpha[1] - alpha[0], abs=1e-6)
+    assert 0 < change.low < change.value < change.high
+    assert changed == pytest.approx(100 * np.mean(full.label == CLASSES.index("crate")))  # others keep their label
+    assert most == "crate to room"
+    assert share > 90
+    shown = bench("show", "run", "prompts", cwd=tmp_path).stdout
+    assert "without shelf" in shown
+
+
+def test_names_change_as_the_text_beside_the_file_says(tmp_path, monkeypatch):
+    """Names are left out, added and renamed; a new name is encoded, the others are not encoded again."""
+    from semstab.predict import vocabulary as module
+
+    known = {
+        name: row.astype(np.float32)
+        for name, row in zip((*CLASSES, "lamp", "rack"), [*EMBEDDINGS, *EMBEDDINGS[:2] + 1], strict=True)
+    }
+    asked = []
+    monkeypatch.setattr(
+        module, "_encoded", lambda encoder, words, path: (asked.append(words), np.stack([known[w] for w in words]))[1]
+    )
+    path = tmp_path / "five.yaml"
+    path.write_text(yaml.safe_dump({"names": [*CLASSES], "encoder": {"checkpoint": "clip"}}))
+    texts = ["", ",without=crate,add=lamp", ",rename=shelf:rack"]
+    full, other, renamed = module.named([f"{path}{text}" for text in texts]).values()
+    assert other.space.name == "five,without=crate,add=lamp"
+    assert other.space.classes == (*(name for name in CLASSES if name != "crate"), "lamp")
+    assert renamed.space.classes == tuple("rack" if name == "shelf" else name for name in CLASSES)
+    assert asked == [[*CLASSES], ["lamp"], ["rack"]]
+    for words in (full, other, renamed):
+        expected = np.stack([known[name] / np.linalg.norm(known[name]) for name in words.space.classes])
+        assert words.embeddings == pytest.approx(expected, abs=1e-6)
+
+
+def test_a_name_in_other_words_is_no_change(tmp_path):
+    """Renaming with the same labels changes none; a label that is taken away becomes another one, or none."""
+    from semstab.comparison.prompts import effect
+    from semstab.predict.prompts import Changes
+    from semstab.statistics import SpotObservations
+
+    room(tmp_path / "room")
+    bench("room", "--voxel-size", "0.2", "-o", "run", "--no-truth", "--vocabulary", vocabulary(tmp_path), cwd=tmp_path)
+    full = SpotObservations.load(semstab.load_result(tmp_path / "run").record(model="net@five").observations_file)
+    same = dataclasses.replace(full, classes=("space", *full.classes[1:]))
+    found = effect(full, same, Changes(rename=((full.classes[0], "space"),)))
+    assert (found.changed, found.most, found.difference.value) == (0, "", 0)
+    silent = dataclasses.replace(full, label=np.where(full.label == 1, full.K, full.label).astype(np.uint16))
+    found = effect(full, silent, Changes(without=(full.classes[1],)))
+    assert found.changed == pytest.approx(np.mean(full.label == 1))
+    assert found.most == f"{full.classes[1]} to no label"
+
+
+@pytest.mark.parametrize(
+    ("text", "line"),
+    [
+        ("without=crat", "no name 'crat'; did you mean 'crate'?"),
+        ("without=", "'without=' says no name; write without=NAME"),
+        ("rename=crate", "'rename=crate' says no name; write rename=OLD:NEW"),
+        ("add=lamp", "five.yaml holds embeddings, of its own names alone; give it an encoder, or put 'lamp' into the"),
+        ("without=each,without=crate", "without=each stands alone"),
+        (",".join(f"without={name}" for name in CLASSES[1:]), "leaves 1 name; at least 2 are needed"),
+    ],
+)
+def test_a_bad_change_of_names_is_one_line(tmp_path, text, line):
+    room(tmp_path / "room", frames=2)
+    vocabulary(tmp_path)
+    error = error_of("room", "--voxel-size", "0.2", "-o", "run", "--vocabulary", f"five.yaml,{text}", cwd=tmp_path)
+    assert line in error
+    assert not (tmp_path / "run").exists()
+
+
 @pytest.mark.parametrize(
     ("change", "line"),
     [
@@ -176,8 +275,6 @@ def test_without_features_there_is_nothing_to_name(tmp_path):
 
 
 def test_two_vocabularies_have_two_names(tmp_path):
-    from semstab.predict.vocabulary import named
-
     one, other = vocabulary(tmp_path), vocabulary(tmp_path, "other", name_="five")
     other.write_text(other.read_text().replace("name_", "name"))
     with pytest.raises(ConfigError, match="two vocabularies are called 'five'"):
@@ -206,3 +303,44 @@ def test_a_text_encoder_makes_embeddings(tmp_path):
             mean = torch.stack(parts).mean(dim=0)
         assert row == pytest.approx((mean / mean.norm()).numpy(), abs=1e-5)
     assert words.of.tolist() == [0, 1, 1]
+    changed = named([f"{path},without=road,add=grass,add=sky", f"{path},rename=road:street"])
+    less, more = changed.values()
+    assert less.space.classes == ("tree", "grass", "sky")
+    assert np.array_equal(less.embeddings[:2], words.embeddings[1:])
+    assert more.space.classes == ("street", "tree")
+    other = tmp_path / "other.yaml"
+    other.write_text(yaml.safe_dump({"names": ["street", "grass", "sky"], "encoder": encoder}))
+    expected = Vocabulary.load(other).embeddings
+    assert np.stack([more.embeddings[0], *less.embeddings[2:]]) == pytest.approx(expected, abs=1e-6)
+
+
+@pytest.mark.parametrize(("model", "options"), [("segearth-ov", ",resize=64"), ("transformers", "")])
+def test_prompts_of_a_model_with_its_own_text_encoder_are_ranked(tmp_path, model, options):
+    """SegEarth-OV and CLIPSeg with two lists of prompts, called NET@PROMPTS: ranked beyond chance."""
+    pytest.importorskip("torch")
+    from model_folders import tiny
+
+    write(tmp_path / "room", Room(poses=walk(4)))
+    (tmp_path / "room/color").mkdir()
+    rng = np.random.default_rng(0)
+    for i in range(4):
+        image = np.kron(rng.integers(0, 255, (9, 12, 3)), np.ones((8, 8, 1)))
+        write_image(tmp_path / f"room/color/{i:03d}.png", image.astype(np.uint8))
+    lists = {"few": ["road", "tree"], "many": ["road", "tree", "car", "building"]}
+    words = []
+    for name, prompts in lists.items():
+        (tmp_path / f"{name}.yaml").write_text(yaml.safe_dump({"classes": prompts, "templates": ["a {}."]}))
+        value_of = f"{name}.yaml" if model == "segearth-ov" else f"[{','.join(prompts)}]"
+        checkpoint = tiny("clip" if model == "segearth-ov" else "clipseg")
+        words += ["--predict", f"{model},checkpoint={checkpoint},prompts={value_of},name=net@{name}{options}"]
+    screen = bench("room", "--voxel-size", "0.2", "-o", "run", "--no-truth", *words, cwd=tmp_path).stdout
+    from semstab.comparison.ranking import rank_models
+
+    result = semstab.load_result(tmp_path / "run")
+    assert [*result.models] == ["net@few", "net@many"]
+    for name, prompts in lists.items():
+        assert len(prompts) == result.record(model=f"net@{name}").summary.table.K
+    (difference,) = rank_models(result).differences
+    assert {difference.model, difference.other} == {"net@few", "net@many"}
+    assert difference.low < difference.value < difference.high
+    assert "net@many: 4 names, as many as" in screen

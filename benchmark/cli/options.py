@@ -187,7 +187,8 @@ class Source:
 
 
 Vocabularies = Annotated[list[Path] | None, typer.Option(
-    metavar="FILE", help="Label the features of models by the likeliest name of a vocabulary; repeatable.",
+    metavar="FILE[,CHANGE]", help="Label the features of models by the likeliest name of a vocabulary, with names"
+    " changed: without=NAME, without=each (one after the other), add=NAME, rename=OLD:NEW; repeatable.",
     show_default="none", rich_help_panel=SETTINGS)]
 
 

@@ -42,6 +42,8 @@ def compare(
     from semstab.core.types import THIS_SCENE
     from semstab.report.comparison.tables import print_comparison
 
+    if _compare_features(runs, out, scope, markdown=markdown, quiet=quiet):
+        return
     with Console(stderr=True, quiet=quiet).status("opening") as status:
         comparison = compare(
             *runs, out=out, scope=scope or THIS_SCENE, progress=lambda scene: status.update(f"comparing {scene}")
@@ -53,6 +55,29 @@ def compare(
         print_comparison(comparison, Console(), verbose=verbose, out=out)
     if out is not None:
         print_lines([f"folder: {out}; report: {out / 'report.html'}"], quiet=quiet)
+
+
+def _compare_features(runs: list[str], out: Path | None, scope: str | None, *, markdown: bool, quiet: bool) -> bool:
+    """Compare models that give features alone; return False if the models named have labels."""
+    from semstab.comparison.entries import gives_features_alone, open_models, open_runs
+    from semstab.report.comparison.features import compared_features
+    from semstab.report.tables.table import to_markdown, to_terminal
+
+    handles = open_models(runs[0], features=True) if len(runs) == 1 else open_runs(runs, features=True)
+    records = [entry.record for handle in handles for entry in handle.scenes.values() if entry.record is not None]
+    if len(handles) < 2 or len(records) < len(handles) or not all(map(gives_features_alone, records)):
+        return False
+    if out is not None or scope is not None:
+        raise ConfigError(
+            "compare: alpha of features has the scope of its run, and no pages of differences; leave out --out and"
+            " --scope"
+        )
+    sentences, table = compared_features(handles)
+    if markdown:
+        print_lines(["\n".join([*(f"- {text}" for text in sentences), "", to_markdown(table)])], quiet=quiet)
+    else:
+        print_lines([*sentences, "", to_terminal(table)], quiet=quiet)
+    return True
 
 
 def _compare_visits(

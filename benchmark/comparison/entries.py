@@ -165,13 +165,15 @@ class RunHandle:
         return self.model if self.source is None else f"{self.model} ({self.source})"
 
 
-def open_runs(named: Sequence[str | os.PathLike[str]]) -> tuple[RunHandle, ...]:
+def open_runs(named: Sequence[str | os.PathLike[str]], *, features: bool = False) -> tuple[RunHandle, ...]:
     """Open folders of runs or studies, 'FOLDER:MODEL', and small summaries, under the shortest distinct names.
+
+    With `features` also label sources that give features alone.
 
     Raises:
         ConfigError, DataError: As `open_run` does.
     """
-    runs = [open_run(source) for source in named]
+    runs = [open_run(source, features=features) for source in named]
     folders = ["" if run.source is None else run.source.resolve().name for run in runs]
     models = [run.model for run in runs]
     folder_and_model = [f"{folder}:{model}" for folder, model in zip(folders, models, strict=True)]
@@ -188,31 +190,40 @@ def open_runs(named: Sequence[str | os.PathLike[str]]) -> tuple[RunHandle, ...]:
     return tuple(replace(run, name=name) for run, name in zip(runs, names, strict=True))
 
 
-def open_models(named: str | os.PathLike[str]) -> tuple[RunHandle, ...]:
+def open_models(named: str | os.PathLike[str], *, features: bool = False) -> tuple[RunHandle, ...]:
     """Open all label sources of one run that have the classes that most of them have; ground truth is left out.
+
+    Models that give features alone are left out, too, unless the run has no others and `features` allows them.
 
     Raises:
         ConfigError, DataError: As `open_run` does.
     """
     path, model_named = run_and_model(named)
     if model_named is not None or not path.is_dir():
-        return (open_run(named),)
-    return models_of(load_result(path), path if isinstance(named, str | Path) else None)
+        return (open_run(named, features=features),)
+    return models_of(load_result(path), path if isinstance(named, str | Path) else None, features=features)
 
 
-def models_of(result: Result, source: Path | None = None) -> tuple[RunHandle, ...]:
-    """Return the label sources of a run that have the classes that most of them have, without the ground truth."""
-    handles = [handle_of(result, model, source) for model in result.models if model != GROUND_TRUTH]
+def models_of(result: Result, source: Path | None = None, *, features: bool = False) -> tuple[RunHandle, ...]:
+    """Return the label sources of a run that have the classes that most of them have, without the ground truth.
+
+    Models that give features alone are left out, unless there are no others.
+    """
+    names = [model for model in result.models if model != GROUND_TRUTH]
+    labelled = [name for name in names if not any(map(gives_features_alone, result.select(model=name)))]
+    handles = [handle_of(result, model, source, features=features) for model in labelled or names]
     scenes = set.intersection(*({*handle.scenes} for handle in handles)) if handles else set()
     if not scenes:
         return tuple(handles)
     scene = min(scenes)
-    names = sharing_classes({handle.model: handle.scenes[scene].classes for handle in handles})
-    return tuple(handle for handle in handles if handle.model in names)
+    shared = sharing_classes({handle.model: handle.scenes[scene].classes for handle in handles})
+    return tuple(handle for handle in handles if handle.model in shared)
 
 
-def open_run(named: str | os.PathLike[str]) -> RunHandle:
+def open_run(named: str | os.PathLike[str], *, features: bool = False) -> RunHandle:
     """Open a run's only label source, or the one that 'FOLDER:MODEL' selects, at the base settings and backend.
+
+    With `features` also one that gives features alone.
 
     Raises:
         ConfigError: If there is no such folder or label source, or several.
@@ -227,19 +238,28 @@ def open_run(named: str | os.PathLike[str]) -> RunHandle:
         _chosen(path, [small.model], model)
         return small
     result = load_result(path)
-    return handle_of(result, _chosen(path, result.models, model), path if isinstance(named, str | Path) else None)
+    source = path if isinstance(named, str | Path) else None
+    return handle_of(result, _chosen(path, result.models, model), source, features=features)
 
 
-def handle_of(result: Result, model: str, source: Path | None = None) -> RunHandle:
-    """Return one label source of a run, at the base settings and backend; `source` is its folder, if it has one."""
+def gives_features_alone(record: Record) -> bool:
+    """Return whether a model gives features and no labels."""
+    features = None if record.statistics is None else record.statistics.features
+    return features is not None and features.alone
+
+
+def handle_of(result: Result, model: str, source: Path | None = None, *, features: bool = False) -> RunHandle:
+    """Return one label source of a run, at the base settings and backend; `source` is its folder, if it has one.
+
+    Raises:
+        ConfigError: If it gives features alone, unless `features` allows that.
+    """
     seed = result.manifest.get("seed")
-    for record in result.select(model=model):
-        features = None if record.statistics is None else record.statistics.features
-        if features is not None and features.alone:
-            raise ConfigError(
-                f"{source or model}: {model} gives features and no labels, and what is compared is of labels; name its"
-                f" features (--vocabulary FILE), or see `semstab-bench show {source or 'RUN'} features`"
-            )
+    if not features and any(map(gives_features_alone, result.select(model=model))):
+        raise ConfigError(
+            f"{source or model}: {model} gives features and no labels, and what is compared is of labels; name its"
+            f" features (--vocabulary FILE), or see `semstab-bench show {source or 'RUN'} features`"
+        )
     scenes = {
         scene: Entry(
             summary=record.summary, image_space=record.image_space, georeference=result.georeference.get(scene),

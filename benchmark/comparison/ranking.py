@@ -12,6 +12,7 @@ from typing import TypeVar
 import numpy as np
 
 from semstab.comparison.differences import holm, sums_difference
+from semstab.comparison.entries import gives_features_alone
 from semstab.comparison.observations import compared_observations
 from semstab.core.types import THESE_FRAMES, THIS_SCENE, Scope
 from semstab.data.labels import sharing_classes
@@ -77,7 +78,7 @@ def rank_models(result: Result) -> Ranking:
 
     Scenes in which not all models have observations do not count.
     """
-    labelled = (record for record in result.select() if not _has_features_alone(record))
+    labelled = (record for record in result.select() if not gives_features_alone(record))
     records = [record for record in labelled if record.unit.model != GROUND_TRUTH]
     models: dict[str, list[Record]] = {}
     for record in records:
@@ -193,11 +194,6 @@ def with_one_number_of_classes(samples: Mapping[str, SpotObservations]) -> dict[
         return replace(sample, label=label, neighbour=neighbour, beyond=beyond, K=K, classes=(), distances=None)
 
     return {name: widened(sample) for name, sample in samples.items()}
-
-
-def _has_features_alone(record: Record) -> bool:
-    features = None if record.statistics is None else record.statistics.features
-    return features is not None and features.alone
 
 
 def _is_uninformative(record: Record) -> bool:

@@ -237,19 +237,16 @@ def _base_units(config: Config, scenes: Mapping[str, Scene]) -> Iterator[Unit]:
         fused = config.models
         if fused is None:
             fused = [model for model in scene.models if model not in config.region_maps]
-        settings = _base_settings(config, name, fused)
+        settings, others = _base_settings(config, name, fused), list[str]()
         for task in tasks_of(scene, settings):
             _check_classes(config.critical_classes, task)
             model_settings = settings.model_copy(update={"models": [task.model]})
             if config.truth and scene.ground_truth and task.model != GROUND_TRUTH and truth_task(task) is None:
-                space, target = scene.label_space(GROUND_TRUTH), task.mapping.target
+                target = task.mapping.target
                 if target == OF_FEATURES:
                     logger.info("%s: features of %s are not compared with the ground truth", name, task.model)
                 else:
-                    logger.warning(
-                        "%s: labels are not compared with the ground truth, as %s has classes that %s has not;"
-                        " list them under its ignored, or among members", name, space.name, target.name,
-                    )  # fmt: skip
+                    others.append(target.name)
             sampled = _is_sampled(config, config.backends[0])
             if config.video_measures == "dis" and scene.missing(task.indices[0], color=True):
                 raise ConfigError(f"{name}: there are no images for optical flow; use --video-measures depth")
@@ -258,6 +255,13 @@ def _base_units(config: Config, scenes: Mapping[str, Scene]) -> Iterator[Unit]:
             flags = {"image_space": True, "stored": True, "sampled": sampled}
             flags |= {"assessed": scene.posed, "fuses": scene.posed}
             yield Unit.of(Variation(BASE), model_settings, task, identity(model_settings, task), **flags)
+        if others:
+            first, *more = dict.fromkeys(others)
+            logger.warning(
+                "%s: labels are not compared with the ground truth, as %s has classes that %s has not; list them under"
+                " its ignored, or among members",
+                name, scene.label_space(GROUND_TRUTH).name, f"{first} and {len(more)} more" if more else first,
+            )  # fmt: skip
 
 
 def _check_video(config: Config, task: Task) -> None:

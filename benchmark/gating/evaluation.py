@@ -12,6 +12,7 @@ import numpy as np
 
 from semstab.comparison.differences import flicker_difference, sums_difference
 from semstab.comparison.entries import Entry, RunHandle
+from semstab.comparison.features import FEATURE_ALPHA, agreement_of, at_level, difference_of_features, other_network
 from semstab.comparison.pairing import on_common_observations
 from semstab.comparison.quantities import COVERAGE, FLICKER, RECURRENT_VSS, SBD_EXCESS
 from semstab.config import nearest
@@ -51,6 +52,12 @@ def require_data(rule: Rule, new: RunHandle, base: RunHandle | None, scenes: Seq
                 raise ConfigError(
                     f"rule '{rule.text}': {entry.where} has no {name} of {scene}{few}; {rule.measure.if_missing}"
                 )
+        changes_features = rule.measure.quantity is FEATURE_ALPHA and rule.change is not None
+        if changes_features and base is not None and (why := other_network(base, new, scene)):
+            raise ConfigError(
+                f"rule '{rule.text}': {why}, and features of different networks cannot be compared by size; bound the"
+                f" value itself, as '{rule.measure.name} > .6'"
+            )
         if len({entry.sums.voxel_size for entry in entries}) > 1:
             sizes = [entry.sums.voxel_size for entry in entries]
             raise DataError(
@@ -63,6 +70,8 @@ def _has(rule: Rule, entry: Entry) -> bool:
     """Return whether a run has the data of a measure."""
     if rule.measure.quantity is FLICKER:
         return len(entry.flicker) > 1
+    if rule.measure.quantity is FEATURE_ALPHA:
+        return agreement_of(entry) is not None
     if rule.measure.quantity is COVERAGE:
         return bool(entry.sums.layout)
     key, k = rule.measure.quantity.key, _k(rule, entry)
@@ -192,6 +201,9 @@ def value_of(rule: Rule, entry: Entry) -> float:
     """Return the number of a rule's measure in a run on a scene; NaN if undefined."""
     if rule.measure.quantity is FLICKER:
         return float(np.mean(list(entry.flicker.values())))
+    if rule.measure.quantity is FEATURE_ALPHA:
+        agreement = agreement_of(entry)
+        return math.nan if agreement is None else agreement.alpha.value
     if rule.measure.quantity is COVERAGE:
         return math.nan
     number = value(entry.sums, rule.measure.quantity.key, _k(rule, entry))
@@ -202,6 +214,8 @@ def _interval_of(rule: Rule, new: Entry, base: Entry | None, level: float, scope
     if rule.measure.quantity is COVERAGE and base is not None and _same_frames(new, base):
         change = counted(_covered(new.sums, base.sums), new.sums)
         return change if rule.change == "rise" else negative(change)
+    if rule.measure.quantity is FEATURE_ALPHA:
+        return _of_features(rule, new, base, level, scope)
     if rule.measure.quantity is not FLICKER:
         k, before = _k(rule, new), None if base is None else base.sums
         result = bounded(rule, new.sums, before, k=k, level=level, scope=scope)
@@ -218,6 +232,19 @@ def _interval_of(rule: Rule, new: Entry, base: Entry | None, level: float, scope
         return dataclasses.replace(mean, low=max(mean.low, 0.0), high=min(mean.high, 100.0))
     result = flicker_difference(new.flicker, base.flicker, level=1 - 2 * level)
     return result if rule.change == "rise" else negative(result)
+
+
+def _of_features(rule: Rule, new: Entry, base: Entry | None, level: float, scope: Scope) -> Interval:
+    """Return alpha of features, or its drop or rise, from the intervals that the runs state."""
+    own, before = agreement_of(new), None if base is None else agreement_of(base)
+    assert own is not None
+    result = own.alpha if before is None or rule.change is None else difference_of_features(own, before)
+    if scope not in (result.scope, THIS_SCENE):
+        raise ConfigError(
+            f"rule '{rule.text}': {new.where} states it for {result.scope}; leave out --scope, or run the model with it"
+        )
+    result = at_level(result, 1 - 2 * level)
+    return negative(result) if rule.change == "drop" else result
 
 
 def bounded(

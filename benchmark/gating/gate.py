@@ -12,6 +12,7 @@ import numpy as np
 from pydantic import BaseModel, ConfigDict, Field
 
 from semstab.comparison.entries import RunHandle, open_run, shared_scenes
+from semstab.comparison.features import FEATURE_ALPHA
 from semstab.comparison.quantities import COVERAGE, FLICKER
 from semstab.config import read_yaml, validated
 from semstab.config.groups import ScopeSetting
@@ -103,8 +104,9 @@ def gate(new: str | os.PathLike[str], against: str | os.PathLike[str] | None, co
           passes: alpha > 0.6: 0.8...
     """
     parsed = [parse(text) for text in config.rules]
-    run = open_run(new)
-    base = None if against is None else open_run(against)
+    of_features = all(rule.measure.quantity is FEATURE_ALPHA for rule in parsed)
+    run = open_run(new, features=of_features)
+    base = None if against is None else open_run(against, features=of_features)
     scenes = tuple(run.scenes) if base is None else shared_scenes([base, run])
     runs, judgements, notes = GateRuns(run, base, scenes), list[Judgement](), _notes(run, base, scenes)
     for parsed_rule in parsed:
@@ -168,7 +170,7 @@ def _without_frames(judgements: Sequence[Judgement], scope: Scope) -> list[str]:
         for judgement in judgements
         if judgement.interval.scope == THESE_FRAMES != scope
         and not judgement.counted
-        and judgement.rule.measure.quantity not in (FLICKER, COVERAGE)
+        and judgement.rule.measure.quantity not in (FLICKER, COVERAGE, FEATURE_ALPHA)
         and not functional(judgement.rule.measure.quantity.key).of_space_alone
     ]
     why = "as the run kept no sums of its map by frame or has few; --statistics, or more frames"

@@ -10,6 +10,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Literal, get_args
 
+from semstab.comparison.features import FEATURE_ALPHA
 from semstab.comparison.quantities import (
     COVERAGE,
     FLICKER,
@@ -60,6 +61,7 @@ MEASURES = (
     GateMeasure(PSA, "psa"),
     GateMeasure(ALPHA, "alpha", of_class=True),
     GateMeasure(ALPHA_BY_MEANING, "alpha by meaning", if_missing="run it with distances between classes (--distances)"),
+    GateMeasure(FEATURE_ALPHA, "alpha of features", (FEATURE_ALPHA.key,), if_missing="run a model that gives features"),
     GateMeasure(RECURRENT_VSS, "vss"),
     GateMeasure(VOXEL_ALPHA, "voxel alpha", of_class=True),
     GateMeasure(ENTROPY, "entropy"),

@@ -5,6 +5,7 @@ from __future__ import annotations
 import functools
 import hashlib
 import io
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Self
@@ -18,7 +19,8 @@ from semstab.core.files import read_limited
 from semstab.core.types import Float32, Float64, Int64, UInt8, UInt16
 from semstab.data.features import Features
 from semstab.data.labels import IGNORE_8BIT, IGNORE_16BIT, LabelSpace
-from semstab.errors import ConfigError, DataError, MissingDependencyError
+from semstab.errors import ConfigError, DataError, MissingDependencyError, nearest
+from semstab.predict.prompts import EACH, Changes
 
 MOST_BYTES = 1 << 28
 """The largest file of embeddings."""
@@ -33,6 +35,11 @@ class NameEntry(Settings):
     name: str = Field(min_length=1, description="the class")
     synonyms: list[str] = Field(default_factory=list, description="other words for it, with embeddings of their own")
     group: str = Field("", description="group of the class, from which distances follow: vehicle/two wheels")
+
+    @property
+    def words(self) -> tuple[str, ...]:
+        """The name and its synonyms."""
+        return (self.name, *self.synonyms)
 
 
 class EncoderSettings(Settings):
@@ -102,38 +109,8 @@ class Vocabulary:
 
     @classmethod
     def load(cls, path: Path) -> Vocabulary:
-        """Read a vocabulary's file.
-
-        Raises:
-            ConfigError: If the file is not a vocabulary, or two names are the same.
-            DataError: If its embeddings cannot be used.
-            MissingDependencyError: If its text encoder needs packages that are not installed.
-        """
-        settings = validated(VocabularySettings, read_yaml(path), f"{path}: ")
-        words = [word for entry in settings.names for word in (entry.name, *entry.synonyms)]
-        name_of_word = np.repeat(np.arange(len(settings.names)), [1 + len(entry.synonyms) for entry in settings.names])
-        try:
-            space = LabelSpace(
-                settings.name or path.stem,
-                tuple(entry.name for entry in settings.names),
-                members=tuple(tuple(entry.synonyms) for entry in settings.names),
-                groups=tuple(entry.group for entry in settings.names),
-            )
-        except ConfigError as error:
-            raise ConfigError(f"{path}: {str(error).replace('taxonomy', 'vocabulary', 1)}") from error
-        if settings.encoder is not None:
-            embeddings = _encoded(settings.encoder, words, path)
-        else:
-            assert settings.embeddings is not None
-            embeddings = _stored(path.parent / settings.embeddings, words)
-        length = np.linalg.norm(embeddings, axis=1)
-        if not (wrong := np.isfinite(length) & (length > 0)).all():
-            word = words[int(np.flatnonzero(~wrong)[0])]
-            raise DataError(f"{path}: the embedding of '{word}' has no length or is not finite")
-        if settings.normalise:
-            embeddings = (embeddings / length[:, None]).astype(np.float32)
-        models = None if settings.models is None else tuple(settings.models)
-        return cls(space, embeddings, name_of_word.astype(np.int64), settings.threshold, str(path), models)
+        """Read a vocabulary's file; raises what `VocabularyFile.load` and `VocabularyFile.vocabulary` raise."""
+        return VocabularyFile.load(path).vocabulary()
 
     def is_for(self, model: str) -> bool:
         """Return whether it is for the features of a model."""
@@ -191,6 +168,103 @@ class Vocabulary:
         return image
 
 
+@dataclass(frozen=True, eq=False)
+class VocabularyFile:
+    """The content of a vocabulary's file, from which vocabularies with other names are made.
+
+    Attributes:
+        embeddings: Embeddings (1 + s, D) of each name and its s synonyms, as they are stored or encoded.
+    """
+
+    path: Path
+    settings: VocabularySettings
+    embeddings: tuple[Float32, ...]
+
+    @classmethod
+    def load(cls, path: Path) -> VocabularyFile:
+        """Read a file.
+
+        Raises:
+            ConfigError: If the file is not a vocabulary.
+            DataError: If its embeddings cannot be used.
+            MissingDependencyError: If its text encoder needs packages that are not installed.
+        """
+        settings = validated(VocabularySettings, read_yaml(path), f"{path}: ")
+        words = [word for entry in settings.names for word in entry.words]
+        if settings.encoder is not None:
+            embeddings = _encoded(settings.encoder, words, path)
+        else:
+            assert settings.embeddings is not None
+            embeddings = _stored(path.parent / settings.embeddings, words)
+        length = np.linalg.norm(embeddings, axis=1)
+        if not (right := np.isfinite(length) & (length > 0)).all():
+            word = words[int(np.flatnonzero(~right)[0])]
+            raise DataError(f"{path}: the embedding of '{word}' has no length or is not finite")
+        ends = np.cumsum([len(entry.words) for entry in settings.names])
+        return cls(path, settings, tuple(np.split(embeddings, ends[:-1])))
+
+    def changed(self, changes: Changes) -> VocabularyFile:
+        """Return what the file would hold with other names; a new name is encoded as those of the file are.
+
+        Raises:
+            ConfigError: If it has no such name, fewer than two are left, or there is no encoder for a new one.
+        """
+        where, names = f"{self.path},{changes}", [entry.name for entry in self.settings.names]
+        for name in (*changes.without, *(old for old, _ in changes.rename)):
+            if name not in names:
+                raise ConfigError(f"{where}: no name '{name}'; {nearest(name, names)}")
+        new_names = dict(changes.rename)
+        entries: list[NameEntry] = []
+        embeddings: list[Float32] = []
+        for entry, rows in zip(self.settings.names, self.embeddings, strict=True):
+            if entry.name in changes.without:
+                continue
+            new = new_names.get(entry.name)
+            entries.append(entry if new is None else entry.model_copy(update={"name": new}))
+            embeddings.append(rows if new is None else np.concatenate([self._encode(new, where), rows[1:]]))
+        for name in changes.add:
+            entries.append(NameEntry(name=name))
+            embeddings.append(self._encode(name, where))
+        if len(entries) < 2:
+            raise ConfigError(f"{where}: leaves {len(entries)} name; at least 2 are needed")
+        name = f"{self.settings.name or self.path.stem},{changes}"
+        return VocabularyFile(
+            self.path, self.settings.model_copy(update={"names": entries, "name": name}), tuple(embeddings)
+        )
+
+    def _encode(self, name: str, where: str) -> Float32:
+        """Return the embedding (1, D) of a new name."""
+        if self.settings.encoder is None:
+            raise ConfigError(
+                f"{where}: {self.path.name} holds embeddings, of its own names alone; give it an encoder, or"
+                f" put '{name}' into the file and leave names out (without=NAME)"
+            )
+        return _encoded(self.settings.encoder, [name], self.path)
+
+    def vocabulary(self) -> Vocabulary:
+        """Return the vocabulary.
+
+        Raises:
+            ConfigError: If two names are the same.
+        """
+        settings = self.settings
+        try:
+            space = LabelSpace(
+                settings.name or self.path.stem,
+                tuple(entry.name for entry in settings.names),
+                members=tuple(tuple(entry.synonyms) for entry in settings.names),
+                groups=tuple(entry.group for entry in settings.names),
+            )
+        except ConfigError as error:
+            raise ConfigError(f"{self.path}: {str(error).replace('taxonomy', 'vocabulary', 1)}") from error
+        embeddings = np.concatenate(self.embeddings)
+        if settings.normalise:
+            embeddings = (embeddings / np.linalg.norm(embeddings, axis=1, keepdims=True)).astype(np.float32)
+        name_of_word = np.repeat(np.arange(len(settings.names)), [len(rows) for rows in self.embeddings])
+        models = None if settings.models is None else tuple(settings.models)
+        return Vocabulary(space, embeddings, name_of_word.astype(np.int64), settings.threshold, str(self.path), models)
+
+
 def _stored(path: Path, words: list[str]) -> Float32:
     """Return embeddings (n, D) of a file, a row for each of the words."""
     try:
@@ -218,18 +292,29 @@ def _encoded(encoder: EncoderSettings, words: list[str], path: Path) -> Float32:
     return text_embeddings(where, words, encoder.templates)
 
 
-def named(vocabularies: list[Path]) -> dict[str, Vocabulary]:
-    """Return vocabularies by their names.
+def named(vocabularies: Sequence[Path]) -> dict[str, Vocabulary]:
+    """Return vocabularies by their names, with the changes that stand beside their files.
+
+    'FILE,without=each' stands for the vocabulary of the file, and for the same without each of its names.
 
     Raises:
-        ConfigError: If two have one name, and what `Vocabulary.load` raises.
+        ConfigError: If two have one name, and what `Changes.parse` and `VocabularyFile` raise.
     """
+    wanted = dict.fromkeys(Changes.parse(str(path)) for path in vocabularies)
+    files = {file: VocabularyFile.load(file) for file in dict.fromkeys(file for file, _ in wanted)}
+    listed: dict[tuple[Path, Changes], None] = {}
+    for file, changes in wanted:
+        if EACH in changes.without:
+            each = (Changes(without=(entry.name,)) for entry in files[file].settings.names)
+            listed |= dict.fromkeys((file, variant) for variant in (Changes(), *each))
+        else:
+            listed[file, changes] = None
     by_name: dict[str, Vocabulary] = {}
-    for path in vocabularies:
-        vocabulary = Vocabulary.load(path)
+    for file, changes in listed:
+        vocabulary = (files[file].changed(changes) if changes else files[file]).vocabulary()
         if vocabulary.space.name in by_name:
             raise ConfigError(
-                f"{path}: two vocabularies are called '{vocabulary.space.name}'; give one a name (name: NAME)"
+                f"{file}: two vocabularies are called '{vocabulary.space.name}'; give one a name (name: NAME)"
             )
         by_name[vocabulary.space.name] = vocabulary
     return by_name

@@ -29,7 +29,9 @@ class VocabularyOptions(Settings):
 
     title: ClassVar[str] = NAME
     dataset: DatasetConfig = Field(description="a dataset with its options")
-    vocabularies: list[Path] = Field(min_length=1, description="files of vocabularies (docs/open-vocabulary.md)")
+    vocabularies: list[Path] = Field(
+        min_length=1, description="files of vocabularies, with changes (docs/open-vocabulary.md)"
+    )
 
     @field_validator("dataset")
     @classmethod

@@ -50,6 +50,11 @@ def save_models(folder: Path) -> None:
     (folder / "by_colour.py").write_text(python_blocks("tutorials/two-visits.md")[0], encoding="utf-8")
 
 
+def save_features(folder: Path) -> None:
+    """The file of a model that gives features, which the reader saves."""
+    (folder / "colours.py").write_text(python_blocks("tutorials/prompts.md")[0], encoding="utf-8")
+
+
 @pytest.mark.parametrize(("name", "prepare", "left"), [
     ("own-backend", save_backend, ["mine/report.html", "side-by-side/report.html"]),
     ("fusion-rules", save_rule, ["rules/report.html", "sharp/report.html"]),
@@ -58,6 +63,7 @@ def save_models(folder: Path) -> None:
     ("scans", make_nothing, [f"scans/{file}" for file in ("report.html", "tables/ranges.csv")]),
     ("two-models", make_nothing, ["both/report.html", "versus/report.html", "versus/comparison.json"]),
     ("two-visits", save_models, ["by-colour/report.html", "balanced/visits.json"]),
+    ("prompts", save_features, ["town/report.html", "town/tables/prompts.csv", "fewer/tables/prompts.csv"]),
     ("drone-flight", make_project, ["map/report.html", "map.ply", "map.tif", "map.class.tif", "map.laz"]),
 ])  # fmt: skip
 def test_every_block_of_a_tutorial_works_as_it_stands(name, prepare, left, tmp_path, monkeypatch) -> None:

@@ -16,6 +16,7 @@ from semstab.report.tables.features import feature_places, features
 from semstab.report.tables.filters import filter_tables
 from semstab.report.tables.flicker import flicker
 from semstab.report.tables.paper import paper
+from semstab.report.tables.prompts import prompts
 from semstab.report.tables.sensitivity import reduced, sensitivity
 from semstab.report.tables.stability import classes, cross_model, overview, persistence, scenes
 from semstab.report.tables.statistics import (
@@ -49,8 +50,8 @@ __all__ = [
 
 BUILDERS = (
     overview, paper, verdicts, flicker, video_measures, scenes, persistence, classes, temporal_agreement, correlogram,
-    class_agreement, merges, features, feature_places, ranges, drift, frames, uncertainty, ceiling, correctness,
-    cross_model, sensitivity, reduced, fusion, fusion_correctness, compared, agreement,
+    class_agreement, merges, prompts, features, feature_places, ranges, drift, frames, uncertainty, ceiling,
+    correctness, cross_model, sensitivity, reduced, fusion, fusion_correctness, compared, agreement,
 )  # fmt: skip
 """The functions that make tables, in the paper's order; without numbers for its tables a function returns none."""
 
@@ -58,9 +59,9 @@ OF_IMAGES = (flicker, video_measures, frames)
 """Functions of tables that also have rows for videos, which have no map."""
 
 WRITTEN = (
-    "filters", "findings", "overview", "verdicts", "features", "scenes", "persistence", "classes", "class_agreement",
-    "temporal_agreement", "flicker", "ranges", "frames", "correctness", "video_measures", "sensitivity", "fusion",
-    "agreement",
+    "filters", "findings", "overview", "verdicts", "features", "prompts", "scenes", "persistence", "classes",
+    "class_agreement", "temporal_agreement", "flicker", "ranges", "frames", "correctness", "video_measures",
+    "sensitivity", "fusion", "agreement",
 )  # fmt: skip
 """The beginnings of the names of the tables that a run writes, the most wanted first; `show` has the others."""
 

@@ -9,6 +9,7 @@ from semstab.data.measures import headlines
 from semstab.data.records import Record, Result
 from semstab.data.statistics import UNDEFINED, short
 from semstab.metrics import CATEGORIES
+from semstab.predict.prompts import Changes
 from semstab.report.means import ENOUGH
 from semstab.report.ranking import answers
 from semstab.report.terminal.disagreement import class_lines, outlying_lines
@@ -80,10 +81,13 @@ def several_models(result: Result, records: Sequence[Record], width: int) -> Ite
     yield from legend()
     if len(records) <= MOST_MAPS and any(record.summary.table.categories for record in records):
         yield from ("", *_map_shares(records, width, begin), "")
-    yield from class_lines(records, width, begin)
-    yield from outlying_lines(records)
+    told = [record for record in records if not _is_change_of(record, [*result.models])]
+    yield from class_lines(told, width, begin)
+    yield from outlying_lines(told)
     yield from _wrong_lines(records)
-    for record in records:
+    if len(told) < len(records):
+        yield from wrapped("what each change of names does: semstab-bench show RUN prompts")
+    for record in told:
         statistics = record.summary.statistics
         if statistics is None:
             continue
@@ -103,6 +107,12 @@ def several_models(result: Result, records: Sequence[Record], width: int) -> Ite
         for text in filter(None, (*statistics.moving_lines, *texts)):
             yield from wrapped(f"{record.unit.model}: {text}")
     yield ""
+
+
+def _is_change_of(record: Record, models: Sequence[str]) -> bool:
+    """Return whether it is a vocabulary of the run with other names."""
+    full, changes = Changes.of_model(record.unit.model)
+    return bool(changes) and full in models
 
 
 def _wrong_lines(records: Sequence[Record]) -> Iterator[str]:
