@@ -52,7 +52,7 @@ def other_network(base: RunHandle, other: RunHandle, scene: str) -> str:
 def difference_of_features(new: FeatureAgreement, base: FeatureAgreement) -> Interval:
     """Return alpha of features minus that of another run, as if errors were independent.
 
-    Errors of runs of the same frames are alike, so the interval is rather too wide than too narrow.
+    Errors of runs over the same frames are correlated, so the interval is rather too wide than too narrow.
     """
     return unpaired(new.alpha, base.alpha)
 

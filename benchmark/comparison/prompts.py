@@ -25,7 +25,7 @@ NO_LABEL = "no label"
 
 @dataclass(frozen=True)
 class Effect:
-    """What a change of names does to the labels of a vocabulary.
+    """The effect of a change of names on the labels of a vocabulary.
 
     Attributes:
         difference: Alpha with the change minus alpha of the full vocabulary, where both give a label.

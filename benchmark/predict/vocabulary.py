@@ -204,7 +204,7 @@ class VocabularyFile:
         return cls(path, settings, tuple(np.split(embeddings, ends[:-1])))
 
     def changed(self, changes: Changes) -> VocabularyFile:
-        """Return what the file would hold with other names; a new name is encoded as those of the file are.
+        """Return what the file would hold with other names; a new name is encoded like the names of the file.
 
         Raises:
             ConfigError: If it has no such name, fewer than two are left, or there is no encoder for a new one.
