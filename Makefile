@@ -50,6 +50,9 @@ faults: setup-dev
 	$(BIN)/python tests/faults/kills.py $(or $(FAULTS),280)
 	$(BIN)/python tests/faults/disk.py 12
 	$(BIN)/python tests/faults/forgeries.py results city@1 sim-soft
+	$(BIN)/python tests/faults/forgeries.py results city@1 trick-world-locked
+	$(BIN)/python tests/faults/forgeries.py results livingroom@1 dicenet-0.2
+	$(BIN)/python tests/faults/forgeries.py results apc_shelf@1 fcn-scores
 
 MUTANTS := --lines 100 --seed 0
 mutants: setup-dev

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import functools
 import logging
 import os
 import subprocess
@@ -13,9 +14,6 @@ from pathlib import Path
 from typer.testing import CliRunner
 
 from semstab.cli import _Once, app
-
-FOLDERS = ("room", "wall")
-"""Datasets that tests give as first word, which is short for `run --data`."""
 
 COMMAND = str(Path(sys.executable).with_name("semstab-bench"))
 
@@ -29,12 +27,16 @@ def command(words: Sequence[object], report: bool = False, recording: bool = Fal
 
     Runs and studies draw and record nothing unless a test looks: most of their time.
     """
-    said = {*map(str, words)}
-    first = str(words[0]).replace("-", "_") if words else ""
-    fuses = first in ("run", "study") or first[:1] == "_" or Path(first).name in FOLDERS
-    fuses = fuses and not {"--help", "--version"} & said
+    said, first = {*map(str, words)}, str(words[0]) if words else "run"
+    fuses = first in ("run", "study") or first not in _commands()  # bare options, or data: short for `run --data`
+    fuses = fuses and not {"--help", "-h", "--version"} & said
     off = [name for name, wanted in (("--report", report), ("--rerun", recording)) if not wanted and name not in said]
     return [COMMAND, *map(str, words), *(word for name in off if fuses for word in (name, "off"))]
+
+
+@functools.cache
+def _commands() -> frozenset[str]:
+    return frozenset(each.name or each.callback.__name__ for each in app.registered_commands)  # type: ignore[union-attr]
 
 
 def bench(

@@ -15,7 +15,7 @@ from semstab.recording.voxel_maps import packed
 from semstab.statistics.moving import MOVED, STATE_COLORS, STAYED, states_of
 
 CITY = {
-    "dataset": {"name": "city", "options": {"width": 256, "height": 144, "frames": 40}}, "scenes": ["scene0"],
+    "dataset": {"name": "city", "options": {"width": 160, "height": 90, "frames": 40}}, "scenes": ["scene0"],
     "models": ["gt"], "check": None, "voxel_size": 1.0,
 }  # fmt: skip
 
@@ -60,7 +60,7 @@ def test_the_run_tells_what_moved_and_its_series_has_it(run) -> None:  # type: i
 
 
 def test_kept_movers_are_told_nowhere(tmp_path) -> None:  # type: ignore[no-untyped-def]
-    result = semstab.run(CITY | {"moving": "keep"}, out=tmp_path / "run")
+    result = semstab.run(CITY | {"moving": "keep", "frames": {"stop": 10}}, out=tmp_path / "run", report=False)
     (record,) = result.select()
     assert record.statistics.moved is None
     assert record.statistics.static is None
@@ -86,6 +86,7 @@ def test_exported_masks_take_the_movers_out_of_the_map(run, tmp_path) -> None:  
     (before,) = semstab.run(config, out=tmp_path / "before", report=False).select()
     semstab.export(tmp_path / "before", tmp_path / "moving")
     (tmp_path / "moving").rename(converted.folder / "mask")
+    config |= {"statistics": False}
     (after,) = semstab.run(config, out=tmp_path / "after", report=False).select()
     (kept,) = semstab.run(config | {"exclude": {"masks": False}}, out=tmp_path / "kept", report=False).select()
 

@@ -36,6 +36,12 @@ def _flights():
     return flights()
 
 
+@pytest.fixture(scope="module")
+def plain(flights):
+    """The values of the first sequence, frame by frame."""
+    return updated(TemporalStability(K, SIZE), flights["scene0"]).compute()
+
+
 def test_it_says_what_the_command_says(flights):
     metric = TemporalStability(K, SIZE)
     for first, second in zip(*flights.values(), strict=True):  # sequences alternate
@@ -57,9 +63,8 @@ def test_it_says_what_the_command_says(flights):
     assert metric.by_sequence()["scene3"].scalars() == pytest.approx(rows[1].scalars(), abs=1e-9, nan_ok=True)
 
 
-def test_batches_of_tensors_are_frames_one_by_one(flights):
+def test_batches_of_tensors_are_frames_one_by_one(flights, plain):
     frames = flights["scene0"]
-    one = updated(TemporalStability(K, SIZE), frames).compute()
     images = [
         torch.stack([torch.from_numpy(np.array(getattr(f, name))) for f in frames])
         for name in ("labels", "depth", "T_wc")
@@ -74,7 +79,7 @@ def test_batches_of_tensors_are_frames_one_by_one(flights):
     ):
         metric = TemporalStability(K, SIZE)
         metric.update(given_labels, depth, given_camera, given_poses, ["s"] * len(frames))
-        assert metric.compute() == pytest.approx(one, abs=1e-12)
+        assert metric.compute() == pytest.approx(plain, abs=1e-12)
 
 
 def test_soft_scores_are_fused_as_scores(flights):
@@ -109,12 +114,11 @@ def test_pixels_without_a_label_are_left_out(flights):
         metric.update(np.full((54, 96), 9), frames[0].depth, frames[0].intrinsics, frames[0].T_wc)
 
 
-@settings(deadline=None, max_examples=6)
+@settings(deadline=None, max_examples=3)
 @given(owner=st.lists(st.integers(0, 2), min_size=10, max_size=10))
-def test_processes_add_up_to_one(flights, owner):
+def test_processes_add_up_to_one(flights, plain, owner):
     """However the frames are shared out; SBD and flicker are means over the steps that each process saw."""
     frames = flights["scene0"]
-    whole = updated(TemporalStability(K, SIZE), frames).compute()
     parts = [
         updated(TemporalStability(K, SIZE), [f for f, own in zip(frames, owner, strict=True) if own == k])
         for k in range(3)
@@ -125,8 +129,8 @@ def test_processes_add_up_to_one(flights, owner):
         merged.merge_state(states)
     values = merged.compute()
     for name in EXACT:
-        assert values[name] == pytest.approx(whole[name], abs=1e-9), name
-    assert values["alpha"] == pytest.approx(whole["alpha"], abs=ABOUT)
+        assert values[name] == pytest.approx(plain[name], abs=1e-9), name
+    assert values["alpha"] == pytest.approx(plain["alpha"], abs=ABOUT)
     assert math.isnan(values["sbd_op3"]) or 0 <= values["sbd_op3"] <= 0.32
 
 
@@ -181,14 +185,13 @@ def test_what_cannot_be_measured_is_one_line(change, message):
 # --- torchmetrics, Lightning, several processes
 
 
-def test_it_is_a_metric_of_torchmetrics(flights):
+def test_it_is_a_metric_of_torchmetrics(flights, plain):
     from torchmetrics import Metric, MetricCollection
     from torchmetrics.aggregation import MeanMetric
 
     assert issubclass(semstab.TemporalStability, Metric)
     collection = MetricCollection({"stability": semstab.TemporalStability(K, SIZE), "mean": MeanMetric()})
     metric = collection["stability"].clone()
-    plain = updated(TemporalStability(K, SIZE), flights["scene0"]).compute()
     for frame in flights["scene0"]:
         batch = metric(frame.labels, frame.depth, frame.intrinsics, frame.T_wc)
     assert batch["recurrent_share"] == 0  # of the last frame alone
@@ -219,7 +222,7 @@ def test_two_processes_say_what_one_says(flights, tmp_path):
     assert float(second["recurrent_share"]) != float(first["recurrent_share"])
 
 
-def test_lightning_logs_it(flights, tmp_path):
+def test_lightning_logs_it(flights, plain, tmp_path):
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # of Lightning's own imports
         import lightning
@@ -246,8 +249,7 @@ def test_lightning_logs_it(flights, tmp_path):
             enable_checkpointing=False, default_root_dir=tmp_path,
         )  # fmt: skip
         (logged,) = trainer.validate(Module(), torch.utils.data.DataLoader(torch.arange(10)), verbose=False)
-    expected = updated(TemporalStability(K, SIZE), frames).compute()
-    assert logged == pytest.approx({f"val/{name}": value for name, value in expected.items()}, rel=1e-6)
+    assert logged == pytest.approx({f"val/{name}": value for name, value in plain.items()}, rel=1e-6)
 
 
 def test_help_shows_the_arguments_of_the_metric_and_its_own_documentation():

@@ -146,7 +146,10 @@ def test_runs_over_videos_are_shown_compared_and_gated(tmp_path) -> None:
 def test_other_processes_measure_the_same(tmp_path) -> None:
     write(tmp_path / "clips/a", wrong=(5,))
     write(tmp_path / "clips/b", wrong=(7,))
-    words = "--dataset", "video", "--data", "clips", "--option", f"classes=[{','.join(CLASSES)}]", "--report", "on"
+    words = (
+        "--dataset", "video", "--data", "clips", "--option", f"classes=[{','.join(CLASSES)}]", "--frames", ":9",
+        "--report", "on",
+    )  # fmt: skip
     for out, jobs in (("one", "1"), ("two", "2")):
         bench("run", *words, "--out", out, "--jobs", jobs, cwd=tmp_path)
     assert _numbers(tmp_path / "one") == _numbers(tmp_path / "two")
@@ -202,7 +205,7 @@ def test_a_folder_of_images_alone_names_the_dataset(images, tmp_path) -> None:
 def test_what_needs_a_map_says_so(tmp_path) -> None:
     folder = write(tmp_path / "clip")
     given = ("--dataset", "video", "--data", folder)
-    classes = ("--option", f"classes=[{','.join(CLASSES)}]")
+    classes = ("--option", f"classes=[{','.join(CLASSES)}]", "--frames", ":3")
     told = bench("run", *given, *classes, "--voxel-size", "0.1", "--out", "sized", cwd=tmp_path).stderr
     assert "voxel_size: a video has no map, so that this is not used" in told
     assert "not used" not in bench("run", *given, *classes, "--out", "plain", cwd=tmp_path).stderr

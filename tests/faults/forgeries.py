@@ -5,6 +5,7 @@ Each is to be refused, or to change no rank.
     python tests/faults/forgeries.py results livingroom@1 [MODEL]
 
 prints a table: how many forgeries there are of each kind, how many are refused, leave all as it was, or change a rank.
+It ends with code 1 if a rank changes.
 """
 
 from __future__ import annotations
@@ -15,6 +16,7 @@ import dataclasses
 import io
 import itertools
 import json
+import sys
 import tempfile
 import zipfile
 from collections import Counter
@@ -554,6 +556,9 @@ def judged(referee: Referee, file: Path, *, fields: bool = True, one_in: int = 1
             yield kind, what, referee.outcome(file.name, forged, before)
 
 
+CHANGES = "A RANK CHANGES"
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("folder", type=Path)
@@ -568,13 +573,14 @@ def main() -> None:
         file = f"{given.benchmark}__{given.model}{SUFFIX}"
     count: Counter[tuple[str, str]] = Counter()
     for kind, what, outcome in judged(referee, given.folder / file, fields=not given.hand):
-        plain = outcome if outcome in ("refused", "no rank changes") else "A RANK CHANGES"
+        plain = outcome if outcome in ("refused", "no rank changes") else CHANGES
         count[kind, plain] += 1
-        if plain not in ("refused", "no rank changes"):
+        if plain == CHANGES:
             print(f"{kind}: {what}: {outcome}", flush=True)
     print(f"{file}: {len(ranks)} honest results, {count.total()} forgeries")
     for kind in dict.fromkeys(kind for kind, _ in count):
         print(f"  {kind:<40}", *(f"{what} {n}" for (own, what), n in sorted(count.items()) if own == kind), sep="  ")
+    sys.exit(any(outcome == CHANGES for _, outcome in count))
 
 
 if __name__ == "__main__":

@@ -1,4 +1,4 @@
-"""Forged results are refused in one line, or change no rank; `python tests/faults/forgeries.py` has many more."""
+"""Forged results are refused in one line, or change no rank; `make faults` judges many more, and all of these."""
 
 from __future__ import annotations
 
