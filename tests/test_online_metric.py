@@ -13,7 +13,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from hypothesis import given, settings
+from hypothesis import example, given, settings
 from hypothesis import strategies as st
 from online_rank import FLIGHT, FRAMES, SIZE, K, flights, updated
 
@@ -116,6 +116,7 @@ def test_pixels_without_a_label_are_left_out(flights):
 
 @settings(deadline=None, max_examples=3)
 @given(owner=st.lists(st.integers(0, 2), min_size=10, max_size=10))
+@example(owner=[0] * 10)
 def test_processes_add_up_to_one(flights, plain, owner):
     """However the frames are shared out; SBD and flicker are means over the steps that each process saw."""
     frames = flights["scene0"]
