@@ -71,7 +71,7 @@ def test_what_it_prints_fits_into_80_columns(file, tmp_path) -> None:
     for name in files:
         assert (tmp_path / "studies/tiny" / name).exists()
     assert max(len(line) for line in out.splitlines()) <= 80
-    assert "checked numpy against numba" in out
+    assert "fusion by numpy equals numba" in out
     assert "a: no verdict, too few locations were seen twice" in " ".join(out.split())
     assert "report  studies/tiny/report.html" in out
     assert len(out.splitlines()) <= 24
