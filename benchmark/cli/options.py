@@ -315,8 +315,12 @@ def chosen(
             inner = inner.setdefault(group, {})
             if not isinstance(inner, dict):
                 raise ConfigError(f"--set {setting}: '{group}' is given as an option too; use one of the two")
-        template = "{name}" in text or "{model}" in text  # of paths, in which braces are no YAML
-        inner[key] = text if template else parse_yaml(text, f"--set {setting}")
+        try:
+            inner[key] = parse_yaml(text, f"--set {setting}")
+        except ConfigError:
+            if "{name}" not in text and "{model}" not in text:
+                raise
+            inner[key] = text  # a template of paths, whose braces are no YAML
     select_dataset(content, dataset, data, seed)
     _require_settings(settings or (), content)
     if frames is not None:

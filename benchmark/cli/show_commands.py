@@ -209,7 +209,8 @@ def list_(
                     registry.load(name)
                 except MissingDependencyError as error:
                     missing = str(error)
-            described[name] = f"not installed: {missing.rpartition('; ')[2]}" if missing else entry.summary
+            reason, _, advice = missing.rpartition("; ")
+            described[name] = f"{advice} ({reason})" if reason else missing or entry.summary
     taxonomies = {name: LabelSpace.load(name) for name in shipped_taxonomies()}
     sections["taxonomy"] = {
         name: f"{len(space)} classes: {', '.join(space.classes)}" for name, space in taxonomies.items()

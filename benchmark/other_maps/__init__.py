@@ -105,7 +105,8 @@ def compare_maps(
         ConfigError, DataError, MissingDependencyError: For files that cannot be compared, in one line.
 
     Examples:
-        >>> comparison = semstab.compare_maps("run:sim-steady", "map.ply")
+        >>> [file] = semstab.export("run:sim-steady", "map.ply")
+        >>> comparison = semstab.compare_maps("run:sim-steady", file)
         >>> comparison.agreements[0].same
         1.0
     """
