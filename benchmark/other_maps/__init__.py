@@ -106,7 +106,7 @@ def compare_maps(
 
     Examples:
         >>> [file] = semstab.export("run:sim-steady", "map.ply")
-        >>> comparison = semstab.compare_maps("run:sim-steady", file)
+        >>> comparison = semstab.compare_maps("run:sim-steady", file.path)
         >>> comparison.agreements[0].same
         1.0
     """
