@@ -26,7 +26,7 @@ def peak():
         if line.startswith("VmHWM"):
             return int(line.split()[1]) / 1024
 for action in json.loads({actions!r}):
-    open("/proc/self/clear_refs", "w").write("5")  # the peak begins anew at the memory in use
+    open("/proc/self/clear_refs", "w").write("5")  # the peak restarts at the memory in use
     before, began, message = peak(), time.process_time(), None
     try:
         eval(action)

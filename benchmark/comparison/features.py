@@ -17,7 +17,7 @@ FEATURE_ALPHA = Quantity(key="feature_alpha", title="Alpha of features", better=
 
 @dataclass(frozen=True, eq=False)
 class FeatureDifference:
-    """Alpha of features of a run minus that of the base.
+    """Alpha of features of a run minus alpha of features of the base.
 
     Attributes:
         by_scene: In each scene.
@@ -50,7 +50,7 @@ def other_network(base: RunHandle, other: RunHandle, scene: str) -> str:
 
 
 def difference_of_features(new: FeatureAgreement, base: FeatureAgreement) -> Interval:
-    """Return alpha of features minus that of another run, as if errors were independent.
+    """Return alpha of features minus alpha of another run, as if errors were independent.
 
     Errors of runs over the same frames are correlated, so the interval is rather too wide than too narrow.
     """

@@ -1,4 +1,4 @@
-"""Vocabularies of which names were left out, added or renamed, beside the full vocabulary of the same run."""
+"""Vocabularies of which names were left out, added or renamed, compared with the full vocabulary of the same run."""
 
 from __future__ import annotations
 

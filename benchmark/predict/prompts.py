@@ -1,4 +1,4 @@
-"""Changes of a vocabulary that stand beside its file: 'kitchen.yaml,without=door,add=lamp,rename=shelf:rack'."""
+"""Changes of a vocabulary that follow its file: 'kitchen.yaml,without=door,add=lamp,rename=shelf:rack'."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ CHANGE = re.compile(r",(without|add|rename)=")
 
 @dataclass(frozen=True)
 class Changes:
-    """Names that are taken out of a vocabulary, added to it, or said in other words.
+    """Names that are taken out of a vocabulary, added to it, or renamed.
 
     Attributes:
         without: Names that are left out, with their synonyms.
@@ -31,7 +31,7 @@ class Changes:
 
     @classmethod
     def parse(cls, text: str) -> tuple[Path, Self]:
-        """Return the file of a vocabulary, and the changes that stand beside it.
+        """Return the file of a vocabulary, and the changes that follow it.
 
         Raises:
             ConfigError: If a change says no name, or 'without=each' is not the only one.

@@ -293,7 +293,7 @@ def _encoded(encoder: EncoderSettings, words: list[str], path: Path) -> Float32:
 
 
 def named(vocabularies: Sequence[Path]) -> dict[str, Vocabulary]:
-    """Return vocabularies by their names, with the changes that stand beside their files.
+    """Return vocabularies by their names, with the changes that follow their files.
 
     'FILE,without=each' stands for the vocabulary of the file, and for the same without each of its names.
 
