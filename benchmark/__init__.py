@@ -11,6 +11,7 @@ if TYPE_CHECKING:
     from semstab import backends, datasets, engine, metrics, models, statistics
     from semstab.api import run, run_study
     from semstab.compare_runs import compare
+    from semstab.comparison.features import compare_features
     from semstab.config import Config
     from semstab.configure import load_config, load_study
     from semstab.data.events import Events
@@ -53,6 +54,7 @@ __all__ = [
     "VoxelTable",
     "backends",
     "compare",
+    "compare_features",
     "compare_maps",
     "compare_visits",
     "datasets",
@@ -78,7 +80,8 @@ _HOMES = {
     "Frame": "data.frames",
     "GateConfig": "gating.gate", "Intrinsics": "data.frames", "LabelSpace": "data.labels",
     "MissingDependencyError": "errors", "Result": "data.records", "SemstabError": "errors", "VoxelTable": "data.voxels",
-    "FusedResult": "online", "TemporalStability": "online", "compare": "compare_runs", "compare_maps": "other_maps",
+    "FusedResult": "online", "TemporalStability": "online", "compare": "compare_runs",
+    "compare_features": "comparison.features", "compare_maps": "other_maps",
     "compare_visits": "two_visits", "fuse": "online",
     "export": "exports", "gate": "gating.gate", "load": "report.saved_run",
     "load_config": "configure", "load_result": "engine.folder", "load_study": "configure", "relabel": "exports.relabel",

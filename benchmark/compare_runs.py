@@ -13,7 +13,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from semstab.comparison.differences import ComparisonData, Progress, find
+from semstab.comparison.differences import ComparisonData, Progress, differences_of
+from semstab.comparison.entries import RunHandle, open_compared
 from semstab.comparison.locations import VoxelChanges
 from semstab.comparison.quantities import HEADLINES, IOU, by_name
 from semstab.config.groups import ScopeOption, validated
@@ -25,7 +26,6 @@ from semstab.data.contrast import Against, Area, RunComparison, SceneComparison
 from semstab.data.georeference import Georeference
 from semstab.data.results import slug
 from semstab.data.statistics import Estimate
-from semstab.engine.folder import load_result, run_and_model
 from semstab.errors import ConfigError
 from semstab.exports.area_pictures import area_pictures
 from semstab.report.charts import dot_chart, sample
@@ -159,20 +159,32 @@ def compare(
         progress: Function that is called with each compared scene.
 
     Raises:
-        ConfigError, DataError: For runs that cannot be opened, or have no scene or no classes in common, in one line.
+        ConfigError, DataError: For runs that cannot be opened, or have no scene or no classes in common, in one line;
+            for models with features and no labels, which `compare_features` compares.
 
     Examples:
         >>> semstab.compare("run:sim-steady", "run:sim-flicker")
         <RunComparison with sim-steady on scene0>
           sim-flicker: alpha -.19 ..., p ...; worse in alpha, psa_op2, vss_op3...
     """
+    return compare_opened(open_compared(runs), out=out, scope=scope, progress=progress)
+
+
+def compare_opened(
+    handles: Sequence[RunHandle],
+    *,
+    out: str | Path | None = None,
+    scope: str = THIS_SCENE,
+    progress: Progress = lambda what: None,
+) -> RunComparison:
+    """Compare opened runs, as `compare` does."""
     lock = None
     if out is not None:
         _require_own(Path(out))
         lock = FolderLock(Path(out))
     try:
-        comparison = find(runs, progress, validated(ScopeOption, {"scope": scope}, "compare: ").scope)
-        by_scene = georeferences(runs)
+        comparison = differences_of(handles, progress, validated(ScopeOption, {"scope": scope}, "compare: ").scope)
+        by_scene = georeferences(handles)
         if out is not None:
             write(comparison, out, by_scene)
     finally:
@@ -183,10 +195,9 @@ def compare(
     return located(comparison.result, by_scene)
 
 
-def georeferences(runs: Sequence[str | os.PathLike[str]]) -> Mapping[str, Georeference]:
-    """Return the georeferences of scenes by name from the first run with a folder: all runs have the same."""
-    folders = (folder for folder, _ in map(run_and_model, runs) if folder.is_dir())
-    return next((load_result(folder).georeference for folder in folders), {})
+def georeferences(runs: Sequence[RunHandle]) -> Mapping[str, Georeference]:
+    """Return the georeferences of scenes by name, from the first run: all that are paired have the same."""
+    return {scene: entry.georeference for scene, entry in runs[0].scenes.items() if entry.georeference is not None}
 
 
 def located(result: RunComparison, known: Mapping[str, Georeference]) -> RunComparison:

@@ -13,6 +13,7 @@ from __future__ import annotations
 
 import argparse
 import importlib.util
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -120,6 +121,32 @@ class dicenet_city(WithFeatures):  # noqa: N801
     name = "dicenet_city"
 
 
+def write_vocabulary(
+    networks: str, name: str, scale: float, out: Path, *, groups: bool = False, models: Sequence[str] = ()
+) -> None:
+    """Write the classifier of a network as a vocabulary, and its embeddings next to it.
+
+    Args:
+        networks: The folder of EdgeNets.
+        name: Name of the network in nets.py.
+        scale: Width of the network.
+        out: The vocabulary, a .yaml.
+        groups: Whether names are groups of classes, not classes.
+        models: Models whose features it is for; by default `name`.
+    """
+    network = load(networks, name, scale)
+    names, order = list(network.classes), list(range(len(network.classes)))
+    if groups:
+        of_data = VOC_GROUPS if network.data == "pascal" else CITY_GROUPS
+        names = [{"name": group, "synonyms": members} for group, members in of_data.items()]
+        order = [network.classes.index(word) for members in of_data.values() for word in (members[0], *members)]
+    np.save(out.with_suffix(".npy"), weights_of(network)[order])
+    content = {
+        "names": names, "embeddings": out.with_suffix(".npy").name, "normalise": False, "models": [*models] or [name],
+    }  # fmt: skip
+    out.write_text(yaml.safe_dump(content, sort_keys=False))
+
+
 def main() -> None:
     """Write the classifier of a network as a vocabulary."""
     parser = argparse.ArgumentParser(description=main.__doc__)
@@ -129,20 +156,7 @@ def main() -> None:
     parser.add_argument("--groups", action="store_true", help="name the groups of classes, not the classes")
     parser.add_argument("-o", "--out", type=Path, required=True, help="a .yaml; embeddings are written next to it")
     options = parser.parse_args()
-    network = load(options.networks, options.name, options.scale)
-    names, order = list(network.classes), list(range(len(network.classes)))
-    if options.groups:
-        groups = VOC_GROUPS if network.data == "pascal" else CITY_GROUPS
-        names = [{"name": name, "synonyms": members} for name, members in groups.items()]
-        order = [network.classes.index(word) for members in groups.values() for word in (members[0], *members)]
-    np.save(options.out.with_suffix(".npy"), weights_of(network)[order])
-    content = {
-        "names": names,
-        "embeddings": options.out.with_suffix(".npy").name,
-        "normalise": False,
-        "models": [options.name],
-    }
-    options.out.write_text(yaml.safe_dump(content, sort_keys=False))
+    write_vocabulary(options.networks, options.name, options.scale, options.out, groups=options.groups)
 
 
 if __name__ == "__main__":

@@ -208,8 +208,8 @@ def run(work: Path, results: Path) -> None:
     accuracy = {(row["street"], row["network"]): row["accuracy"] for row in rows if row["condition"] == "main"}
     for row in rows:
         row["accuracy"] = accuracy[row["street"], row["network"]]
-    _write(results / "streets.csv", rows)
-    _write(results / "streets-classes.csv", classes)
+    write_rows(results / "streets.csv", rows)
+    write_rows(results / "streets-classes.csv", classes)
     _describe(results / "streets.json", shlex.join(["semstab-bench", *command]).replace(str(work), "WORK"), about, work)
 
 
@@ -379,7 +379,8 @@ def _together(pixels: Mapping[str, tuple[Any, Any]]) -> dict[str, float]:
 # --- Results ----------------------------------------------------------------------------------------------------------
 
 
-def _write(path: Path, rows: Sequence[Mapping[str, Any]]) -> None:
+def write_rows(path: Path, rows: Sequence[Mapping[str, Any]]) -> None:
+    """Write rows of numbers and texts as CSV; NaN is empty."""
     names = list(dict.fromkeys(name for row in rows for name in row))
     with atomic_path(path) as temporary, temporary.open("w", newline="", encoding="utf-8") as file:
         writer = csv.DictWriter(file, names, lineterminator="\n")

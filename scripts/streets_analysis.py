@@ -29,6 +29,9 @@ MEASURES = {
 LESS = {"sbd", "entropy", "flicker", "compensated"}
 """Measures of which less is better: their signs are turned."""
 
+TEXTS = ("condition", "data", "street", "network", "family", "of", "verdict", "class", "level", "merged")
+"""Columns of text."""
+
 SAMPLES = 1000
 APART = 0.02
 """Accuracies that differ by this or more make a pair of networks whose order is asked for."""
@@ -41,7 +44,7 @@ def load(path: Path) -> list[dict[str, Any]]:
 
 
 def _number(key: str, text: str) -> Any:
-    if key in ("condition", "street", "network", "family", "of", "verdict", "class"):
+    if key in TEXTS:
         return text
     return float(text or "nan")
 

@@ -5,23 +5,25 @@ from __future__ import annotations
 import dataclasses
 import itertools
 import logging
+import math
 import shutil
 
 import numpy as np
 import pytest
 from command_line import bench, error_of
+from numpy.testing import assert_array_equal
 from room_scene import CAMERA, CLASSES, Room, opened, render, rigid, turn, walk, write
 from simulated_events import grid, spots_at
 
 import semstab
+from semstab.comparison.differences import sums_difference
 from semstab.core.files import write_image
 from semstab.data.features import FeatureColours, Features
-from semstab.data.statistics import Estimate
 from semstab.errors import DataError
 from semstab.online.metric import TemporalStability
 from semstab.statistics import Sampler
 from semstab.statistics.accumulate import sums_of_spots
-from semstab.statistics.cluster_sums import value
+from semstab.statistics.cluster_sums import ClusterSums, value
 from semstab.statistics.feature_spots import FeatureObservations, FeatureStore
 from semstab.statistics.features import FEATURE_ALPHA, alpha_of_features, feature_agreement, feature_sums, likeness
 from semstab.statistics.intervals import estimate, scope_of
@@ -50,6 +52,12 @@ def sampled(frames, budget=1 << 19):
     for frame in frames:
         sampler.add(frame)
     return sampler
+
+
+def agreement_of(seen):
+    """Alpha of features of observations, with all that goes with it."""
+    alike = likeness(seen)
+    return feature_agreement(seen, alike, feature_sums(seen, alike))
 
 
 def seen_by(vectors, index=None):
@@ -90,7 +98,7 @@ def test_their_intervals_are_those_of_the_labels():
     sampler = sampled(frames)
     first = sums_of_spots(sampler.sample()).answers[0]
     expected = estimate(first, "voxel_alpha", scope=scope_of(first, key="voxel_alpha"))
-    found = feature_agreement(sampler.features()).alpha
+    found = agreement_of(sampler.features()).alpha
     assert (found.low, found.high) == pytest.approx((expected.low, expected.high), abs=1e-9)
     assert found.scope == expected.scope
 
@@ -120,7 +128,7 @@ def test_agreement_of_pairs_in_a_bin_is_that_of_all_their_vectors():
     vectors = rng.normal(size=(400, 1, 60)) + rng.normal(size=(400, 24, 60)) + drift
     seen = seen_by(vectors)
     s = seen.rows(slice(0, len(seen))).reshape(400, 24, 60)
-    found = {(each.low, each.high): each.alpha.value for each in feature_agreement(seen).correlogram.time}
+    found = {(each.low, each.high): each.alpha.value for each in agreement_of(seen).correlogram.time}
     a, b = s[:, :-1].reshape(-1, 60), s[:, 1:].reshape(-1, 60)  # pairs of views next to each other
     both = np.concatenate([a, b])
     n, total = len(both), both.sum(axis=0)
@@ -179,7 +187,7 @@ def test_a_bad_frame_is_named_and_a_bad_place_is_found():
     index = grid(30)
     corner = (index[:, 0] < 8) & (index[:, 1] < 8)
     vectors[corner] = rng.normal(size=(corner.sum(), 10, 12))
-    found = feature_agreement(seen_by(vectors, index))
+    found = agreement_of(seen_by(vectors, index))
     assert [each.frame for each in found.outlying_frames.frames] == [4]
     assert found.places[0].centre[0] < 1 > found.places[0].centre[1]
     assert found.places[0].cosine < 0.2 < found.places[-1].cosine
@@ -195,7 +203,7 @@ def test_agreement_falls_with_the_angle_between_views():
         turned[..., 6], turned[..., 7] = np.cos(0.15 * i), np.sin(0.15 * i)
         turned = turned + 0.02 * rng.normal(size=turned.shape)
         frames.append(semstab.Frame(i, depth, CAMERA, T, features=turned.astype(np.float32)))
-    alphas = [each.alpha.value for each in feature_agreement(sampled(frames).features()).correlogram.time]
+    alphas = [each.alpha.value for each in agreement_of(sampled(frames).features()).correlogram.time]
     assert len(alphas) >= 4
     assert alphas == sorted(alphas, reverse=True)
     assert alphas[0] - alphas[-1] > 0.2
@@ -470,12 +478,10 @@ def test_features_of_one_network_at_two_settings_are_compared(runs_of_features):
         semstab.load_result(runs_of_features / run).record().statistics.features.alpha for run in ("base", "noise")
     )
     said = " ".join(bench("compare", "base", "noise", cwd=runs_of_features).stdout.split())
-    change = noise.value - base.value
-    low = change - np.hypot(noise.value - noise.low, base.high - base.value)
-    high = change + np.hypot(noise.high - noise.value, base.value - base.low)
-    assert high < 0
-    expected = Estimate(change, low, high)
-    assert f"features of noise are less stable than of base: alpha of features {expected.text('+')}" in said
+    (found,) = semstab.compare_features(runs_of_features / "base", runs_of_features / "noise")
+    assert found.difference.value == pytest.approx(noise.value - base.value)
+    assert found.difference.low < found.difference.value < found.difference.high < 0
+    assert f"features of noise are less stable than of base: alpha of features {found.difference.text('+')}" in said
     assert f"{base.value:.3f} ({base.low:.3f}, {base.high:.3f})" in said
     same = bench("compare", "base", "base", cwd=runs_of_features).stdout
     assert "do not differ significantly in stability" in same
@@ -511,10 +517,64 @@ def test_a_gate_judges_alpha_of_features(runs_of_features):
     assert alpha.low < interval.low < alpha.value < interval.high < alpha.high  # each end at 5 %, not at 2.5 %
 
 
+def test_the_change_of_one_networks_features_is_paired_on_common_frames():
+    """What is hard for both settings is no error of their difference."""
+    rng, wrong = np.random.default_rng(1), []
+    for frame in flight(24, wrong=0.4):
+        wrong.append(of_classes(frame.labels) + 0.3 * rng.normal(size=(*frame.labels.shape, K)))
+    frames = [dataclasses.replace(frame, features=cells) for frame, cells in zip(flight(24), wrong, strict=True)]
+    other = [
+        dataclasses.replace(frame, features=frame.features.vectors.astype(float) + 0.1 * rng.normal(size=cells.shape))
+        for frame, cells in zip(frames, wrong, strict=True)
+    ]
+    one, two = (sums_with_features(sampled(of)) for of in (frames, other))
+    paired, apart = (sums_difference("feature_alpha", two, one, apart=apart) for apart in (False, True))
+    assert paired.value == pytest.approx(value(two, "feature_alpha") - value(one, "feature_alpha"))
+    assert paired.high - paired.low < 0.5 * (apart.high - apart.low)
+
+
+def test_sums_of_features_are_in_the_file_of_sums(tmp_path):
+    frames = [dataclasses.replace(frame, features=of_classes(frame.labels)) for frame in flight(8)]
+    sums = sums_with_features(sampled(frames))
+    sums.save(tmp_path / "sums.parquet")
+    again = ClusterSums.load(tmp_path / "sums.parquet")
+    assert_array_equal(again.features.columns, sums.features.columns)
+    assert value(again, "feature_alpha") == value(sums, "feature_alpha")
+    coarse = again.coarsened(again.edge * 2, 4)
+    assert value(coarse, "feature_alpha") == pytest.approx(value(sums, "feature_alpha"))
+    assert math.isnan(value(dataclasses.replace(sums, features=None), "feature_alpha"))
+
+
+def sums_with_features(sampler):
+    """Sums of spots with sums of their features, as a run stores them."""
+    seen = sampler.features()
+    return dataclasses.replace(sums_of_spots(sampler.sample()), features=feature_sums(seen, likeness(seen)))
+
+
+def test_a_baseline_of_features_is_paired(runs_of_features):
+    config = semstab.GateConfig(rules=("alpha of features drop < .5",))
+    bench("gate", "base", "--rule", "alpha of features > .1", "--save-baseline", "base.semstab", cwd=runs_of_features)
+    of_file, of_folder = (
+        semstab.gate(runs_of_features / "noise", runs_of_features / base, config) for base in ("base.semstab", "base")
+    )
+    assert "clip gives features" in error_of("gate", "base.semstab", "--rule", "alpha > .8", cwd=runs_of_features)
+    intervals = [result.judgements[0].interval for result in (of_file, of_folder)]
+    assert intervals[0].value == pytest.approx(intervals[1].value)
+    assert intervals[0].low == pytest.approx(intervals[1].low, abs=0.02)
+
+
+def test_features_of_labels_are_named_in_python(tmp_path):
+    written(tmp_path / "room", clip=coarse)
+    bench("room", "--voxel-size", "0.2", "-o", "run", cwd=tmp_path)
+    run = tmp_path / "run"
+    with pytest.raises(semstab.ConfigError, match=r"net has labels; semstab\.compare compares them"):
+        semstab.compare_features(f"{run}:clip", f"{run}:net")
+    with pytest.raises(semstab.ConfigError, match=r"name two runs or more"):
+        semstab.compare_features(f"{run}:clip")
+
+
 def test_what_features_alone_have_not_is_one_line(runs_of_features):
     assert "clip gives features" in error_of("gate", "base", "--rule", "alpha > .8", cwd=runs_of_features)
-    both = "base", "--rule", "alpha of features > .1", "--scope", "other-scenes"
-    assert "base states it for this scene; leave out --scope" in error_of("gate", *both, cwd=runs_of_features)
     assert "leave out --out and --scope" in error_of("compare", "base", "noise", "-o", "out", cwd=runs_of_features)
     assert not (runs_of_features / "out").exists()
 

@@ -4,12 +4,15 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from semstab.cli.options import OwnCode, Quiet, ScopeOption, Verbose, print_lines, say
 from semstab.errors import ConfigError
+
+if TYPE_CHECKING:
+    from semstab.comparison.entries import RunHandle
 
 
 def compare(
@@ -36,17 +39,21 @@ def compare(
         return
     if align is not None or code:
         raise ConfigError("--align and --code belong to two visits of one place: add --same-place")
-    from semstab.compare_runs import compare
+    from semstab.compare_runs import compare_opened
     from semstab.compare_runs import markdown as as_markdown
+    from semstab.comparison.entries import open_compared
     from semstab.core.console import Console
     from semstab.core.types import THIS_SCENE
     from semstab.report.comparison.tables import print_comparison
 
-    if _compare_features(runs, out, scope, markdown=markdown, quiet=quiet):
-        return
     with Console(stderr=True, quiet=quiet).status("opening") as status:
-        comparison = compare(
-            *runs, out=out, scope=scope or THIS_SCENE, progress=lambda scene: status.update(f"comparing {scene}")
+        handles = open_compared(runs)
+        if all(handle.features_alone for handle in handles):
+            status.stop()
+            _compare_features(handles, out, scope, markdown=markdown, quiet=quiet)
+            return
+        comparison = compare_opened(
+            handles, out=out, scope=scope or THIS_SCENE, progress=lambda scene: status.update(f"comparing {scene}")
         )
     if markdown:
         print_lines([as_markdown(comparison)], quiet=quiet)
@@ -57,16 +64,13 @@ def compare(
         print_lines([f"folder: {out}; report: {out / 'report.html'}"], quiet=quiet)
 
 
-def _compare_features(runs: list[str], out: Path | None, scope: str | None, *, markdown: bool, quiet: bool) -> bool:
-    """Compare models that give features alone; return False if the models named have labels."""
-    from semstab.comparison.entries import gives_features_alone, open_models, open_runs
+def _compare_features(
+    handles: Sequence[RunHandle], out: Path | None, scope: str | None, *, markdown: bool, quiet: bool
+) -> None:
+    """Print the comparison of models that give features alone."""
     from semstab.report.comparison.features import compared_features
     from semstab.report.tables.table import to_markdown, to_terminal
 
-    handles = open_models(runs[0], features=True) if len(runs) == 1 else open_runs(runs, features=True)
-    records = [entry.record for handle in handles for entry in handle.scenes.values() if entry.record is not None]
-    if len(handles) < 2 or len(records) < len(handles) or not all(map(gives_features_alone, records)):
-        return False
     if out is not None or scope is not None:
         raise ConfigError(
             "compare: alpha of features has the scope of its run, and no pages of differences; leave out --out and"
@@ -77,7 +81,6 @@ def _compare_features(runs: list[str], out: Path | None, scope: str | None, *, m
         print_lines(["\n".join([*(f"- {text}" for text in sentences), "", to_markdown(table)])], quiet=quiet)
     else:
         print_lines([*sentences, "", to_terminal(table)], quiet=quiet)
-    return True
 
 
 def _compare_visits(
@@ -159,7 +162,7 @@ def gate(
         if not result.passed:
             return
     if save_baseline is not None:
-        save_summary(open_run(new), save_baseline)
+        save_summary(open_run(new, features=True), save_baseline)
         print_lines([f"{save_baseline}: a baseline of {save_baseline.stat().st_size:,} bytes"], quiet=quiet)
 
 

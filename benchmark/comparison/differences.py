@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import dataclasses
 import math
-import os
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -12,7 +11,7 @@ from pathlib import Path
 import numpy as np
 
 from semstab.comparison.caution import cautions
-from semstab.comparison.entries import Entry, Flicker, RunHandle, open_models, open_runs, shared_scenes
+from semstab.comparison.entries import Entry, Flicker, RunHandle, shared_scenes
 from semstab.comparison.locations import VoxelChanges, worse_areas
 from semstab.comparison.pairing import Common, joint_class, pair
 from semstab.comparison.quantities import (
@@ -33,7 +32,6 @@ from semstab.data.measures import Measure, Quantity, mean
 from semstab.data.results import slug
 from semstab.data.statistics import CONFIDENCE, UNKNOWN, Interval
 from semstab.data.voxels import VoxelTable
-from semstab.errors import ConfigError
 from semstab.metrics import macro_mean
 from semstab.statistics.accumulate import Cubes
 from semstab.statistics.agreement import ALPHA, ratio_of
@@ -300,29 +298,17 @@ class ComparisonData:
     up: Mapping[str, Up]
 
 
-def find(
-    runs: Sequence[str | os.PathLike[str]], progress: Progress = lambda what: None, scope: Scope = THIS_SCENE
-) -> ComparisonData:
-    """Compare runs with the first one for a scope; `progress` is called with each step.
-
-    Raises:
-        ConfigError: For fewer than two, and as `open_runs` does.
-        DataError: As `differences_of` does.
-    """
-    handles = open_models(runs[0]) if len(runs) == 1 else open_runs(runs)
-    if len(handles) < 2:
-        raise ConfigError("there is nothing to compare the run with; name two runs or more, the base first")
-    return differences_of(handles, progress, scope)
-
-
 def differences_of(
     handles: Sequence[RunHandle], progress: Progress = lambda what: None, scope: Scope = THIS_SCENE
 ) -> ComparisonData:
     """Compare opened runs with the first one for a scope; `progress` is called with each step.
 
     Raises:
+        ConfigError: If a run has features and no labels.
         DataError: As `shared_scenes` and `pair` do.
     """
+    for handle in handles:
+        handle.require_labels()
     scenes: list[SceneComparison] = []
     changes: dict[tuple[str, str], VoxelChanges] = {}
     for scene in shared_scenes(handles):

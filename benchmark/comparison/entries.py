@@ -31,7 +31,7 @@ from semstab.data.georeference import Georeference
 from semstab.data.labels import sharing_classes
 from semstab.data.records import ImageSpace, Record, Result
 from semstab.data.results import UnitSummary
-from semstab.data.statistics import LabelledPairs
+from semstab.data.statistics import LabelledPairs, MapStatistics
 from semstab.datasets import GROUND_TRUTH
 from semstab.engine.folder import load_result, run_and_model
 from semstab.errors import ConfigError, DataError, sanitize, summarize_error
@@ -164,6 +164,32 @@ class RunHandle:
     def __str__(self) -> str:
         return self.model if self.source is None else f"{self.model} ({self.source})"
 
+    @property
+    def features_alone(self) -> bool:
+        """Return whether the model gives features and no labels."""
+        return any(gives_features_alone(entry.summary.statistics) for entry in self.scenes.values())
+
+    def require_labels(self) -> None:
+        """Raise ConfigError if the model gives features alone."""
+        if self.features_alone:
+            raise ConfigError(
+                f"{self.where}: {self.model} gives features and no labels, and what is compared is of labels; name its"
+                f" features (--vocabulary FILE), or see `semstab-bench show {self.source or 'RUN'} features`"
+            )
+
+
+def open_compared(named: Sequence[str | os.PathLike[str]]) -> tuple[RunHandle, ...]:
+    """Open runs that are compared, or the models of one run; also such as have features and no labels.
+
+    Raises:
+        ConfigError: If there are fewer than two, and as `open_runs` does.
+        DataError: As `open_runs` does.
+    """
+    handles = open_models(named[0], features=True) if len(named) == 1 else open_runs(named, features=True)
+    if len(handles) < 2:
+        raise ConfigError("there is nothing to compare the run with; name two runs or more, the base first")
+    return handles
+
 
 def open_runs(named: Sequence[str | os.PathLike[str]], *, features: bool = False) -> tuple[RunHandle, ...]:
     """Open folders of runs or studies, 'FOLDER:MODEL', and small summaries, under the shortest distinct names.
@@ -210,8 +236,10 @@ def models_of(result: Result, source: Path | None = None, *, features: bool = Fa
     Models that give features alone are left out, unless there are no others.
     """
     names = [model for model in result.models if model != GROUND_TRUTH]
-    labelled = [name for name in names if not any(map(gives_features_alone, result.select(model=name)))]
-    handles = [handle_of(result, model, source, features=features) for model in labelled or names]
+    of_models = [handle_of(result, model, source, features=True) for model in names]
+    handles = [handle for handle in of_models if not handle.features_alone] or of_models
+    for handle in () if features else handles:
+        handle.require_labels()
     scenes = set.intersection(*({*handle.scenes} for handle in handles)) if handles else set()
     if not scenes:
         return tuple(handles)
@@ -236,15 +264,17 @@ def open_run(named: str | os.PathLike[str], *, features: bool = False) -> RunHan
     if path.is_file():
         small = load_summary(path)
         _chosen(path, [small.model], model)
+        if not features:
+            small.require_labels()
         return small
     result = load_result(path)
     source = path if isinstance(named, str | Path) else None
     return handle_of(result, _chosen(path, result.models, model), source, features=features)
 
 
-def gives_features_alone(record: Record) -> bool:
+def gives_features_alone(statistics: MapStatistics | None) -> bool:
     """Return whether a model gives features and no labels."""
-    features = None if record.statistics is None else record.statistics.features
+    features = None if statistics is None else statistics.features
     return features is not None and features.alone
 
 
@@ -255,11 +285,6 @@ def handle_of(result: Result, model: str, source: Path | None = None, *, feature
         ConfigError: If it gives features alone, unless `features` allows that.
     """
     seed = result.manifest.get("seed")
-    if not features and any(map(gives_features_alone, result.select(model=model))):
-        raise ConfigError(
-            f"{source or model}: {model} gives features and no labels, and what is compared is of labels; name its"
-            f" features (--vocabulary FILE), or see `semstab-bench show {source or 'RUN'} features`"
-        )
     scenes = {
         scene: Entry(
             summary=record.summary, image_space=record.image_space, georeference=result.georeference.get(scene),
@@ -269,7 +294,10 @@ def handle_of(result: Result, model: str, source: Path | None = None, *, feature
         for record in result.select(model=model)
         for scene in [record.unit.scene]
     }  # fmt: skip
-    return RunHandle(model, source, model, scenes)
+    handle = RunHandle(model, source, model, scenes)
+    if not features:
+        handle.require_labels()
+    return handle
 
 
 def shared_scenes(runs: Sequence[RunHandle]) -> tuple[str, ...]:

@@ -2,15 +2,19 @@
 
 from __future__ import annotations
 
-import dataclasses
+import os
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-from semstab.comparison.entries import Entry, RunHandle
+from semstab.comparison.differences import sums_difference
+from semstab.comparison.entries import Entry, RunHandle, open_compared, shared_scenes
+from semstab.comparison.pairing import other_frame_of_reference
+from semstab.core.types import THIS_SCENE, Scope
 from semstab.data.measures import Quantity
 from semstab.data.statistics import FeatureAgreement, Interval
-from semstab.errors import DataError
-from semstab.statistics.intervals import mean_of, unpaired
+from semstab.errors import ConfigError, DataError
+from semstab.statistics.cluster_sums import functional, parts_of
+from semstab.statistics.intervals import mean_of
 
 FEATURE_ALPHA = Quantity(key="feature_alpha", title="Alpha of features", better="higher", digits=(3, 4))
 
@@ -49,12 +53,13 @@ def other_network(base: RunHandle, other: RunHandle, scene: str) -> str:
     return ""
 
 
-def difference_of_features(new: FeatureAgreement, base: FeatureAgreement) -> Interval:
-    """Return alpha of features minus alpha of another run, as if errors were independent.
+def difference_of_features(new: Entry, base: Entry, scope: Scope = THIS_SCENE) -> Interval:
+    """Return alpha of features minus alpha of features of the base, paired on cubes of space and on common frames.
 
-    Errors of runs over the same frames are correlated, so the interval is rather too wide than too narrow.
+    Runs in other frames of reference have nothing in common: their errors are independent.
     """
-    return unpaired(new.alpha, base.alpha)
+    apart = bool(other_frame_of_reference([base, new]))
+    return sums_difference(FEATURE_ALPHA.key, new.sums, base.sums, scope=scope, apart=apart)
 
 
 def feature_differences(runs: Sequence[RunHandle], scenes: Sequence[str]) -> list[FeatureDifference]:
@@ -65,24 +70,42 @@ def feature_differences(runs: Sequence[RunHandle], scenes: Sequence[str]) -> lis
     """
     base, *others = runs
     for run in runs:
-        if without := next((scene for scene in scenes if agreement_of(run.scenes[scene]) is None), None):
+        if without := next((scene for scene in scenes if not _has_features(run.scenes[scene])), None):
             raise DataError(f"{run.where}: {run.model} has no alpha of features of {without}; run it again")
     result = []
     for other in others:
         if why := next(filter(None, (other_network(base, other, scene) for scene in scenes)), ""):
             result.append(FeatureDifference(other.name, (), None, why))
             continue
-        pairs = [(agreement_of(other.scenes[scene]), agreement_of(base.scenes[scene])) for scene in scenes]
-        by_scene = [difference_of_features(new, old) for new, old in pairs if new is not None and old is not None]
+        by_scene = [difference_of_features(other.scenes[scene], base.scenes[scene]) for scene in scenes]
         result.append(FeatureDifference(other.name, tuple(by_scene), mean_of(by_scene)))
     return result
 
 
-def at_level(interval: Interval, level: float) -> Interval:
-    """Return an interval at another level: its ends lie farther or nearer as quantiles of Student's t do."""
-    from scipy import special
+def _has_features(entry: Entry) -> bool:
+    return bool(parts_of(entry.sums, functional(FEATURE_ALPHA.key)))
 
-    degrees = interval.degrees if interval.degrees > 0 else float("inf")
-    wanted, given = (float(special.stdtrit(degrees, (1 + each) / 2)) for each in (level, interval.level))
-    low, high = (interval.value + wanted / given * (end - interval.value) for end in (interval.low, interval.high))
-    return dataclasses.replace(interval, low=max(low, -1.0), high=min(high, 1.0), level=level)
+
+def compare_features(*runs: str | os.PathLike[str]) -> tuple[FeatureDifference, ...]:
+    """Compare alpha of features of runs with the first of them, for models with features and without labels.
+
+    Args:
+        runs: Folders of runs, 'FOLDER:MODEL' if there are several models, or small summaries; the first is the base.
+            One folder alone: its models are compared.
+
+    Returns:
+        The difference of each other run. Networks of another name or another number of components are not compared,
+        and it says why: alpha of features depends on how a network spreads its vectors.
+
+    Raises:
+        ConfigError: If fewer than two runs are named, or one has labels.
+        DataError: If they have no scene in common, or one has no features in a scene.
+
+    Examples:
+        >>> for change in semstab.compare_features("before", "after"):  # doctest: +SKIP
+        ...     print(change.other, change.difference)
+    """
+    handles = open_compared(runs)
+    if labelled := next((run for run in handles if not run.features_alone), None):
+        raise ConfigError(f"{labelled.where}: {labelled.model} has labels; semstab.compare compares them")
+    return tuple(feature_differences(handles, shared_scenes(handles)))

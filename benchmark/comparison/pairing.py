@@ -119,7 +119,7 @@ def pair(entries: Sequence[Entry], names: Sequence[str], scope: Scope = THIS_SCE
 def _paired(entries: Sequence[Entry], names: Sequence[str]) -> Common:
     if not all(entry.sums.layout for entry in entries):
         return Common("images", (OF_IMAGES,), tuple(entry.sums for entry in entries))
-    if note := _other_frame_of_reference(entries):
+    if note := other_frame_of_reference(entries):
         return _apart(entries, note)
     if len(sizes := {entry.summary.table.voxel_size for entry in entries}) > 1:
         note = OTHER_SIZES.format(sizes=" and ".join(f"{size:g} m" for size in sorted(sizes)))
@@ -226,7 +226,7 @@ def on_common_observations(
     None if nothing can be paired on observations: alpha is then over each run's own observations.
     """
     runs = [*entries.values()]
-    if _other_frame_of_reference(runs) or _no_voxels(runs):
+    if other_frame_of_reference(runs) or _no_voxels(runs):
         return None
     samples = _observations_of_the_same_frames([entry.record for entry in runs if entry.record is not None])
     if not samples:
@@ -285,7 +285,7 @@ def _fewer_frames(observations: Sequence[SpotObservations]) -> tuple[str, ...]:
 # --- Reasons against pairing ------------------------------------------------------------------------------------------
 
 
-def _other_frame_of_reference(entries: Sequence[Entry]) -> str:
+def other_frame_of_reference(entries: Sequence[Entry]) -> str:
     """Return why coordinates do not show the same locations; empty where they do."""
     first, *rest = (entry.georeference for entry in entries)
     for entry, views in zip(entries[1:], rest, strict=True):

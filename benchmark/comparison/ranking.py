@@ -78,7 +78,7 @@ def rank_models(result: Result) -> Ranking:
 
     Scenes in which not all models have observations do not count.
     """
-    labelled = (record for record in result.select() if not gives_features_alone(record))
+    labelled = (record for record in result.select() if not gives_features_alone(record.statistics))
     records = [record for record in labelled if record.unit.model != GROUND_TRUTH]
     models: dict[str, list[Record]] = {}
     for record in records:

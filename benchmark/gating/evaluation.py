@@ -12,7 +12,7 @@ import numpy as np
 
 from semstab.comparison.differences import flicker_difference, sums_difference
 from semstab.comparison.entries import Entry, RunHandle
-from semstab.comparison.features import FEATURE_ALPHA, agreement_of, at_level, difference_of_features, other_network
+from semstab.comparison.features import FEATURE_ALPHA, other_network
 from semstab.comparison.pairing import on_common_observations
 from semstab.comparison.quantities import COVERAGE, FLICKER, RECURRENT_VSS, SBD_EXCESS
 from semstab.config import nearest
@@ -70,8 +70,6 @@ def _has(rule: Rule, entry: Entry) -> bool:
     """Return whether a run has the data of a measure."""
     if rule.measure.quantity is FLICKER:
         return len(entry.flicker) > 1
-    if rule.measure.quantity is FEATURE_ALPHA:
-        return agreement_of(entry) is not None
     if rule.measure.quantity is COVERAGE:
         return bool(entry.sums.layout)
     key, k = rule.measure.quantity.key, _k(rule, entry)
@@ -201,9 +199,6 @@ def value_of(rule: Rule, entry: Entry) -> float:
     """Return the number of a rule's measure in a run on a scene; NaN if undefined."""
     if rule.measure.quantity is FLICKER:
         return float(np.mean(list(entry.flicker.values())))
-    if rule.measure.quantity is FEATURE_ALPHA:
-        agreement = agreement_of(entry)
-        return math.nan if agreement is None else agreement.alpha.value
     if rule.measure.quantity is COVERAGE:
         return math.nan
     number = value(entry.sums, rule.measure.quantity.key, _k(rule, entry))
@@ -214,8 +209,6 @@ def _interval_of(rule: Rule, new: Entry, base: Entry | None, level: float, scope
     if rule.measure.quantity is COVERAGE and base is not None and _same_frames(new, base):
         change = counted(_covered(new.sums, base.sums), new.sums)
         return change if rule.change == "rise" else negative(change)
-    if rule.measure.quantity is FEATURE_ALPHA:
-        return _of_features(rule, new, base, level, scope)
     if rule.measure.quantity is not FLICKER:
         k, before = _k(rule, new), None if base is None else base.sums
         result = bounded(rule, new.sums, before, k=k, level=level, scope=scope)
@@ -232,19 +225,6 @@ def _interval_of(rule: Rule, new: Entry, base: Entry | None, level: float, scope
         return dataclasses.replace(mean, low=max(mean.low, 0.0), high=min(mean.high, 100.0))
     result = flicker_difference(new.flicker, base.flicker, level=1 - 2 * level)
     return result if rule.change == "rise" else negative(result)
-
-
-def _of_features(rule: Rule, new: Entry, base: Entry | None, level: float, scope: Scope) -> Interval:
-    """Return alpha of features, or its drop or rise, from the intervals that the runs state."""
-    own, before = agreement_of(new), None if base is None else agreement_of(base)
-    assert own is not None
-    result = own.alpha if before is None or rule.change is None else difference_of_features(own, before)
-    if scope not in (result.scope, THIS_SCENE):
-        raise ConfigError(
-            f"rule '{rule.text}': {new.where} states it for {result.scope}; leave out --scope, or run the model with it"
-        )
-    result = at_level(result, 1 - 2 * level)
-    return negative(result) if rule.change == "drop" else result
 
 
 def bounded(

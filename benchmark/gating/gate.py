@@ -170,7 +170,7 @@ def _without_frames(judgements: Sequence[Judgement], scope: Scope) -> list[str]:
         for judgement in judgements
         if judgement.interval.scope == THESE_FRAMES != scope
         and not judgement.counted
-        and judgement.rule.measure.quantity not in (FLICKER, COVERAGE, FEATURE_ALPHA)
+        and judgement.rule.measure.quantity not in (FLICKER, COVERAGE)
         and not functional(judgement.rule.measure.quantity.key).of_space_alone
     ]
     why = "as the run kept no sums of its map by frame or has few; --statistics, or more frames"

@@ -7,6 +7,7 @@ observations (Krippendorff 2018, Content Analysis, ch. 12).
 
 from __future__ import annotations
 
+import dataclasses
 import functools
 import itertools
 import math
@@ -21,11 +22,12 @@ from semstab.statistics.accumulate import Cubes
 from semstab.statistics.agreement import alpha_of
 from semstab.statistics.cluster_sums import (
     ALPHA_SUMS,
+    FUNCTIONALS,
     ClusterSums,
     Functional,
     distinct_rows,
+    layout_of_features,
     most_groups,
-    side_by_side,
     value,
 )
 from semstab.statistics.correlogram import BINS, Lag, in_bins
@@ -34,12 +36,9 @@ from semstab.statistics.frame_disagreement import LEAST_VIEWS, LoneDisagreement,
 from semstab.statistics.intervals import estimate, scope_of
 from semstab.statistics.ranges import LEAST_SEEN_TWICE, edges_of
 
-FEATURE_ALPHA = Functional(ALPHA_SUMS, alpha_of, -1.0, 1.0, "agreement", pairs=("twice_agreeing", "twice"))
+FEATURE_ALPHA = dataclasses.replace(FUNCTIONALS["feature_alpha"], of_features=False)
 PAIRED = Functional(ALPHA_SUMS, alpha_of, -1.0, 1.0, "agreement", pairs=ALPHA_SUMS[:2])
-"""Alpha of features, of all observations and of pairs of them."""
-
-COLUMNS = ("voxels", "observations", "agreeing", "own", "twice", "twice_agreeing", "evidence")
-"""Sums of features; evidence is of the parts along the sum of all vectors."""
+"""Alpha of features, from their sums alone, of all observations and of pairs of them."""
 
 SIDE, MOST_PLACES, LEAST_SPOTS, MOST_FRAMES = 8, 10, 8, 5
 """Coarse cells along the edge of a place; most places that are named, least spots of one, most frames named with it."""
@@ -115,7 +114,7 @@ def feature_sums(seen: FeatureObservations, of: Likeness, edge: float | None = N
     cell, frame = np.divmod(rows, max(len(groups), 1))
     return ClusterSums(
         cubes.cell[cell], groups[frame].astype(np.int32), sums[rows],
-        side_by_side(dict.fromkeys(COLUMNS, 1)), cubes.edge, step, log.voxel_size, (),
+        layout_of_features(), cubes.edge, step, log.voxel_size, (),
         len(np.unique(log.frame)),
     )  # fmt: skip
 
@@ -127,6 +126,8 @@ def alpha_of_features(seen: FeatureObservations) -> float:
 
 def feature_agreement(
     seen: FeatureObservations,
+    of: Likeness,
+    sums: ClusterSums,
     scope: Scope = THIS_SCENE,
     *,
     alone: bool = False,
@@ -136,12 +137,12 @@ def feature_agreement(
 
     Args:
         seen: Features that views give spots.
+        of: Their `likeness`.
+        sums: Their `feature_sums`.
         scope: Scope of the intervals, if there are enough views for it.
         alone: Whether the model gives no labels.
         name: Returns the name of a frame's file by its index.
     """
-    of = likeness(seen)
-    sums = feature_sums(seen, of)
     n, similar, squares = (float(sums[key].sum()) for key in ("observations", "agreeing", "own"))
     total = float((sums["evidence"].sum(axis=0) ** 2).sum())
     return FeatureAgreement(

@@ -62,7 +62,7 @@ from semstab.statistics.cube_sums import (
 )
 from semstab.statistics.drift import expected_sbd
 from semstab.statistics.feature_spots import FeatureObservations
-from semstab.statistics.features import feature_agreement
+from semstab.statistics.features import feature_agreement, feature_sums, likeness
 from semstab.statistics.frame_disagreement import LoneDisagreement, by_frame, lone_disagreement, outlying_frames
 from semstab.statistics.geometry import losses
 from semstab.statistics.groupings import groupings
@@ -210,6 +210,12 @@ def analyse(
     sums = cluster_sums_of(
         table, events, true_label, spots=spots, sbd_excess=columns["sbd_excess"], cubes=cubes, consistent=consistent
     )
+    agreement_of_features = None
+    if features is not None:
+        alike = likeness(features)
+        of_features = feature_sums(features, alike)
+        sums = dataclasses.replace(sums, features=of_features)
+        agreement_of_features = feature_agreement(features, alike, of_features, scope, alone=alone, name=frame_name)
     sample_columns, log = log_sums(sample, cubes)
     if log is not None:
         sample_columns["sbd_null"] = null
@@ -251,7 +257,7 @@ def analyse(
         groupings=None if spots is None else groupings(spots, sums, scope, limits),
         moved=moved,
         moving_untold=moving_untold,
-        features=None if features is None else feature_agreement(features, scope, alone=alone, name=frame_name),
+        features=agreement_of_features,
     )  # fmt: skip
     if alone:
         summary, lone = _without_classes(summary), None

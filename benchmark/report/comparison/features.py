@@ -36,9 +36,8 @@ def compared_features(runs: Sequence[RunHandle]) -> tuple[list[str], Table]:
         Column("components", "Components", 0),
     )  # fmt: skip
     caption = (
-        f"Change is alpha of features minus that of {runs[0].name}, for runs of the same network: of one name and"
-        " number of components. Its interval takes the errors of both runs for independent; of the same frames it is"
-        " rather too wide than too narrow."
+        f"Change is alpha of features minus alpha of {runs[0].name}, for runs of one network: of one name and one"
+        " number of components. Runs over the same frames are paired, frame by frame and place by place."
     )
     return sentences, Table("features", "Alpha of features", caption, columns, tuple(groups), by="scene")
 

@@ -29,6 +29,10 @@ WITHOUT_FRAMES = (*DRIFT, *CALIBRATION)
 """Sums that belong to no frame: they stand in rows whose frame is -1, as do sums of the register of measures."""
 
 
+OF_FEATURES = ("voxels", "observations", "agreeing", "own", "twice", "twice_agreeing", "evidence")
+"""Sums of features at spots; evidence is of the parts of vectors along the sum of all vectors."""
+
+
 def of_measure(key: str) -> tuple[str, str]:
     """Return the names of the sums of a measure of the register: its total, and over how many voxels."""
     return f"{key}_sum", f"{key}_count"
@@ -51,6 +55,11 @@ def layout(K: int, *, truth: bool, measured: tuple[str, ...] = (), meaning: bool
     widths += [(name, 1) for key in measured for name in of_measure(key)]
     widths += [*((name, 1) for name in OF_MEANING), *((name, K) for name in POINTS)] if meaning else []
     return side_by_side(dict(widths))
+
+
+def layout_of_features() -> Mapping[str, slice]:
+    """Return the columns of the sums of features by name, one each."""
+    return side_by_side(dict.fromkeys(OF_FEATURES, 1))
 
 
 def side_by_side(widths: Mapping[str, int]) -> Mapping[str, slice]:

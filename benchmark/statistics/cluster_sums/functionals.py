@@ -49,6 +49,7 @@ class Functional:
         low, high: Its range.
         scale: Scale of its interval: a 'share' or mean of numbers from 0 to 1, an 'agreement', at most 1, or 'plain'.
         of_spots: Its sums are of the answers of spots, not of a map; see `parts_of`.
+        of_features: Its sums are of features at spots.
         pairs: Names of the part of the first two sums that is of pairs alone, where the first is of pairwise
             agreement: at a location that two frames saw, neither frame has it for itself alone.
         pair_weight: Weight of an observation of these pairs in the first two sums.
@@ -65,6 +66,7 @@ class Functional:
     pairs: tuple[str, ...] = ()
     pair_weight: float = 1.0
     of_spots: bool = False
+    of_features: bool = False
     by_location: bool = False
     k: int | None = None
 
@@ -124,6 +126,7 @@ FUNCTIONALS: Mapping[str, Functional] = {
     "alpha_by_meaning": Functional(
         MEANING_SUMS, meaning_alpha_of, -1.0, 1.0, "agreement", pairs=("twice_similar", "twice"), of_spots=True
     ),
+    "feature_alpha": Functional(ALPHA_SUMS, alpha_of, -1.0, 1.0, "agreement", pairs=PAIRS, of_features=True),
     "voxel_alpha": Functional(ALPHA_SUMS, alpha_of, -1.0, 1.0, "agreement", pairs=PAIRS),
     "vss": Functional(("vss", "recurrent"), ratio_of),
     "entropy_op2": Functional(("entropy", "voxels"), ratio_of, by_location=True),
@@ -134,7 +137,8 @@ FUNCTIONALS: Mapping[str, Functional] = {
     "miou": Functional(("known", "known", "class_right", "class_known", "class_predicted"), miou_of, scale="plain"),
     "ece": Functional(("calibrated", "calibrated", "gap"), ece_of, scale="plain"),
 }
-"""Numbers by key: alpha, of spots that two views saw or more, and the same with distances between classes; PSA,
+"""Numbers by key: alpha, of spots that two views saw or more, and the same with distances between classes, and of
+features; PSA,
 Krippendorff's alpha of voxels and entropy at OP >= 2 (`entropy_op2`); VSS at OP >= 3; SBD minus SBD in random order if
 the order is known. With ground truth: accuracy of the fused labels at OP >= 2 and of single observations, the wrong
 among the consistent locations at OP >= 3, mean intersection over union and expected calibration error at OP >= 2."""
@@ -184,7 +188,9 @@ def parts_of(sums: ClusterSums, number: Functional) -> tuple[tuple[ClusterSums, 
     of the points that answer from the spot, as a border of two classes may lie between them.
     """
     parts: tuple[tuple[ClusterSums, float], ...] = ((sums, 1.0),)
-    if number.of_spots:
+    if number.of_features:
+        parts = () if sums.features is None else ((sums.features, 1.0),)
+    elif number.of_spots:
         if not sums.answers:
             return ()
         first, second, _ = sums.answers

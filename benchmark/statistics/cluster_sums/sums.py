@@ -21,7 +21,15 @@ from semstab.core.types import Float64, Int32, Int64
 from semstab.data import parquet
 from semstab.data.measures import measures
 from semstab.errors import DataError
-from semstab.statistics.cluster_sums.columns import OF_TRUTH, column_names, layout, of_measure, side_by_side, width
+from semstab.statistics.cluster_sums.columns import (
+    OF_TRUTH,
+    column_names,
+    layout,
+    layout_of_features,
+    of_measure,
+    side_by_side,
+    width,
+)
 from semstab.statistics.cluster_sums.index import MOST_CELLS, ClusterIndex, distinct_rows
 
 SCHEMA = 1
@@ -49,6 +57,7 @@ class ClusterSums:
         fused: Number of frames that they come from.
         answers: The same of spots, which are units instead of voxels, and views, instead of frames: of their first,
             second and third answers; empty without `SpotObservations`.
+        features: The same of features at spots, with the columns `OF_FEATURES`; None without features.
     """
 
     cell: Int32
@@ -61,6 +70,7 @@ class ClusterSums:
     classes: tuple[str, ...] = ()
     fused: int = 0
     answers: tuple[ClusterSums, ...] = ()
+    features: ClusterSums | None = None
 
     @classmethod
     def of_cubes(cls, cell: npt.NDArray[np.integer], edge: float, sums: Mapping[str, Float64]) -> ClusterSums:
@@ -129,7 +139,9 @@ class ClusterSums:
         Cubes of the spots are then at least as large as cubes of the map.
         """
         answers = tuple(part.coarsened(max(edge, part.edge), part.step) for part in self.answers)
-        return dataclasses.replace(self.map_coarsened(edge, step), answers=answers)
+        of = self.features
+        features = None if of is None else of.coarsened(max(edge, of.edge), of.step)
+        return dataclasses.replace(self.map_coarsened(edge, step), answers=answers, features=features)
 
     def map_coarsened(self, edge: float, step: int) -> ClusterSums:
         """Return the sums of the map in larger cubes or groups of frames, with the sums of spots unchanged."""
@@ -160,7 +172,7 @@ class ClusterSums:
         import pyarrow as pa
         import pyarrow.parquet as pq
 
-        parts = self, *self.answers
+        parts = self, *self.answers, *([] if self.features is None else [self.features])
         about = {name: getattr(self, name) for name in ("K", "classes", "truth")}
         about |= {name: [getattr(part, name) for part in parts] for name in ("edge", "step", "voxel_size", "fused")}
         lengths = [len(part.frame) for part in parts]
@@ -203,9 +215,10 @@ class ClusterSums:
             measured = tuple(measure.key for measure in measures() if stored.keys() >= {*of_measure(measure.key)})
             of_map = layout(meta.K, truth=meta.truth, measured=measured)
             of_answers = layout(meta.K, truth=False, meaning="similar" in stored)
+            layouts = [of_map, *ANSWERS * [of_answers], layout_of_features()]
             numbers = {
                 name: arrow.values_of(stored[name])
-                for name in dict.fromkeys((*column_names(of_map), *column_names(of_answers)))
+                for name in dict.fromkeys(name for columns in layouts for name in column_names(columns))
                 if name in stored
             }
             if any(np.any(np.abs(column) > LARGEST**2) for column in numbers.values()):
@@ -216,20 +229,22 @@ class ClusterSums:
             for number, (edge, step, voxel_size, fused) in enumerate(
                 zip(meta.edge, meta.step, meta.voxel_size, meta.fused, strict=True)
             ):
-                rows, its_layout = part == number, of_answers if number else of_map
+                rows, its_layout = part == number, layouts[number]
                 cell, frame = np.stack([key[rows] for key in keys[:3]], axis=1), keys[3][rows]
                 columns = np.full((len(frame), width(its_layout)), np.nan)
                 for k, name in enumerate(column_names(its_layout)):
                     if name in numbers:
                         columns[:, k] = numbers[name][rows]
                 where = cell.astype(np.int32), frame.astype(np.int32), columns
-                parts.append(cls(*where, its_layout, edge, step, voxel_size, meta.classes, fused))
-        map_sums, *answers = parts
-        return dataclasses.replace(map_sums, answers=tuple(answers))
+                classes = () if number > ANSWERS else meta.classes
+                parts.append(cls(*where, its_layout, edge, step, voxel_size, classes, fused))
+        answers, features = tuple(parts[1 : 1 + ANSWERS]), parts[1 + ANSWERS :]
+        return dataclasses.replace(parts[0], answers=answers, features=features[0] if features else None)
 
 
 KEYS = ("part", "ix", "iy", "iz", "frame")
-"""The columns of the file before the sums; part 0 is the map, 1 to 3 are first, second and third answers of spots."""
+"""The columns of the file before the sums; part 0 is the map, 1 to 3 are first, second and third answers of spots, 4 is
+their features."""
 
 
 ANSWERS = 3
@@ -253,8 +268,8 @@ class SumsMeta:
 
     def __post_init__(self) -> None:
         parts = {len(values) for values in (self.edge, self.step, self.voxel_size, self.fused)}
-        if not (parts <= {1} or parts <= {1 + ANSWERS}):
-            raise DataError(f"sums of other parts than a map, and {ANSWERS} answers of spots")
+        if not any(parts <= {number} for number in (1, 1 + ANSWERS, 2 + ANSWERS)):
+            raise DataError(f"sums of other parts than a map, {ANSWERS} answers of spots, and features")
         sizes = all(0 < size < math.inf for size in self.voxel_size)
         if not (sizes and self.K > 0 and len(self.classes) in (0, self.K)):
             raise DataError(f"{self.K} classes, {len(self.classes)} names, voxels of {self.voxel_size[0]:g} m")
@@ -290,6 +305,9 @@ def aligned(*parts: ClusterSums) -> tuple[ClusterSums, ...]:
     edge, steps = max(part.edge for part in parts), [part.step for part in parts]
     step = max(steps) if all(steps) else 0
     same = [part if (part.edge, part.step) == (edge, step) else part.map_coarsened(edge, step) for part in parts]
+    if all(part.features for part in same):
+        features = aligned(*(part.features for part in same if part.features is not None))
+        same = [dataclasses.replace(part, features=of) for part, of in zip(same, features, strict=True)]
     if not all(part.answers for part in same):
         return tuple(same)
     answers = zip(*(aligned(*of_all) for of_all in zip(*(part.answers for part in same), strict=True)), strict=True)
