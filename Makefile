@@ -9,7 +9,7 @@ help:
 	@echo 'make test    set up, then lint, types and import contract beside a minute of damaged files, and the test suite'
 	@echo 'make quick   between edits, a minute at most: ruff, and the tests of what changed since the last commit'
 	@echo 'make fuzz    damage files of every kind for an hour (FUZZ_SECONDS=3600 FUZZ_SEED=1); fuzz-short: the same 10,000 inputs everywhere'
-	@echo 'make faults  kill 280 runs (over videos, too), studies, predictions, exports and conversions (FAULTS=280), fill their disk, and see that nothing is lost'
+	@echo 'make faults  kill 315 runs (of 30 scenes, over videos, too), studies, predictions, exports and conversions (FAULTS=315), fill their disk, and see that nothing is lost'
 	@echo 'make mutants  change 100 lines of the product, one at a time (MUTANTS="--lines 100 --seed 0"), and say which the tests find'
 	@echo 'make docs    build the documentation into site/, warnings are errors; type its tutorials, and the examples of the help, as they stand'
 	@echo 'make setup   the set-up alone: system libraries, .venv, semstab; make setup-dev: and what the tests need'
@@ -47,7 +47,7 @@ fuzz-short: setup-dev
 	$(BIN)/python tests/fuzz/fuzz.py --inputs 10000 --seconds 300 --seed 1
 
 faults: setup-dev
-	$(BIN)/python tests/faults/kills.py $(or $(FAULTS),280)
+	$(BIN)/python tests/faults/kills.py $(or $(FAULTS),315)
 	$(BIN)/python tests/faults/disk.py 12
 	$(BIN)/python tests/faults/forgeries.py results city@1 sim-soft
 	$(BIN)/python tests/faults/forgeries.py results city@1 trick-world-locked

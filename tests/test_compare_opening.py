@@ -20,6 +20,7 @@ from posed_scene import fails
 import semstab
 from semstab.comparison.entries import LARGEST, open_run, open_runs, save_summary, shared_scenes
 from semstab.core.json_form import to_json
+from semstab.core.sealed_zip import packed
 from semstab.errors import ConfigError, DataError
 from semstab.statistics.cluster_sums import value
 
@@ -120,13 +121,26 @@ def test_a_damaged_small_summary_is_one_line(run, tmp_path):
     for data in (whole[: len(whole) // 2], b"", whole[:200] + b"\0" * 200 + whole[400:]):
         file.write_bytes(data)
         fails(DataError, re.escape(str(file)), open_run, file)
-    with zipfile.ZipFile(file, "w") as archive:
-        archive.writestr("summary.json", json.dumps({"kind": "else"}))
+    file.write_bytes(packed({"summary.json": json.dumps({"kind": "else"}).encode()}))
     fails(DataError, re.escape("of another kind or version"), open_run, file)
     with zipfile.ZipFile(file, "w", zipfile.ZIP_DEFLATED) as archive:
         archive.writestr("summary.json", b" " * (LARGEST + 1))
     assert file.stat().st_size < 200_000
     fails(DataError, re.escape(f"{file}: it unpacks to more than 100 MB"), open_run, file)
+
+
+@pytest.mark.parametrize("member", ["summary.json", "0.parquet", "sha256"])
+def test_a_changed_small_summary_is_refused(run, tmp_path, member):
+    """A digit that somebody changes, or a member that is of another file, is no damage that a zip archive tells."""
+    file = tmp_path / "kept.semstab"
+    save_summary(open_run(f"{run}:a"), file)
+    with zipfile.ZipFile(file) as archive:
+        members = {name: archive.read(name) for name in archive.namelist()}
+    members[member] = members[member].replace(b"1", b"2", 1)
+    with zipfile.ZipFile(file, "w") as archive:
+        for name, content in members.items():
+            archive.writestr(name, content)
+    fails(DataError, re.escape("it has changed since it was written; write it again"), open_run, file)
 
 
 @pytest.mark.parametrize(("field", "number", "line"), [
@@ -150,9 +164,8 @@ def test_numbers_that_no_map_has_are_refused_before_they_overflow(run, tmp_path,
     else:
         content["scenes"][0][field][0] = number
     pq.write_table(sums, tmp_path / "sums.parquet")
-    with zipfile.ZipFile(file, "w") as archive:
-        archive.writestr("summary.json", json.dumps(content))
-        archive.write(tmp_path / "sums.parquet", "0.parquet")
+    sums_file = (tmp_path / "sums.parquet").read_bytes()
+    file.write_bytes(packed({"summary.json": json.dumps(content).encode(), "0.parquet": sums_file}))
     fails(DataError, line, open_run, file)
 
 

@@ -24,6 +24,7 @@ from posed_writer import write_posed
 import semstab
 from semstab.comparison.entries import open_run, save_summary
 from semstab.configure import shipped_benchmarks
+from semstab.core.sealed_zip import packed, unpacked
 from semstab.datasets import city
 from semstab.errors import ConfigError, DataError
 from semstab.leaderboard.board import board_of, boards, tables_of
@@ -103,14 +104,10 @@ def definitions(home):
 def rewritten(file: Path, change) -> None:
     """Change the content of a result."""
     with zipfile.ZipFile(file) as archive:
-        parts = {name: archive.read(name) for name in archive.namelist()}
+        parts = unpacked(archive)
     content = json.loads(parts["summary.json"])
     change(content)
-    data = io.BytesIO()
-    with zipfile.ZipFile(data, "w") as archive:
-        for name, part in (parts | {"summary.json": json.dumps(content).encode()}).items():
-            archive.writestr(name, part)
-    file.write_bytes(data.getvalue())
+    file.write_bytes(packed(parts | {"summary.json": json.dumps(content).encode()}))
 
 
 # --- Definitions ------------------------------------------------------------------------------------------------------

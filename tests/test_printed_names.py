@@ -16,6 +16,7 @@ import semstab
 from semstab.cli import _Once
 from semstab.comparison.entries import open_run, save_summary
 from semstab.core.console import Console
+from semstab.core.sealed_zip import packed
 from semstab.errors import ConfigError
 from semstab.leaderboard.submission import ModelCard
 
@@ -57,9 +58,8 @@ def test_names_in_a_small_summary_are_names(tmp_path, name):
             content, sums = json.loads(whole.read("summary.json")), whole.read("0.parquet")
         part = change(content)
         part["model" if part is content else "name"] = name
-        with zipfile.ZipFile(tmp_path / "small.semstab", "w") as archive:
-            archive.writestr("summary.json", json.dumps(content))
-            archive.writestr("0.parquet", sums)
+        members = {"summary.json": json.dumps(content).encode(), "0.parquet": sums}
+        (tmp_path / "small.semstab").write_bytes(packed(members))
         line = error_of("gate", "small.semstab", "--rule", "alpha > 0", cwd=tmp_path)
         assert "is no name of a scene or model" in line
         assert line.isprintable()

@@ -24,6 +24,7 @@ import numpy as np
 from semstab.config import nearest
 from semstab.core.files import ScratchFolder, atomic_path, parse_json, read_limited
 from semstab.core.json_form import from_json, to_json
+from semstab.core.sealed_zip import packed, unpacked
 from semstab.data import parquet
 from semstab.data.contrast import FrameShare
 from semstab.data.digests import require_unchanged
@@ -447,13 +448,14 @@ def load_summary(path: str | Path) -> RunHandle:
                 raise DataError(f"{path}: it unpacks to more than {LARGEST // 10**6} MB; write the summary again")
             if archive.getinfo(CONTENT).file_size > LONGEST_CONTENT:
                 raise DataError(f"{path}: its text has more than {LONGEST_CONTENT} bytes; write the summary again")
-            text = parse_json(archive.read(CONTENT))
+            members = unpacked(archive)
+            text = parse_json(members[CONTENT])
             if not isinstance(text, dict) or (text.get("kind"), text.get("schema")) != (KIND, SCHEMA):
                 raise DataError("it is of another kind or version")
             content = from_json(_Content, text, path)
             for name in (content.model, *(scene.name for scene in content.scenes)):
                 _require_name(path, name)
-            files = [archive.read(f"{i}.parquet") for i in range(len(content.scenes))]
+            files = [members[f"{i}.parquet"] for i in range(len(content.scenes))]
     except (OSError, zipfile.BadZipFile, zlib.error, LookupError, ValueError, RuntimeError, EOFError) as error:
         if isinstance(error, DataError) and str(path) in str(error):
             raise
@@ -489,14 +491,13 @@ def _numbers(numbers: EntryNumbers) -> dict[str, Any]:
 
 def _archive(content: str, sums: list[ClusterSums], *, single: bool) -> bytes:
     """Return the file, byte for byte the same for the same content."""
-    data = io.BytesIO()
-    with zipfile.ZipFile(data, "w", zipfile.ZIP_DEFLATED) as archive, ScratchFolder() as folder:
-        archive.writestr(zipfile.ZipInfo(CONTENT), content, zipfile.ZIP_DEFLATED)
+    members = {CONTENT: content.encode()}
+    with ScratchFolder() as folder:
         for i, scene_sums in enumerate(sums):
             part = folder / "sums.parquet"
             scene_sums.save(part, single=single)
-            archive.writestr(zipfile.ZipInfo(f"{i}.parquet"), part.read_bytes())
-    return data.getvalue()
+            members[f"{i}.parquet"] = part.read_bytes()
+    return packed(members)
 
 
 def _coarser(sums: ClusterSums, *, keep_spots: bool) -> ClusterSums:

@@ -30,8 +30,9 @@ SUFFIX = ".geometry.json"
 
 SCHEMA = 1
 
-MOST_ROWS = 2048
-"""Most rows of all scenes: cubes are made larger until there are no more, so that a result is a small file."""
+MOST_ROWS, ROWS_OF_SCENE = 2048, 400
+"""Most rows of all scenes, or a scene in the mean if that is more: cubes are made larger until there are no more, so
+that a result is a small file, in which a scene still has enough cubes for an interval."""
 
 
 @dataclass(frozen=True)
@@ -111,8 +112,8 @@ def spots_of(seen: Iterable[Frame], truth: Iterable[Frame] | None, classes: tupl
 
 def few_rows(scenes: Mapping[str, Spots]) -> dict[str, Spots]:
     """Return the spots of scenes, with larger cubes until there are few rows."""
-    made, before = dict(scenes), math.inf
-    while before > (rows := sum(len(spots.rows) for spots in made.values())) > MOST_ROWS:
+    made, before, most = dict(scenes), math.inf, max(MOST_ROWS, ROWS_OF_SCENE * len(scenes))
+    while before > (rows := sum(len(spots.rows) for spots in made.values())) > most:
         before = rows
         made = {name: spots.coarsened() for name, spots in made.items()}
     return made

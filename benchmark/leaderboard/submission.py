@@ -36,9 +36,9 @@ from semstab.predict.dataset import NAME as PREDICTED
 SUFFIX = ".semstab"
 """Suffix of the files."""
 
-LARGEST = 1_500_000
-"""Bytes of a file at most: sums of the map are made coarser until they fit, which changes no number, but the ends of
-intervals. Alpha and ranks are of spots, whose cubes are the definition's."""
+LARGEST, LARGEST_OF_SCENE = 1_500_000, 200_000
+"""Bytes of a file at most, or of a scene in the mean if that is more: sums of the map are made coarser until they fit,
+which changes no number, but the ends of intervals. Alpha and ranks are of spots, whose cubes are the definition's."""
 
 LONGEST_LINE = 500
 """Most characters of a line that is told of a model or a machine."""
@@ -117,6 +117,7 @@ def submissions(run: Path, path: Path, card: ModelCard | None = None) -> Iterato
     benchmark = _benchmark_of(run, config)
     require_unchanged(file)
     models = [name for name in result.models if name != GROUND_TRUTH]
+    most = max(LARGEST, LARGEST_OF_SCENE * len(benchmark.geometry))
     if len(models) > 1 and (path.suffix or card is not None):
         what = path if path.suffix else "--card"
         raise ConfigError(f"{what}: the run has several models ({', '.join(models)}); choose one with --model")
@@ -128,7 +129,7 @@ def submissions(run: Path, path: Path, card: ModelCard | None = None) -> Iterato
         handle = dataclasses.replace(handle, about=to_json(about), scenes=scenes)
         file = path if path.suffix else path / f"{benchmark.id}__{slug(model)}{SUFFIX}"
         file.parent.mkdir(parents=True, exist_ok=True)
-        save_summary(handle, file, LARGEST, single=True, keep_spots=True)
+        save_summary(handle, file, most, single=True, keep_spots=True)
         yield file, handle
 
 
@@ -181,7 +182,8 @@ def _checked(path: Path, benchmark: Benchmark, handle: RunHandle) -> dict[str, E
 def _in_cubes(entry: Entry, spots: Spots) -> Entry:
     """Return a scene with the sums of its spots in the cubes of the definition."""
     answers = tuple(part.coarsened(spots.edge, spots.step) for part in entry.sums.answers)
-    return dataclasses.replace(entry, small=(dataclasses.replace(entry.sums, answers=answers), entry.flicker))
+    sums = dataclasses.replace(entry.sums, answers=answers, features=None)
+    return dataclasses.replace(entry, small=(sums, entry.flicker))
 
 
 def require_whole(benchmark: Benchmark, handle: RunHandle) -> None:

@@ -29,6 +29,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 
 from semstab.comparison.entries import RunHandle
+from semstab.core.sealed_zip import packed
 from semstab.errors import SemstabError
 from semstab.leaderboard.board import board_of
 from semstab.leaderboard.definition import Benchmark
@@ -56,13 +57,13 @@ class Parts:
         return cls(content, [{name: table[name].to_numpy() for name in table.column_names} for table in tables], about)
 
     def save(self, file: Path) -> None:
-        with zipfile.ZipFile(file, "w") as archive:
-            archive.writestr("summary.json", json.dumps(self.content))
-            for i, (sums, about) in enumerate(zip(self.sums, self.about, strict=True)):
-                table = pa.table(sums).replace_schema_metadata({"semstab": json.dumps(about)})
-                data = io.BytesIO()
-                pq.write_table(table, data)
-                archive.writestr(f"{i}.parquet", data.getvalue())
+        members = {"summary.json": json.dumps(self.content).encode()}
+        for i, (sums, about) in enumerate(zip(self.sums, self.about, strict=True)):
+            table = pa.table(sums).replace_schema_metadata({"semstab": json.dumps(about)})
+            data = io.BytesIO()
+            pq.write_table(table, data)
+            members[f"{i}.parquet"] = data.getvalue()
+        file.write_bytes(packed(members))
 
 
 Forgery = tuple[str, str, Callable[[Parts], None]]

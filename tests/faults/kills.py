@@ -1,6 +1,8 @@
 """Kill runs, studies, predictions, exports and conversions at random moments, half of them at their folder's birth.
 
-    python tests/faults/kills.py [COUNT [SEED [KIND...]]]       make faults: 280, 35 of each of 8 kinds
+    python tests/faults/kills.py [COUNT [SEED [KIND...]]]       make faults: 315, 35 of each of 9 kinds
+
+The kind `wide` is a run of 30 scenes and two models in two processes.
 
 Each is then started again as it was, and has to leave what one without a kill leaves. Where several are at work on the
 machine, a kill may come after the end: those are counted apart. Beside these, a fifth as many are started twice at
@@ -112,11 +114,14 @@ def of_files(out: Path) -> Any:
 def kinds(base: Path) -> dict[str, tuple[Callable[[Path], Words], Callable[[Path], Any]]]:
     """What is killed: its words for a folder, and what is compared of that."""
     wall = tiny_scene.write(base / "wall", models=("a", "b"), frames=20)
+    for k in range(30):
+        tiny_scene.write(base / f"rooms/room{k:02d}", models=("a", "b"), frames=4)
     flight = predicted_scene.write(base / "flight")
     for name, wrong in (("one", (5, 12)), ("two", (3,)), ("three", ())):
         video_scene.write(base / "clips" / name, wrong)
     study = base / "tiny.yaml"
     study.write_text(yaml.safe_dump(tiny_study.content(tiny_study.write(base / "walls"), backends=["numpy"])))
+    wide = ["--data", str(base / "rooms"), "--backend", "numpy", "--quiet", "--report", "off", "--voxel-size", "0.1"]
     common = ["--data", str(wall), "--backend", "numpy", "--quiet", "--report", "off", "--voxel-size", "0.1"]
     one = ["--data", str(wall), "--model", "a", "--backend", "numpy", "--quiet", "--report", "off", "--rerun", "off"]
 
@@ -135,6 +140,7 @@ def kinds(base: Path) -> dict[str, tuple[Callable[[Path], Words], Callable[[Path
             lambda out: [*common, "--tile-size", "8", "--jobs", "2", "--rerun", "off", "--out", str(out)],
             of_run,
         ),
+        "wide": (lambda out: [*wide, "--jobs", "2", "--rerun", "off", "--out", str(out)], of_run),
         "videos": (lambda out: [*videos, "--out", str(out)], of_run),
         "study": (lambda out: ["study", str(study), "--report", "off", "--quiet", "--out", str(out)], of_run),
         "predict": (
@@ -198,5 +204,5 @@ def main(count: int, seed: int, *only: str) -> None:
 
 
 if __name__ == "__main__":
-    count, seed, *only = (*sys.argv[1:], *("280", "0")[len(sys.argv) - 1 :])
+    count, seed, *only = (*sys.argv[1:], *("315", "0")[len(sys.argv) - 1 :])
     main(int(count), int(seed), *only)

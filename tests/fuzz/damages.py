@@ -18,6 +18,7 @@ import pyarrow.parquet as pq
 import yaml
 from image_files import png_chunk
 
+from semstab.core.sealed_zip import DIGESTS, packed
 from semstab.datasets.formats.images import PNG_SIGNATURE
 
 Damage = Callable[[bytes, random.Random], bytes]
@@ -153,13 +154,16 @@ def of_npz(content: bytes, rng: random.Random) -> bytes:
         return of_bytes(content, rng)
     out = io.BytesIO()
     with zipfile.ZipFile(io.BytesIO(content)) as old, zipfile.ZipFile(out, "w", zipfile.ZIP_DEFLATED) as new:
-        chosen = rng.choice(old.namelist())
+        chosen, members = rng.choice(old.namelist()), dict[str, bytes]()
         for name in old.namelist():
             body = old.read(name)
             called = rng.choice((name, name, name, "x", "../x.npy")) if name == chosen else name
             damage = {".json": of_json, ".parquet": of_parquet}.get(name[name.rfind(".") :], of_bytes)
+            members[called] = damage(body, rng) if name == chosen else body
             info = zipfile.ZipInfo(called)  # without the time of day: the same for the same seed
-            new.writestr(info, damage(body, rng) if name == chosen else body, zipfile.ZIP_DEFLATED)
+            new.writestr(info, members[called], zipfile.ZIP_DEFLATED)
+    if members.pop(DIGESTS, None) is not None and rng.random() < 0.8:
+        return packed(members)  # with right digests, so that the damage itself is met
     return out.getvalue()
 
 
