@@ -38,6 +38,9 @@ semstab-bench benchmark city@1 --predict colour-clusters \\
 semstab-bench benchmark apc_shelf@1 --data DATA/apc_shelf --submit results
 semstab-bench benchmark livingroom@1 --data DATA/livingroom \\
   --predict EdgeNets/nets.py:espnetv2_voc,scale=0.5,name=espnetv2-0.5 ... --submit results
+python scripts/streets.py predict --edgenets EdgeNets --espnet ESPNet --coral coral --work WORK
+semstab-bench benchmark semantickitti-images@1 --data WORK/data --labels WORK/labels -m deeplab \\
+  -m espnet-8 -m dicenet-0.75 -m espnetv2-2.0 --submit results
 ```
 """
 
@@ -45,6 +48,8 @@ MODELS = {
     "apc_shelf@1": "The labels and the scores that were published with the data.",
     "city@1": "Simulated models of known quality, tricks that buy stability without knowledge, and clusters of colour.",
     "livingroom@1": "Ten networks of two families, trained on PASCAL VOC.",
+    "semantickitti-images@1": "One network of each of four families, trained on Cityscapes; the study of real"
+    " networks has fourteen.",
 }
 """Models of each benchmark."""
 
