@@ -299,6 +299,8 @@ class SpotObservations:
         Raises:
             DataError: If the file is missing, damaged or of another kind.
         """
+        import pyarrow as pa
+
         with parquet.reading(path, "a file of sampled observations"):
             with parquet.opened(path) as file:
                 content = file.read()
@@ -311,12 +313,15 @@ class SpotObservations:
                 about["distances"] = np.array(about["distances"], np.float64).reshape(about["K"], about["K"])
             point = np.stack([arrays.values_of(content.column(name)) for name in "xyz"], axis=1)
             lists = {name: content.column(name).combine_chunks() for name in COLUMNS[1:]}
-            counts = {name: np.asarray(values.value_lengths()) for name, values in lists.items()}
+            counts = {
+                name: arrays.values_of(pa.chunked_array([values.value_lengths()])) for name, values in lists.items()
+            }
             answers = counts["view"].astype(np.int64)
             if not all(np.array_equal(answers, count) for count in counts.values()):
                 raise DataError("the lists of a spot's answers have different lengths")
             columns: dict[str, Any] = {
-                name: np.asarray(values.flatten()).astype(TYPES[name]) for name, values in lists.items()
+                name: arrays.values_of(pa.chunked_array([values.flatten()])).astype(TYPES[name])
+                for name, values in lists.items()
             }
             columns["spot"] = np.repeat(np.arange(len(answers), dtype=np.int32), answers)
             cell_hash = arrays.values_of(content.column("drawn")).astype(np.uint32)
