@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import shutil
 from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
@@ -37,17 +38,23 @@ Entry = tuple[str, int, Any]
 """The topic, bag time and message of a record."""
 
 
+@functools.cache
+def _store(first: bool) -> Any:
+    from rosbags.typesys import Stores, get_types_from_msg, get_typestore
+
+    store = get_typestore(Stores.ROS1_NOETIC if first else Stores.LATEST)
+    if first:
+        definition = "geometry_msgs/TransformStamped[] transforms"
+        store.register(get_types_from_msg(definition, "tf2_msgs/msg/TFMessage"))
+    return store
+
+
 class Ros:
     """Messages of ROS 1 or ROS 2."""
 
     def __init__(self, container: str) -> None:
-        from rosbags.typesys import Stores, get_types_from_msg, get_typestore
-
         self.first = container == "ROS 1"
-        self.store = get_typestore(Stores.ROS1_NOETIC if self.first else Stores.LATEST)
-        if self.first:
-            definition = "geometry_msgs/TransformStamped[] transforms"
-            self.store.register(get_types_from_msg(definition, "tf2_msgs/msg/TFMessage"))
+        self.store = _store(self.first)
         self.types = self.store.types
 
     def stamp(self, ns: int) -> Any:

@@ -129,8 +129,6 @@ def in_another_order(scene: Scene, indices: Sequence[int], model: str, pixels: i
     Each frame gets the map whose edges fit its depth and colour best, each map once. That is right where labels then
     agree clearly better between frames, which the edges do not know.
     """
-    from scipy.optimize import linear_sum_assignment
-
     first = next(readable(scene, indices[:1], model), None)
     if first is None:
         return None
@@ -140,6 +138,8 @@ def in_another_order(scene: Scene, indices: Sequence[int], model: str, pixels: i
     frames = [frame for frame in frames if frame.references and frame.labels.shape == frames[0].labels.shape]
     if len(frames) < 2 * IN_A_RUN:
         return None
+    from scipy.optimize import linear_sum_assignment  # a sixth of a second, which a scene of a few frames is spared
+
     n = len(frames)
     references = np.stack([_coarse(frame.references) for frame in frames])
     none = np.zeros_like(frames[0].references[0])

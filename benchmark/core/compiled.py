@@ -108,9 +108,17 @@ def in_chunks(loop: Any, *arguments: Any) -> None:
         for chunk in range(CHUNKS):
             loop(chunk, *arguments)
         return
-    with ThreadPoolExecutor(threads) as pool:
-        for done in [pool.submit(loop, chunk, *arguments) for chunk in range(CHUNKS)]:
-            done.result()
+    left = iter(range(CHUNKS))
+
+    def take_chunks() -> None:
+        for chunk in left:
+            loop(chunk, *arguments)
+
+    with ThreadPoolExecutor(threads - 1) as pool:
+        others = [pool.submit(take_chunks) for _ in range(threads - 1)]
+        take_chunks()
+        for other in others:
+            other.result()
 
 
 def is_cached(function: Any) -> bool:

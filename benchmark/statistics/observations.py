@@ -173,9 +173,9 @@ class SpotObservations:
         """Return the answers for spots whose dominant class is not one of these."""
         if not len(classes) or not len(self):
             return self
-        log, order, _ = self._first
+        log, at = self.observations(), self.of_log()
         left_out = np.zeros(len(self.point), np.bool_)
-        left_out[order] = np.isin(dominant(log.table()), classes)
+        left_out[at] = np.isin(dominant(log.table()), classes)
         return self.only(~left_out[self.spot])
 
     @property
@@ -212,41 +212,51 @@ class SpotObservations:
 
     def of_log(self) -> Int64:
         """Return the spot (n,) of each location of that log."""
-        return self._first[1]
+        return self._by_voxel[1]
 
     def logs(self) -> tuple[tuple[Events, Float64], ...]:
         """Return the logs of the three answers with (m,) squared distances, metres^2, 0 of the third ones."""
-        return tuple((log, squares) for log, _, squares in (self._first, self._second, self._log(self.beyond)))
+        return self._first, self._second, self._third
 
     @functools.cached_property
-    def _first(self) -> tuple[Events, Int64, Float64]:
+    def _first(self) -> tuple[Events, Float64]:
         return self._log(self.label, self.near)
 
     @functools.cached_property
-    def _second(self) -> tuple[Events, Int64, Float64]:
+    def _second(self) -> tuple[Events, Float64]:
         return self._log(self.neighbour, self.far)
 
-    def _log(self, label: UInt16, square: Float32 | None = None) -> tuple[Events, Int64, Float64]:
-        """Return a log of these labels, (n,) the spot of each of its voxels, and (m,) squared distances.
+    @functools.cached_property
+    def _third(self) -> tuple[Events, Float64]:
+        return self._log(self.beyond)
+
+    @functools.cached_property
+    def _by_voxel(self) -> tuple[Int64, Int64, Int64, Int64]:
+        """(n, 3) indices of the voxels of a log and (n,) their spots; (m,) answers in order, and the voxel of each.
 
         A spot is a voxel of a PARTS-th of a coarse cell, whose faces are faces of such voxels.
         """
+        rows = np.flatnonzero(self.label < self.K)
+        spot = self.spot[rows]
+        number = np.zeros(len(self.point), np.int64)
+        number[spot] = 1
+        spots = np.flatnonzero(number)
+        index, number[spots] = distinct_rows(np.floor(self.point[spots] * (PARTS / self.spacing)).astype(np.int64))
+        at = np.empty(len(index), np.int64)
+        at[number[spots]] = spots
+        order = np.lexsort((self.view[rows], number[spot]))
+        return index, at, rows[order], number[spot[order]]
+
+    def _log(self, label: UInt16, square: Float32 | None = None) -> tuple[Events, Float64]:
+        """Return a log of these labels, and (m,) squared distances."""
         from semstab.statistics.loops.spots import observe
 
-        rows = np.flatnonzero(self.label < self.K)
-        spots, spot = np.unique(self.spot[rows], return_inverse=True)
-        place = np.floor(self.point[spots] * (PARTS / self.spacing)).astype(np.int64)
-        index, of = distinct_rows(place)
-        number = of[spot]
-        order = np.lexsort((self.view[rows], number))
-        rows, number = rows[order], number[order]
+        index, _, rows, number = self._by_voxel
         view, n = self.view[rows], len(rows)
         first, voxel, starts = np.empty(n, np.int64), np.empty(n, np.int32), np.empty(n + 1, np.int64)
         share, text = np.empty(n), np.empty(n, np.uint16)
         n, m = observe(number, view, label[rows], self.K, first, voxel, starts, text, share)
         first = first[:n]
-        at = np.empty(len(index), np.int64)
-        at[of] = spots
         log = Events(
             **index_columns(index),
             voxel=voxel[:n],
@@ -257,7 +267,7 @@ class SpotObservations:
             classes=self.classes,
         )
         squares = np.zeros(n) if square is None else square[rows[first]].astype(np.float64)
-        return log, at, squares
+        return log, squares
 
     def save(self, path: str | Path) -> None:
         """Write Parquet, atomically: a row for each spot, with lists of its answers."""
@@ -289,6 +299,8 @@ class SpotObservations:
         Raises:
             DataError: If the file is missing, damaged or of another kind.
         """
+        import pyarrow as pa
+
         with parquet.reading(path, "a file of sampled observations"):
             with parquet.opened(path) as file:
                 content = file.read()
@@ -301,12 +313,15 @@ class SpotObservations:
                 about["distances"] = np.array(about["distances"], np.float64).reshape(about["K"], about["K"])
             point = np.stack([arrays.values_of(content.column(name)) for name in "xyz"], axis=1)
             lists = {name: content.column(name).combine_chunks() for name in COLUMNS[1:]}
-            counts = {name: np.asarray(values.value_lengths()) for name, values in lists.items()}
+            counts = {
+                name: arrays.values_of(pa.chunked_array([values.value_lengths()])) for name, values in lists.items()
+            }
             answers = counts["view"].astype(np.int64)
             if not all(np.array_equal(answers, count) for count in counts.values()):
                 raise DataError("the lists of a spot's answers have different lengths")
             columns: dict[str, Any] = {
-                name: np.asarray(values.flatten()).astype(TYPES[name]) for name, values in lists.items()
+                name: arrays.values_of(pa.chunked_array([values.flatten()])).astype(TYPES[name])
+                for name, values in lists.items()
             }
             columns["spot"] = np.repeat(np.arange(len(answers), dtype=np.int32), answers)
             cell_hash = arrays.values_of(content.column("drawn")).astype(np.uint32)

@@ -319,13 +319,13 @@ class SpotVotes:
 
         Of n votes, r see through the spot with the probability b(r; n, q), where q is `false_rate`.
         """
-        from scipy.stats import binom
+        from scipy import special
 
         n, count = np.unique(self.votes[self.known], return_counts=True)
         if not len(n):
             return math.nan
         least = np.maximum(LEAST_THROUGH, np.floor(SHARE_THROUGH * n + 1e-9) + 1)
-        return float(binom.sf(least - 1, n, self.false_rate) @ count / count.sum())
+        return float(special.bdtrc(least - 1, n, self.false_rate) @ count / count.sum())
 
     def take(self, rows: Any) -> SpotVotes:
         """Return the votes on some of the spots."""

@@ -6,6 +6,7 @@ The messages are of ROS's own types, whose fields are those of each distribution
 
 from __future__ import annotations
 
+import functools
 import heapq
 import itertools
 import os
@@ -38,6 +39,18 @@ QUOTED = re.compile(r"\w*(?:Error)?\(('[^']*'),?\)")
 
 TF_MESSAGE = "geometry_msgs/TransformStamped[] transforms"
 """The definition of tf2_msgs/TFMessage, which rosbags does not have for ROS 1."""
+
+
+@functools.cache
+def messages_of(first: bool) -> Any:
+    """Return the types of messages of ROS 1, or of ROS 2: rosbags compiles what reads a type, once for all bags."""
+    from rosbags.typesys import Stores, get_types_from_msg, get_typestore
+
+    store = get_typestore(Stores.ROS1_NOETIC if first else Stores.LATEST)
+    if first:
+        store.register(get_types_from_msg(TF_MESSAGE, "tf2_msgs/msg/TFMessage"))
+    return store
+
 
 NANOSECONDS = 10**9
 MOST_LISTED = 12
@@ -145,14 +158,10 @@ class OpenBag:
         try:
             from rosbags.rosbag1 import Reader as Reader1
             from rosbags.rosbag2 import Reader as Reader2
-            from rosbags.typesys import Stores, get_types_from_msg, get_typestore
         except ImportError as error:
             raise MissingDependencyError(f"{path}: bags need rosbags ({summarize_error(error)}); {INSTALL}") from error
         with self._one_line():
-            store: Any = get_typestore(Stores.ROS1_NOETIC if first else Stores.LATEST)
-            if first:
-                store.register(get_types_from_msg(TF_MESSAGE, "tf2_msgs/msg/TFMessage"))
-            self._deserialize = store.deserialize_ros1 if first else store.deserialize_cdr
+            self._deserialize = messages_of(first).deserialize_ros1 if first else messages_of(first).deserialize_cdr
         self._readers: list[Any] = []
         for part in parts or (path,):
             with self._one_line(path=part):
