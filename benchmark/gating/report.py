@@ -11,6 +11,7 @@ from xml.etree import ElementTree
 
 from semstab.core.files import write_text
 from semstab.core.json_form import to_json
+from semstab.core.types import SCOPE_WORDS
 from semstab.errors import ConfigError
 from semstab.gating.result import POWER, GateResult, Verdict
 
@@ -81,7 +82,7 @@ def lines(result: GateResult, width: int = 80) -> Iterator[str]:
     yield ""
     reasons: dict[str, list[str]] = {}
     for judgement in result.judgements:
-        reasons.setdefault(f"{judgement.verdict}: {judgement.reason} ({judgement.about})", []).append(
+        reasons.setdefault(f"{judgement.verdict}: {judgement.reason} ({SCOPE_WORDS[judgement.about]})", []).append(
             judgement.rule.text
         )
     for why, rules in reasons.items():
@@ -111,7 +112,8 @@ def _wrapped(line: str, width: int, indent: int) -> list[str]:
 
 
 def _ends(result: GateResult) -> str:
-    return f"each end of an interval holds with {100 * (1 - result.level):g} % confidence"
+    both, one = 100 * (1 - 2 * result.level), 100 * (1 - result.level)
+    return f"intervals hold with {both:g} % confidence, each end with {one:g} %"
 
 
 def _scenes(result: GateResult) -> str:

@@ -221,7 +221,10 @@ def _size(scene: str, advice: VoxelAdvice, result: Result) -> str:
         )
     if advice.chosen or advice.suggested <= advice.voxel_size:
         return ""
-    return f"{where}{size} are so small that noise splits locations: --voxel-size {advice.suggested:g}"
+    return (
+        f"{where}{size} are smaller than the noise of depth and poses, which puts one point into several:"
+        f" --voxel-size {advice.suggested:g}"
+    )
 
 
 def mixed(runs: Sequence[UnitSummary]) -> bool:

@@ -19,7 +19,10 @@ from semstab.report.terminal.head import head_lines
 from semstab.report.terminal.layout import ALPHA, WIDTH, percent, percents, wrapped
 from semstab.statistics.verdict import DANGEROUS, LIMITS, why_undecided
 
-MEANS = "VSS: agreement of a voxel's frames, 1 is perfect; SBD: change of a voxel's belief per frame"
+MEANS = (
+    "VSS: agreement of a voxel's frames, 1 is perfect; SBD: change of a voxel's belief per frame; entropy: 0 sure, 1"
+    " unsure; margin: best class minus second"
+)
 """The meaning of the paper's means."""
 
 
@@ -60,7 +63,7 @@ def _verdict(run: UnitSummary) -> Iterator[str]:
     if statistics.verdict.level == "no verdict":
         yield from wrapped(statistics.verdict.line)
         return
-    yield f"  {level} {statistics.verdict.stated}".rstrip() + f"    {name} {short(alpha.value)}{_interval(alpha)}"
+    yield f"  {level} {statistics.verdict.in_words}".rstrip() + f"    {name} {short(alpha.value)}{_interval(alpha)}"
     wrong = wrong_text(statistics)
     if statistics.verdict.level == "misleading":
         yield from textwrap.wrap(wrong, WIDTH, initial_indent="  ", subsequent_indent="  ")
@@ -78,7 +81,7 @@ def _verdict(run: UnitSummary) -> Iterator[str]:
         yield from wrapped(f"{why_undecided(alpha)}: more frames decide it")
     for text in statistics.moving_lines:
         yield from wrapped(text)
-    yield f"  two views see the same class at {percent(statistics.agreeing)} of the spots"
+    yield f"  two views see the same class at {percent(statistics.agreeing)} of the spots (points of the surface)"
     if wrong and statistics.verdict.level != "misleading":
         yield f"  {wrong}"
     meaning = None if statistics.spots is None else statistics.spots.meaning

@@ -31,6 +31,7 @@ STAGE_NAMES = {
     "read": "reading",
     "check": "check of the data",
     "sample": "sampling of spots",
+    "observe": "pixels into voxels",
     "reference": "check of the fusion",
     "sizing": "estimate of memory",
     "network": "network",
