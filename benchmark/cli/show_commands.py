@@ -158,10 +158,14 @@ KINDS = {
 """The kinds of things that `list` lists, in the plural."""
 
 USES = {
-    "backend": "--backend NAME", "dataset": "--dataset NAME; the format of --data is found", "model": "--predict NAME",
-    "filter": "--filter NAME:NUMBER", "taxonomy": "--taxonomy NAME", "study": "semstab-bench study NAME",
+    "backend": "--backend NAME, or FILE.py:NAME",
+    "dataset": "--dataset NAME; the format of --data is found",
+    "model": "--predict NAME, or FILE.py:NAME",
+    "filter": "--filter NAME:NUMBER",
+    "taxonomy": "--taxonomy NAME",
+    "study": "semstab-bench study NAME",
     "benchmark": "semstab-bench benchmark NAME",
-}  # fmt: skip
+}
 """The option or the command that takes a name of each kind."""
 
 

@@ -94,7 +94,7 @@ def lines(result: GateResult, width: int = 80) -> Iterator[str]:
 
 def plan(result: GateResult) -> Iterator[str]:
     """Yield lines for the terminal: how many frames each rule needs, by the spread of these runs."""
-    yield f"frames that decide a rule with a probability of {POWER:.0%}, by the spread of these runs"
+    yield f"frames in all that decide a rule with a probability of {POWER:.0%}, if they vary as these runs do"
     for judgement in result.judgements:
         needed, now = judgement.frames_needed(result.level), judgement.interval.frames
         text = (

@@ -426,7 +426,7 @@ def _of_areas(areas: Sequence[Area], crs: str) -> str:
     first = areas[0]
     lost = "whose frames agree less" if first.what == "agreement" else "that are wrong now"
     count = f"{MOST} or more areas" if len(areas) == MOST else f"{len(areas)} area{'s' if len(areas) > 1 else ''}"
-    improved_text = f"{first.improved_alike or 'none'} improved by as much as the largest"
+    improved_text = f"noise would improve as many; {first.improved_alike or 'none'} improved by as much as the largest"
     confused_with = f", confused with {first.confused_with}" if first.confused_with else ""
     x, y, z = first.centre
     system = f" of {crs}" if crs else ""
