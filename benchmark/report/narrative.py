@@ -143,9 +143,9 @@ MOST_FRAMES = 12
 def outlying_line(outlying: OutlyingFrames, of: str = "", *, most: int = MOST_FRAMES) -> str:
     """Return which frames stand out, by the names of their files, in order of the sequence; `of` says of what.
 
-    'frames that stand out: 2 of 40, frame-07 frame-31'.
+    'frames that stand out, net: 2 of 40, frame-07 frame-31'.
     """
-    head = f"frames that stand out{f', {of}' if of else ''}"
+    head = f"frames that stand out{f', {of}' if of else ' from the frames around them'}"
     if not outlying.judged:
         return f"{head}: not known, fewer than {LEAST_FRAMES} views share {LEAST_PLACES} places with two others"
     unjudged = f" ({outlying.unjudged} not judged: they share too few places)" if outlying.unjudged else ""
