@@ -80,11 +80,13 @@ def test_list_names_what_there_is(tmp_path) -> None:
     assert names == ["filters", "ladder", "paper", "rules", "uavid3d"]
 
 
-def test_list_fits_80_columns_and_cuts_no_dataset(tmp_path) -> None:
+def test_list_fits_80_columns_and_cuts_no_dataset_and_no_benchmark(tmp_path) -> None:
     lines = bench("list", cwd=tmp_path, columns=80).stdout.splitlines()
     assert max(map(len, lines)) <= 80
-    of_datasets = bench("list", "datasets", cwd=tmp_path, columns=80).stdout
-    assert "..." not in of_datasets.replace(".depth.png, ...", "")
+    for kind in ("datasets", "benchmarks"):
+        listed = bench("list", kind, cwd=tmp_path, columns=80).stdout
+        assert "..." not in listed.replace(".depth.png, ...", "")
+        assert listed.splitlines()[0].endswith({"datasets": "is found", "benchmarks": "benchmark NAME"}[kind])
 
 
 def test_a_run_on_a_folder(wall, tmp_path) -> None:

@@ -386,6 +386,14 @@ def test_a_stated_grid_is_read(tmp_path):
     assert (features.first, features.step) == ((7.5, 3.5), (8.0, 8.0))
 
 
+@pytest.mark.parametrize(("key", "hold"), [("first", "they hold 1 and 2"), ("step", "they hold 2 and 1")])
+def test_a_grid_of_one_number_is_one_line(tmp_path, key, hold):
+    stated = {"first": np.array([7.5, 3.5]), "step": np.array([8.0, 8.0]), key: np.array(8.0)}
+    written(tmp_path / "room", clip=lambda labels: {"features": coarse(labels), **stated})
+    error = error_of("room", "--voxel-size", "0.2", "-o", "run", "--model", "clip", cwd=tmp_path)
+    assert f"'first' and 'step' must hold two numbers, of columns and of rows; {hold}" in error
+
+
 @pytest.mark.parametrize(
     ("content", "line"),
     [

@@ -301,7 +301,7 @@ def test_a_wrong_column_is_named_with_its_voxel(root, tmp_path, monkeypatch, col
     printed = io.StringIO()
     print_answer(result, Console(file=printed, width=80))
     words = " ".join(printed.getvalue().split())
-    assert f"numba and numpy DISAGREE in 1 of 1 maps: wall, a: {row.first}" in words
+    assert f"numba and numpy DISAGREE in 1 of 1 maps: wall, a: in numba {row.first}" in words
 
 
 def test_a_map_whose_evidence_does_not_sum_to_op_is_no_result(root, tmp_path, monkeypatch) -> None:

@@ -106,7 +106,7 @@ def of_some(result, models, out):
 def test_two_models_are_one_sentence(result, tmp_path):
     found = of_some(result, ["twin", "nervous"], tmp_path / "run")
     (text,) = answers(found)
-    assert text.startswith("nervous is less stable than twin: alpha -")
+    assert text.startswith("nervous is less stable than twin: alpha lower by ")
     assert printed(found, tmp_path / "run").index(text[:40]) < 300
 
 
@@ -151,7 +151,7 @@ def test_a_model_that_owes_its_order_to_what_it_leaves_out_is_not_shown_to_be_mo
     (difference,) = ranking(found).differences
     semstab.comparison.ranking._ranking.cache_clear()
     assert (difference.shown, difference.silent) == (False, True)
-    assert first.startswith("nervous is not shown to differ from twin: alpha -")
+    assert first.startswith("nervous is not shown to differ from twin: alpha lower by ")
     assert second.startswith("twin has a higher alpha than nervous on what both label, but a lower one if what it")
 
 

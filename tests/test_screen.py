@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from semstab.core.palette import MODEL_COLORS, dash, marker, model_color
-from semstab.data.statistics import short
+from semstab.data.statistics import StabilityVerdict, short
 from semstab.metrics import CATEGORY_COLORS
 from semstab.report.tables.backends import one_in
 from semstab.report.terminal import laid_out, percents
@@ -47,6 +47,19 @@ def test_the_share_that_was_compared_has_one_form(drawn, said) -> None:
             self.one_in = share
 
     assert one_in([Row(share) for share in drawn]) == said
+
+
+@pytest.mark.parametrize(
+    ("level", "p", "said"),
+    [
+        ("unstable", 0.97, "(probability .97)"),
+        ("stable", 0.999, "(probability > .99)"),
+        ("undecided", 0.5, ""),
+        ("stable", float("nan"), ""),
+    ],
+)
+def test_the_probability_of_a_verdict_is_no_p_value(level, p, said) -> None:
+    assert StabilityVerdict(level, p, "").in_words == said
 
 
 def test_models_of_one_colour_differ_in_marker_or_dash() -> None:

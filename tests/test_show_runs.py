@@ -84,7 +84,7 @@ def test_tables_of_a_run_are_written_on_demand(folder) -> None:
 
 
 def test_one_run_and_its_tables_are_as_before(folder) -> None:
-    assert "tables  overview" in bench("show", "fine", cwd=folder).stdout
+    assert "tables  semstab-bench show fine TABLE, of overview" in bench("show", "fine", cwd=folder).stdout
     assert bench("show", "fine", "overview", cwd=folder).stdout.startswith("Overview")
 
 

@@ -138,9 +138,9 @@ def test_a_model_on_the_built_in_city_has_the_voxels_of_the_citys_own_models() -
 def test_a_given_voxel_size_is_told_where_it_lies(wide) -> None:
     result = semstab.run(configure(wide, backends=["numba"], check=None, voxel_size=1.0))
     assert not result.advice["wide"].chosen
-    assert "noise splits" not in printed(result)
+    assert "noise of depth" not in printed(result)
     advice = dataclasses.replace(result.advice["wide"], voxel_size=0.5 * result.advice["wide"].suggested)
-    assert "noise splits locations" in printed(dataclasses.replace(result, advice={"wide": advice}))
+    assert "noise of depth and poses" in printed(dataclasses.replace(result, advice={"wide": advice}))
     assert "'background' covers" in printed(result)
 
 

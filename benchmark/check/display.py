@@ -18,6 +18,12 @@ from semstab.data.labels import IGNORE_16BIT
 
 STATES = {"sound": "green", "imprecise": "yellow", "unsound": "bold red", "unclear": "yellow"}
 NOTHING = "-"
+OVERLAP = (
+    "in view: points of a frame inside the other image; co-visible: points that have depth there, too; error: median"
+    " difference of the two depths; agree: points with the same label"
+)
+"""The meaning of the columns of the table of overlaps."""
+
 OF_IMAGES = "predict them (--predict), or put the label maps of a model into its folder"
 OF_SCANS = "put the labels of a model into predictions/MODEL (docs/tutorials/scans.md), or check the truth: --model gt"
 """Advice for a scene without labels."""
@@ -56,10 +62,12 @@ def print_check(checked: SceneCheck, console: Console, *, verbose: bool = False)
         if verbose:
             console.print(f"\n  {title}", highlight=False, markup=False)
         console.print(Padding(table, (0, 0, 0, 2), expand=False))
+        if name == "overlap":
+            say(f"  {OVERLAP}", 4)
     for line in _advice(checked, verbose=verbose):
         say(f"  {line}", 11)
     if not verbose:
-        say("  more     -v: conventions, persistence, labels; --json FILE: all numbers", 11)
+        say("  more     -v: axes of the poses, frames per voxel, labels; --json FILE: all numbers", 11)
     console.print()
 
 

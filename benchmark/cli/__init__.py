@@ -189,8 +189,9 @@ app = typer.Typer(
     pretty_exceptions_enable=False,
     context_settings={"help_option_names": ["-h", "--help"]},
     help="How stable are a segmentation model's predictions at the same physical place?\n\n"
-    "Fuses label maps by depth and pose into metric voxels and measures VSS, SBD, OP and entropy. Without a command "
-    "`run` is the command; without options it runs on the built-in city.",
+    "Fuses label maps by depth and pose into metric voxels, and measures how far views of one place agree (alpha,"
+    " VSS), and how their labels drift (SBD) and flicker. Without a command `run` is the command; without options it"
+    " runs on the built-in city.",
 )
 
 

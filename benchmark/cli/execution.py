@@ -52,7 +52,8 @@ def execute(config: Config, out: Path, execution: Execution, *, quiet: bool, ver
         if result.select() and not quiet:
             print_answer(result, Console(), out=out, seconds=time.monotonic() - began, verbose=verbose)
         else:
-            print_lines([f"  folder  {out}"], quiet=quiet)
+            traces = out / "failures.log"
+            print_lines([f"  traces  {traces}" if traces.exists() else f"  folder  {out}"], quiet=quiet)
         for recorder in recording:
             recorder.serve()
     finally:

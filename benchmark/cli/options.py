@@ -132,7 +132,7 @@ TileSize = Annotated[str | None, typer.Option(
 Verbose = Annotated[bool, typer.Option("--verbose", "-v", help="Also print every table.", rich_help_panel=SETTINGS)]
 ScopeOption = Annotated[str | None, typer.Option(
     "--scope", metavar="these-frames|this-scene|other-scenes", show_default="this-scene",
-    help="Population of intervals: these very frames, this scene flown again, or other scenes like it.",
+    help="What intervals are for: these very frames, this scene flown again, or other scenes like it.",
     rich_help_panel=SETTINGS)]
 OwnCode = Annotated[list[str] | None, typer.Option(
     "--code", metavar="FILE.py:NAME", rich_help_panel=SETTINGS,
@@ -253,15 +253,17 @@ class Measurement:
     options: DatasetOptions = None
     trust_geometry: TrustGeometry = False
     events: Annotated[bool | None, typer.Option(
-        "--events", help="Also write the log of observations.", rich_help_panel=SETTINGS)] = None
+        "--events", help="Also write each frame's evidence in each voxel.", rich_help_panel=SETTINGS)] = None
     statistics: Annotated[bool | None, typer.Option(
-        "--statistics", help="Also measure drift, flips and the part of geometry; takes longer.")] = None
+        "--statistics",
+        help="Also measure drift, flips and how much of the disagreement geometry causes; slower.")] = None
     no_truth: Annotated[bool, typer.Option(
         "--no-truth", metavar="", help="Do not compare with the ground truth of the scene.",
         rich_help_panel=CHECKS)] = False
     moving: Annotated[str | None, typer.Option(
         "--moving", metavar="tell|keep", show_default="tell",
-        help="Tell which spots moved, and judge what stayed; or keep them.", rich_help_panel=SETTINGS)] = None
+        help="Leave spots that moved out of the verdict, and tell which they are; or keep them in it.",
+        rich_help_panel=SETTINGS)] = None
     video_measures: Annotated[str | None, typer.Option(
         "--video-measures", metavar="depth|dis", show_default="none",
         help="Also VC and TC as papers report them, by depth and pose, or by optical flow between images.")] = None

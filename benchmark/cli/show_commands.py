@@ -68,7 +68,8 @@ def show(
         print_lines(map(str, write_figures(result, run, out, svg=figures is FigureFormat.svg)))
     elif not what and out is None:
         print_answer(result, Console(), out=run)
-        listed = f"tables  {', '.join([*by_name, COMPARISON] if len(result.models) > 1 else by_name)}"
+        names = [*by_name, COMPARISON] if len(result.models) > 1 else [*by_name]
+        listed = f"tables  semstab-bench show {run} TABLE, of {', '.join(names)}"
         print_lines(textwrap.wrap(listed, 80, initial_indent="  ", subsequent_indent=" " * 10))
     chosen: dict[str, Table] = {}
     for name in what or ():
@@ -156,6 +157,17 @@ KINDS = {
 }  # fmt: skip
 """The kinds of things that `list` lists, in the plural."""
 
+USES = {
+    "backend": "--backend NAME, or FILE.py:NAME",
+    "dataset": "--dataset NAME; the format of --data is found",
+    "model": "--predict NAME, or FILE.py:NAME",
+    "filter": "--filter NAME:NUMBER",
+    "taxonomy": "--taxonomy NAME",
+    "study": "semstab-bench study NAME",
+    "benchmark": "semstab-bench benchmark NAME",
+}
+"""The option or the command that takes a name of each kind."""
+
 
 def _kind(text: str | None) -> str | None:
     """Return a kind by its name in the singular or the plural; raises ConfigError if there is none."""
@@ -175,7 +187,7 @@ NAME_COLUMNS = 22
 def _entry(name: str, text: str, width: int) -> str:
     """Return the line of an entry: its name, and its description, cut to fit the terminal."""
     room = width - NAME_COLUMNS - 4
-    return f"  {name:<{NAME_COLUMNS}}  {text if len(text) <= room else f'{text[: room - 3].rstrip()}...'}"
+    return f"  {name:<{NAME_COLUMNS}}  {textwrap.shorten(text, room, placeholder=' ...')}"
 
 
 def list_(
@@ -222,7 +234,7 @@ def list_(
     console = Console()
     for kind_name, described in sections.items():
         if section in (None, kind_name):
-            print_lines([f"{plural[kind_name]} ({len(described)})"])
+            print_lines([f"{plural[kind_name]} ({len(described)}): {USES[kind_name]}"])
             print_lines(_entry(name, text, console.width) for name, text in described.items())
             print_lines([""] if section is None else [])
     if section is not None:

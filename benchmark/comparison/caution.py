@@ -90,7 +90,7 @@ def _of_truth(more: str, less: str, by_measure: Mapping[str, Contrast], order: t
     )
     if any(a < b for a, b in values):
         return f"{more} is more stable and less right than {less} ({numbers}): do not take agreement for truth"
-    return f"{more} is also more often right than {less} ({numbers})"
+    return f"none from the ground truth, {more} is also more often right than {less} ({numbers})"
 
 
 def _means(of_both: Sequence[Sequence[float]]) -> tuple[float, float]:

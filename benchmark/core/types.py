@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import Literal
 
 import numpy as np
@@ -23,3 +24,10 @@ Scope = Literal["these frames", "this scene", "other scenes"]
 THESE_FRAMES: Scope = "these frames"
 THIS_SCENE: Scope = "this scene"
 OTHER_SCENES: Scope = "other scenes"
+
+SCOPE_WORDS: Mapping[Scope, str] = {
+    THESE_FRAMES: "for these very frames",
+    THIS_SCENE: "for this scene flown again",
+    OTHER_SCENES: "for other scenes like these",
+}
+"""The words of a sentence that say what an interval is for."""

@@ -11,6 +11,7 @@ from xml.etree import ElementTree
 
 from semstab.core.files import write_text
 from semstab.core.json_form import to_json
+from semstab.core.types import SCOPE_WORDS
 from semstab.errors import ConfigError
 from semstab.gating.result import POWER, GateResult, Verdict
 
@@ -81,7 +82,7 @@ def lines(result: GateResult, width: int = 80) -> Iterator[str]:
     yield ""
     reasons: dict[str, list[str]] = {}
     for judgement in result.judgements:
-        reasons.setdefault(f"{judgement.verdict}: {judgement.reason} ({judgement.about})", []).append(
+        reasons.setdefault(f"{judgement.verdict}: {judgement.reason} ({SCOPE_WORDS[judgement.about]})", []).append(
             judgement.rule.text
         )
     for why, rules in reasons.items():
@@ -93,7 +94,7 @@ def lines(result: GateResult, width: int = 80) -> Iterator[str]:
 
 def plan(result: GateResult) -> Iterator[str]:
     """Yield lines for the terminal: how many frames each rule needs, by the spread of these runs."""
-    yield f"frames that decide a rule with a probability of {POWER:.0%}, by the spread of these runs"
+    yield f"frames in all that decide a rule with a probability of {POWER:.0%}, if they vary as these runs do"
     for judgement in result.judgements:
         needed, now = judgement.frames_needed(result.level), judgement.interval.frames
         text = (
@@ -111,7 +112,8 @@ def _wrapped(line: str, width: int, indent: int) -> list[str]:
 
 
 def _ends(result: GateResult) -> str:
-    return f"each end of an interval holds with {100 * (1 - result.level):g} % confidence"
+    both, one = 100 * (1 - 2 * result.level), 100 * (1 - result.level)
+    return f"intervals hold with {both:g} % confidence, each end with {one:g} %"
 
 
 def _scenes(result: GateResult) -> str:

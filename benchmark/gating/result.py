@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from typing import Literal
 
 from semstab.comparison.quantities import COVERAGE
-from semstab.core.types import THESE_FRAMES
+from semstab.core.types import THESE_FRAMES, Scope
 from semstab.data.statistics import Interval
 from semstab.gating.rules import GateMeasure, Rule
 from semstab.statistics.intervals import LEAST_FRAMES, standard_error
@@ -81,7 +81,7 @@ class Judgement:
         return f"{self.verdict}: {self.rule.text}: {self.values}"
 
     @property
-    def about(self) -> str:
+    def about(self) -> Scope:
         """The scope of the interval, see `Interval`."""
         return self.interval.scope
 

@@ -36,8 +36,8 @@ def tables(agreements: tuple[MapAgreement, ...], run: str) -> list[Table]:
 def overview(agreements: tuple[MapAgreement, ...], run: str) -> Table:
     """Return the table with a row for each map."""
     columns = (
-        Column("map", "Map"), Column("voxels", "Voxels", 0), Column("covers", "Has of run %", 1),
-        Column("covered", "In run %", 1), Column("outside", "Points outside %", 1),
+        Column("map", "Map"), Column("voxels", "Voxels", 0), Column("covers", "Run in map %", 1),
+        Column("covered", "Map in run %", 1), Column("outside", "Points outside %", 1),
         Column("unlabelled", "No class %", 1), Column("same", "Same class %", 1),
         Column("accuracy_run", "run", 3, over="Acc."), Column("accuracy_map", "map", 3, over="Acc."),
         Column("miou_run", "run", 3, over="mIoU"), Column("miou_map", "map", 3, over="mIoU"),
@@ -48,8 +48,8 @@ def overview(agreements: tuple[MapAgreement, ...], run: str) -> Table:
         for row in agreements
     )  # fmt: skip
     caption = (
-        f"Has of run: the share of the voxels of {run} that are in the map; in run: the share of the map's voxels that"
-        f" are in {run}. Same class: of the voxels that both have and label. Accuracy (acc.) and mIoU are"
+        f"Run in map: the share of the voxels of {run} that are in the map; map in run: the share of the map's voxels"
+        f" that are in {run}. Same class: of the voxels that both have and label. Accuracy (acc.) and mIoU are"
         " of those voxels whose true class is known."
     )
     return Table("maps", f"Maps of other programs and {run}", caption, columns, (Group("", rows),), "")
@@ -71,7 +71,7 @@ def _classes(agreements: tuple[MapAgreement, ...], run: str) -> Table:
 
 def _strata(agreements: tuple[MapAgreement, ...], run: str) -> Table:
     columns = (
-        Column("op", "OP"), Column("voxels", "Voxels", 0), Column("covers", "Has of run %", 1),
+        Column("op", "OP"), Column("voxels", "Voxels", 0), Column("covers", "Run in map %", 1),
         Column("same", "Same class %", 1), Column("accuracy_run", "run", 3, over="Acc."),
         Column("accuracy_map", "map", 3, over="Acc."),
     )  # fmt: skip
@@ -82,7 +82,7 @@ def _strata(agreements: tuple[MapAgreement, ...], run: str) -> Table:
         )
         for agreement in agreements
     )
-    caption = f"Voxels of {run} by the number of frames that saw them; has of run: the share that is in the other map."
+    caption = f"Voxels of {run} by the number of frames that saw them; run in map: the share that is in the other map."
     return Table("maps_op", "By OP", caption, columns, groups, "map")
 
 

@@ -143,9 +143,9 @@ MOST_FRAMES = 12
 def outlying_line(outlying: OutlyingFrames, of: str = "", *, most: int = MOST_FRAMES) -> str:
     """Return which frames stand out, by the names of their files, in order of the sequence; `of` says of what.
 
-    'frames that stand out: 2 of 40, frame-07 frame-31'.
+    'frames that stand out, net: 2 of 40, frame-07 frame-31'.
     """
-    head = f"frames that stand out{f', {of}' if of else ''}"
+    head = f"frames that stand out{f', {of}' if of else ' from the frames around them'}"
     if not outlying.judged:
         return f"{head}: not known, fewer than {LEAST_FRAMES} views share {LEAST_PLACES} places with two others"
     unjudged = f" ({outlying.unjudged} not judged: they share too few places)" if outlying.unjudged else ""
@@ -221,7 +221,10 @@ def _size(scene: str, advice: VoxelAdvice, result: Result) -> str:
         )
     if advice.chosen or advice.suggested <= advice.voxel_size:
         return ""
-    return f"{where}{size} are so small that noise splits locations: --voxel-size {advice.suggested:g}"
+    return (
+        f"{where}{size} are smaller than the noise of depth and poses, which puts one point into several:"
+        f" --voxel-size {advice.suggested:g}"
+    )
 
 
 def mixed(runs: Sequence[UnitSummary]) -> bool:

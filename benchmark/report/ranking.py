@@ -37,12 +37,15 @@ def answers(result: Result) -> Iterator[str]:
             relation = "is more stable than" if difference.value > 0 else "is less stable than"
         elif difference.silent:
             relation = "is not shown to differ from"
-        change = Estimate(difference.value, difference.low, difference.high).text("+")
+        change = Estimate(difference.value, difference.low, difference.high)
+        way = "higher"
+        if difference.value < 0:
+            change, way = Estimate(-difference.value, -difference.high, -difference.low), "lower"
         scenes = (
             f", {difference.scenes} of {len(result.scenes)} scenes" if difference.scenes < len(result.scenes) else ""
         )
         why = f"; {difference.undecided}" if difference.undecided else ""
-        yield f"{difference.model} {relation} {difference.other}: alpha {change}{scenes}{why}"
+        yield f"{difference.model} {relation} {difference.other}: alpha {way} by {change.text()}{scenes}{why}"
     elif defined:
         ranks = "; ".join(f"{rank}. {', '.join(names)}" for rank, names in ranked.ranks)
         yield f"most stable first: {ranks}"

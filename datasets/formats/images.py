@@ -231,8 +231,13 @@ def read_features(path: Path, size: Size, read: Read = read_bytes) -> Features:
     vectors = decode_array(path, data, "features", claimed)
     try:
         if path.suffix.lower() == ".npz" and {"first", "step"} <= set(names_in(data)):
-            (u, v), (across, down) = (decode_array(path, data, name).ravel().tolist() for name in ("first", "step"))
-            return Features(vectors, (u, v), (across, down))
+            first, step = (decode_array(path, data, name).ravel().tolist() for name in ("first", "step"))
+            if len(first) != 2 or len(step) != 2:
+                raise DataError(
+                    f"'first' and 'step' must hold two numbers, of columns and of rows; they hold {len(first)} and"
+                    f" {len(step)}"
+                )
+            return Features(vectors, (first[0], first[1]), (step[0], step[1]))
         return Features.over(vectors, size)
     except (DataError, ValueError) as error:
         raise DataError(f"{path}: {error}") from error

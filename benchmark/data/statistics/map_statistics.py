@@ -65,6 +65,11 @@ class StabilityVerdict:
         p = self.probability
         return "" if math.isnan(p) or self.level == "undecided" else "(p > .99)" if p >= 0.995 else f"(p {short(p)})"
 
+    @property
+    def in_words(self) -> str:
+        """Probability with its name, which no reader takes for a p-value: '(probability .71)'."""
+        return self.stated.replace("p", "probability", 1)
+
     def __str__(self) -> str:
         """Return 'stable (p .98)'."""
         return f"{self.level} {self.stated}".rstrip()

@@ -11,6 +11,7 @@ from pathlib import Path
 from semstab.comparison.locations import MOST
 from semstab.comparison.quantities import BY_CLASS, COVERAGE, FLICKER, HEADLINES, IOU, RECALL, by_name
 from semstab.core.console import Console
+from semstab.core.types import SCOPE_WORDS
 from semstab.data.contrast import (
     Against,
     Area,
@@ -386,12 +387,18 @@ def _stability(comparison: RunComparison, against: Against) -> str:
         which = f"{' and '.join(silent)} {'is' if len(silent) == 1 else 'are'} nearly one class all over"
         return f"{other} and {base} are not ranked, as {which}: {numbers}, {interval}{p}."
     if row.change:
-        return f"{other} {text[row.change]} {base}: {numbers}, {interval}{p}, for {row.difference.scope}."
+        return f"{other} {text[row.change]} {base}: {numbers}, {interval}{p}, {_flown_again(comparison, row)}."
     why = f"; undecided: {row.difference.undecided}" if row.difference.undecided else ""
     return (
         f"Over all classes, no difference in stability between {other} and {base} is shown: {numbers},"
-        f" {interval}{p}, for {row.difference.scope}{why}."
+        f" {interval}{p}, {_flown_again(comparison, row)}{why}."
     )
+
+
+def _flown_again(comparison: RunComparison, row: Contrast) -> str:
+    """Return what the interval of a difference is for."""
+    words = SCOPE_WORDS[row.difference.scope]
+    return words.replace("this scene", "these scenes") if len(comparison.scenes) > 1 else words
 
 
 LEAST_COVERAGE = 0.005
@@ -419,7 +426,7 @@ def _of_areas(areas: Sequence[Area], crs: str) -> str:
     first = areas[0]
     lost = "whose frames agree less" if first.what == "agreement" else "that are wrong now"
     count = f"{MOST} or more areas" if len(areas) == MOST else f"{len(areas)} area{'s' if len(areas) > 1 else ''}"
-    improved_text = f"{first.improved_alike or 'none'} improved by as much as the largest"
+    improved_text = f"noise would improve as many; {first.improved_alike or 'none'} improved by as much as the largest"
     confused_with = f", confused with {first.confused_with}" if first.confused_with else ""
     x, y, z = first.centre
     system = f" of {crs}" if crs else ""
@@ -439,6 +446,13 @@ SHOWN = {
 }
 """The columns of each table that fit; files have all of them."""
 
+LEGEND = (
+    "PSA: share of the pairs of frames that give a voxel one class; SBD excess: SBD minus SBD in random order; ECE:"
+    " belief against accuracy; consistent but wrong: share of the voxels whose frames agree on a wrong class; voxel"
+    " alpha: alpha of a voxel's frames; coverage: voxels, of the base's; p (Holm): corrected for all measures"
+)
+"""The meaning of the measures that the screen of a run does not explain."""
+
 LONGEST_NAME = 8
 """The longest names of runs over the columns of their numbers."""
 
@@ -457,6 +471,9 @@ def print_comparison(
             fitting = _fitting(table.only(*SHOWN[table.name]), comparison)
             text = to_terminal(dataclasses.replace(fitting, caption=""), WIDTH)
             console.print(f"\n{text}", highlight=False, markup=False, soft_wrap=True)
+        if table.name == "comparison":
+            legend = textwrap.wrap(f"  {LEGEND}", WIDTH, subsequent_indent="    ", break_on_hyphens=False)
+            console.print("\n".join([*legend, ""]), highlight=False, markup=False)
     for sentence in notes(comparison):
         wrapped = textwrap.wrap(f"  {sentence}", console.width, subsequent_indent="    ")
         console.print("\n".join(wrapped), highlight=False, markup=False)

@@ -40,7 +40,7 @@ def feature_lines(features: FeatureAgreement) -> Iterator[str]:
         yield from wrapped(f"alpha by range: {by_range}")
     views, degrees = features.correlogram.time, features.correlogram.angle
     if len(views) > 1:
-        yield from wrapped(f"alpha by views between two: {_ends(views, 0)}")
+        yield from wrapped(f"alpha by views apart: {_ends(views, 0)}")
     if len(degrees) > 1:
         yield from wrapped(f"alpha by angle between two views: {_ends(degrees, 1, ' degrees')}")
     if features.outlying_frames is not None and features.outlying_frames.frames:
@@ -55,7 +55,7 @@ def feature_lines(features: FeatureAgreement) -> Iterator[str]:
         x, y, z = place.centre
         frames = ", ".join(map(str, place.frames))
         yield from wrapped(
-            f"place at ({x:.1f}, {y:.1f}, {z:.1f}): cosine {place.cosine:.2f},"
+            f"place at ({x:.1f}, {y:.1f}, {z:.1f}) m: cosine {place.cosine:.2f},"
             f" {percent(place.share)} of the disagreement; frames {frames}"
         )
 

@@ -26,6 +26,8 @@ def head_lines(name: str, result: Result, runs: Sequence[UnitSummary], width: in
     classes = f"{' and '.join(map(str, sorted(numbers)))} classes" if numbers else "features"
     what = f"{counts} frames{distinct}, {classes}, {_metres(first.table.voxel_size)} voxels{chosen}"
     remarks = "    ".join(filter(None, (_geometry(result), _scope(runs))))
+    if result.manifest.get("seed") is not None:
+        name = f"simulated: {name}"
     line = f"{name}    {what}    {remarks}".rstrip()
     yield line if len(line) <= width else f"{name}    {what}\n  {remarks}".rstrip()
     for text in noted(result):

@@ -13,15 +13,14 @@ from semstab.statistics.verdict import LIMITS
 
 WIDTH = 80
 
-ALPHA = (
-    f"alpha: agreement of two views beyond chance; {short(LIMITS.stable)} stable, {short(LIMITS.usable)} usable with"
-    " care"
-)
+STABLE, USABLE = short(LIMITS.stable), short(LIMITS.usable)
+ALPHA = f"alpha: agreement of two views of a spot beyond chance; {STABLE} stable, {USABLE} usable"
 COLUMNS = (
     "agree: views with the same class; flicker: pixels that change class per frame",
     "VSS: agreement of a voxel's frames, 1 is perfect; SBD: change of a voxel's belief per frame, in bits; OP: frames"
     " that saw the voxel",
 )
+OVERLAP = "; mIoU: of the map"
 """The meaning of the numbers on the screen, for readers who know mIoU."""
 
 TEXTS = 3
@@ -90,10 +89,10 @@ def number(value: float, digits: int) -> str:
     return "-" if math.isnan(value) else f"{value:z.{digits}f}"
 
 
-def legend() -> Iterator[str]:
+def legend(*, has_truth: bool) -> Iterator[str]:
     """Yield the meaning of the columns of a table of models."""
-    yield from wrapped(ALPHA)
-    for text in COLUMNS:
+    *texts, last = (ALPHA, *COLUMNS)
+    for text in (*texts, f"{last}{OVERLAP if has_truth else ''}"):
         yield from wrapped(text)
 
 

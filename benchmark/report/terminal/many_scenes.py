@@ -17,6 +17,7 @@ from semstab.report.ranking import answers
 from semstab.report.terminal.disagreement import class_lines
 from semstab.report.terminal.head import head_lines
 from semstab.report.terminal.layout import common_beginning, cut, laid_out, legend, number, percent, wrapped
+from semstab.report.terminal.several_models import miou
 
 LEAST_SCENES = 3
 """Scenes from which on an interval over scenes is printed: the spread of two says almost nothing."""
@@ -38,7 +39,7 @@ def many_scenes(result: Result, records: Sequence[Record], width: int) -> Iterat
         yield ""
     models, begin = by_model(records), common_beginning([*result.models])
     yield from _model_rows(models, begin, width)
-    yield from legend()
+    yield from legend(has_truth=any(not math.isnan(miou(record)) for record in records))
     yield ""
     yield from _scene_lines(result.scenes, models, begin, width)
     if begin:
@@ -92,8 +93,8 @@ def _model_row(name: str, records: Sequence[Record]) -> list[str]:
     means = [recurrent[m] if recurrent.voxels >= ENOUGH else math.nan for m in headlines()]
     headline_texts = [short(value, digits=m.digits[0]) for m, value in zip(headlines(), means, strict=True)]
     right = [stats.correctness.miou_op2.value for stats in statistics if stats.correctness is not None]
-    miou = macro_mean(right) if right else math.nan
-    return [name, verdicts, alpha.text(), number(agree, 0), number(flicker, 1), *headline_texts, short(miou, digits=3)]
+    overlap = short(macro_mean(right) if right else math.nan, digits=3)
+    return [name, verdicts, alpha.text(), number(agree, 0), number(flicker, 1), *headline_texts, overlap]
 
 
 def _scene_lines(scenes: Sequence[str], models: dict[str, list[Record]], begin: str, width: int) -> Iterator[str]:

@@ -17,10 +17,16 @@ from semstab.report.terminal.disagreement import class_lines, outlying_lines
 from semstab.report.terminal.features import features_alone
 from semstab.report.terminal.head import head_lines
 from semstab.report.terminal.layout import ALPHA, WIDTH, percent, percents, wrapped
-from semstab.statistics.verdict import DANGEROUS, LIMITS, why_undecided
+from semstab.statistics.verdict import ADVICE, DANGEROUS, LIMITS, why_undecided
 
-MEANS = "VSS: agreement of a voxel's frames, 1 is perfect; SBD: change of a voxel's belief per frame"
+MEANS = (
+    "VSS: agreement of a voxel's frames, 1 is perfect; SBD: change of a voxel's belief per frame; entropy: 0 sure, 1"
+    " unsure; margin: best class minus second"
+)
 """The meaning of the paper's means."""
+
+JUDGED = ("stable", "usable", "unstable")
+"""The levels with which the screen says what to do."""
 
 
 def one_model(result: Result, record: Record, width: int) -> Iterator[str]:
@@ -60,7 +66,7 @@ def _verdict(run: UnitSummary) -> Iterator[str]:
     if statistics.verdict.level == "no verdict":
         yield from wrapped(statistics.verdict.line)
         return
-    yield f"  {level} {statistics.verdict.stated}".rstrip() + f"    {name} {short(alpha.value)}{_interval(alpha)}"
+    yield f"  {level} {statistics.verdict.in_words}".rstrip() + f"    {name} {short(alpha.value)}{_interval(alpha)}"
     wrong = wrong_text(statistics)
     if statistics.verdict.level == "misleading":
         yield from textwrap.wrap(wrong, WIDTH, initial_indent="  ", subsequent_indent="  ")
@@ -78,7 +84,9 @@ def _verdict(run: UnitSummary) -> Iterator[str]:
         yield from wrapped(f"{why_undecided(alpha)}: more frames decide it")
     for text in statistics.moving_lines:
         yield from wrapped(text)
-    yield f"  two views see the same class at {percent(statistics.agreeing)} of the spots"
+    same = f"two views see the same class at {percent(statistics.agreeing)} of the spots"
+    advice = f"{ADVICE[statistics.verdict.decisive]}: " if statistics.verdict.level in JUDGED else ""
+    yield from wrapped(f"{advice}{same}")
     if wrong and statistics.verdict.level != "misleading":
         yield f"  {wrong}"
     meaning = None if statistics.spots is None else statistics.spots.meaning

@@ -22,7 +22,7 @@ from semstab.statistics.verdict import DANGEROUS
 def columns() -> list[tuple[str, str]]:
     """Return the head and the unit or the population of each number in a model's row, see `row_of`."""
     measure_columns = [(m.title, "OP>=3") for m in headlines()]
-    texts = [("model", ""), ("verdict", ""), (f"alpha ({UNDEFINED.of})", "")]
+    texts = [("model", ""), ("verdict", "p: probability"), (f"alpha ({UNDEFINED.of})", "")]
     return [*texts, ("agree", "%"), ("flicker", "%"), *measure_columns, ("mIoU", "OP>=2")]
 
 
@@ -78,7 +78,7 @@ def several_models(result: Result, records: Sequence[Record], width: int) -> Ite
     if any(record.summary.table.recurrent.voxels < ENOUGH for record in records):
         titles = ", ".join(measure.title for measure in headlines())
         yield from wrapped(f"-: fewer than {ENOUGH:,} voxels were seen in 3 frames or more, too few for {titles}")
-    yield from legend()
+    yield from legend(has_truth=has_truth)
     if len(records) <= MOST_MAPS and any(record.summary.table.categories for record in records):
         yield from ("", *_map_shares(records, width, begin), "")
     told = [record for record in records if not _is_change_of(record, [*result.models])]

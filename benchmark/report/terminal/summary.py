@@ -31,6 +31,7 @@ STAGE_NAMES = {
     "read": "reading",
     "check": "check of the data",
     "sample": "sampling of spots",
+    "observe": "pixels into voxels",
     "reference": "check of the fusion",
     "sizing": "estimate of memory",
     "network": "network",
@@ -119,9 +120,10 @@ def _check(pair: tuple[str, str], rows: Sequence[Agreement]) -> str:
         )
     row = bad[0]
     only = f"; {sum(row.only_in):,} voxels in one only" if any(row.only_in) else ""
+    causes = "" if is_builtin(checked) else "; the likely cause: docs/tutorials/own-backend.md, the test suite"
     return (
         f"{checked} and {reference} DISAGREE in {len(bad)} of {len(rows)} maps: {row.scene}, {row.model}:"
-        f" {row.first or 'the agreement in summary.json shows where'}{only}"
+        f" {f'in {checked} {row.first}' if row.first else 'the agreement in summary.json shows where'}{only}{causes}"
     )
 
 

@@ -13,6 +13,13 @@ from semstab.report.terminal.layout import laid_out, number, wrapped
 
 HEADS = ("", "flicker %", "pixel flicker %", "co-visible %", "VC8", "VC16")
 
+LEGEND = (
+    "flicker: pixels whose label differs from the frame before, motion removed by optical flow; pixel flicker: with"
+    " motion; co-visible: pixels that the flow finds in the frame before",
+    "VC8, VC16: share of the pixels whose label stays the same for 8 or 16 frames, with motion",
+)
+"""The meaning of the columns."""
+
 NEEDS = (
     "agreement of places (alpha, VSS), drift (SBD), how often a place was seen (OP) and a verdict need depth and poses:"
     " docs/datasets.md has what is read"
@@ -40,7 +47,8 @@ def videos(result: Result, records: Sequence[Record], width: int) -> Iterator[st
         share = number(100 * mean.compensated_share, 0)
         rows.append((name, *flicker, share, number(mean.self_vc8, 3), number(mean.self_vc16, 3)))
     yield from laid_out(rows, width, texts=0)
-    yield "  flicker: pixels whose label differs from the frame before, motion removed by optical flow"
+    for text in LEGEND:
+        yield from wrapped(text)
     yield from outlying_lines(records)
     yield from wrapped(f"note: {NEEDS}")
     yield ""
