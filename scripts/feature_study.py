@@ -5,7 +5,7 @@
     python scripts/feature_study.py show
 
 EdgeNets is the clone of scripts/streets.py, with scripts/nets.py in it; the room is any folder that `semstab-bench`
-reads. `run` takes about an hour of one core, and goes on where it was stopped; `show` runs no network.
+reads. `run` takes about an hour of one core, and goes on after a stop; `show` runs no network.
 
 Each network gives its labels and the features before its classifier (scripts/feature_nets.py). Two vocabularies name
 the features: the classifier's own classes, and groups of them. results/features.csv has a row for each network and

@@ -366,7 +366,7 @@ def test_a_folder_has_features_with_and_without_labels(tmp_path):
     assert net.headline.alpha.value > 0.5
     alone = bench("room", "--voxel-size", "0.2", "-o", "alone", "--model", "clip", cwd=tmp_path).stdout
     assert "FEATURES    alpha" in alone
-    assert "VSS, SBD, entropy, flicker, classes and a verdict have no number" in " ".join(alone.split())
+    assert "no VSS, SBD, entropy, flicker, classes and verdict: they need labels" in " ".join(alone.split())
 
 
 def test_labels_have_the_same_numbers_with_features_and_without(tmp_path):

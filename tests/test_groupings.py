@@ -89,7 +89,8 @@ def test_classes_that_are_confused_are_merged_and_no_others():
     assert (found.classes, found.told.groups) == (5, 3)
     assert found.told.alpha.low < found.told.alpha.value < found.told.alpha.high
     assert re.match(
-        r"stable with 3 of 5 classes, \d\.\d effective: door \+ curtain, window \+ blinds merged; alpha", found.text
+        r"stable if 5 classes become 3, worth \d\.\d of equal share: door \+ curtain, window \+ blinds; alpha",
+        found.text,
     )
 
 
@@ -167,7 +168,7 @@ def home(tmp_path_factory):
 def test_the_screen_the_report_and_a_table_say_which_classes_hold(home):
     shown = " ".join(bench("show", "run", cwd=home).stdout.split())
     assert re.search(
-        r"stable with 3 of 5 classes, .* effective: door \+ curtain, window \+ blinds merged; alpha", shown
+        r"stable if 5 classes become 3, worth .* of equal share: door \+ curtain, window \+ blinds; alpha", shown
     )
     page = (home / "run/report.html").read_text()
     assert "Which distinctions hold" in page

@@ -196,7 +196,10 @@ def test_the_screen_compare_and_gate_say_how_far_labels_agree_by_meaning(home):
     assert net.alpha.value > worse.alpha.value + 0.1
     assert (net.near, worse.near) == (1.0, 0.0)
     shown = " ".join(bench("show", "run", cwd=home).stdout.split())
-    assert f"net: by meaning: alpha {net.alpha.text()}; 100 % of the disagreement is between near classes" in shown
+    assert (
+        f"net: by meaning: alpha {net.alpha.text()}; 100 % of the disagreement is between classes of near meaning"
+        in shown
+    )
     compared = semstab.compare(f"{home / 'run'}:net", f"{home / 'run'}:worse")
     rows = {row.measure: row for row in compared.overall[0].contrasts}
     assert rows["alpha_by_meaning"].base == pytest.approx(net.alpha.value, abs=1e-9)

@@ -12,7 +12,7 @@ from street import DRIVES, Street
 from semstab.data.frames import Frame, Intrinsics
 from semstab.statistics import Sampler, SpotObservations
 from semstab.statistics.moving import moving_percent, static_spots
-from semstab.statistics.votes import MOST_KEPT, SpotVotes
+from semstab.statistics.votes import MOST_KEPT, SpotVotes, next_to_moved
 
 H, W, FOCAL, HEIGHT = 120, 160, 120.0, 20.0
 CAMERA = Intrinsics(FOCAL, FOCAL, (W - 1) / 2, (H - 1) / 2)
@@ -151,13 +151,27 @@ def test_of_long_flights_every_so_many_views_are_kept() -> None:
 def test_two_views_and_a_third_of_the_votes_decide() -> None:
     seen, through = np.array([0, 0, 1, 3, 4, 9, 1], np.uint16), np.array([0, 2, 1, 2, 2, 1, 0], np.uint16)
     none = np.zeros(0)
-    votes = SpotVotes(seen, 0 * seen, through, none, none > 0, np.array([1000, 3]), 0.01)
+    votes = SpotVotes(seen, 0 * seen, through, seen > 100, none, none > 0, np.array([1000, 3]), 0.01)
     assert votes.moved.tolist() == [False, True, False, True, False, False, False]
     assert votes.static.tolist() == [False, False, False, False, True, True, False]
     # votes 2 of 2, 2 of 5, 3 of 6 and 4 of 10 with a rate of 3.5 in 1001
     q = 3.5 / 1001
     expected = np.mean([q**2, 10 * q**2 * (1 - q) ** 3 + 10 * q**3, 20 * q**3, 210 * q**4])
     assert votes.false_share == pytest.approx(expected, rel=0.05)
+
+
+@pytest.mark.parametrize(("around", "spacing", "told"), [
+    ("mm", 1.0, True), ("m", 1.0, False), ("mmss", 1.0, True), ("mmsss", 1.0, False), ("mm", 0.5, False),
+    ("mmm", 0.0, False), ("", 1.0, False),
+])  # fmt: skip
+def test_an_unknown_spot_next_to_spots_that_moved_moved_too(around: str, spacing: float, told: bool) -> None:
+    """Moved and static spots lie 1.2 m around it; another spot, which is as unknown, lies far away."""
+    angle = np.arange(len(around))
+    point = np.concatenate(
+        [np.zeros((1, 3)), np.full((1, 3), 9.0), 1.2 * np.stack([np.cos(angle), np.sin(angle), 0 * angle], axis=1)]
+    )
+    moved, static = (np.array([False, False, *(kind == each for each in around)]) for kind in "ms")
+    assert next_to_moved(point, moved, static, spacing).tolist() == [told, *[False] * (len(around) + 1)]
 
 
 def test_an_oncoming_car_is_found_in_scans_by_what_it_left_behind() -> None:

@@ -424,7 +424,7 @@ class Sampler:
         if self._memory is None:
             return None
         n, views = self._spots, len(self._views)
-        return self._memory.votes_on(self._point[:n], self._found[:n], self._firm[:n], views, self._sigma)
+        return self._memory.votes_on(self._point[:n], self._found[:n], self._firm[:n], views, self._sigma, self._edge)
 
     def features(self) -> FeatureObservations | None:
         """Return a copy of the features of the sample so far; None without features."""

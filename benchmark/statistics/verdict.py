@@ -74,7 +74,7 @@ ACTED_ON, LEAST_FLIPS = ("stable", "usable"), 0.001
 
 NO_SPOTS = "no spots were sampled; give the observations of a `Sampler`"
 TOO_FEW_VOXELS = "its map has too few locations to act on; use smaller voxels, or frames that overlap more"
-FEATURES_ALONE = "it gives features and no labels; VSS, SBD, entropy, flicker and classes have no number"
+FEATURES_ALONE = "it gives features and no labels; VSS, SBD, entropy, flicker and classes need labels"
 EMPTY = "no spot was sampled: no pixel has both depth and a label that counts; see exclude, masks and the depth range"
 STILL = "all frames show one view: the camera stood still, or moved by less than a sampled pixel shows (pixel_stride)"
 

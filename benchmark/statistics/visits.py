@@ -99,7 +99,8 @@ class VisitSampler(Sampler):
             views = int(np.count_nonzero(visit == visit_index))
             number, of = np.divmod(self._found[:n], VISITS)
             finding_view = np.where(of == visit_index, number, views).astype(np.int32)
-            votes.append(memory.votes_on(self._point[:n], finding_view, self._firm[:n], views + 1, self._sigma))
+            of_visit = self._point[:n], finding_view, self._firm[:n]
+            votes.append(memory.votes_on(*of_visit, views + 1, self._sigma, 0.0))
         return VisitedSpots(self.sample(classes), visit, np.array(self._places, np.int64), (votes[0], votes[1]))
 
 

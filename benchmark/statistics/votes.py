@@ -61,8 +61,12 @@ it."""
 LEAST_VOTES = 2
 """Views that see a spot or see through it, below which it is unknown whether it moved."""
 
-OF_SPOTS = ("seen", "hidden", "through")
-"""Votes on each spot, by name."""
+NEXT_TO, LEAST_NEXT_TO = 1.5, 2
+"""An unknown spot moved if LEAST_NEXT_TO spots or more within NEXT_TO spacings of spots moved, and half of those there
+that are known: most such spots lie at an edge of the depth of a thing that moved, where no view tells."""
+
+OF_SPOTS = ("seen", "hidden", "through", "next_to")
+"""Votes on each spot, and whether it is next to spots that moved, by name."""
 
 CONTRADICTS, MANY = 0.04, 50
 """Two views contradict each other if one sees through more than this share of the spots, MANY or more, of the other."""
@@ -161,7 +165,9 @@ class DepthMemory:
             self._step *= 2
             self.kept = [view_depth for view_depth in self.kept if view_depth.view % self._step == 0]
 
-    def votes_on(self, point: Float64, found: npt.NDArray[np.int32], firm: Mask, views: int, sigma: float) -> SpotVotes:
+    def votes_on(
+        self, point: Float64, found: npt.NDArray[np.int32], firm: Mask, views: int, sigma: float, spacing: float
+    ) -> SpotVotes:
         """Return what the kept views say of spots.
 
         Args:
@@ -170,6 +176,7 @@ class DepthMemory:
             firm: (n,) spots that lie at no edge of depth; the others have no votes.
             views: Number of views.
             sigma: Standard deviation of how depth differs between views, relative.
+            spacing: Distance of spots in metres; with 0 no spot is told by those next to it.
         """
         from semstab.statistics.loops.moving import tally
 
@@ -182,7 +189,10 @@ class DepthMemory:
         tally(votes, fits[depth_views], counts, between)
         counts[~fits[found]] = 0
         num_seen, hidden, through = counts.T.copy()
-        return SpotVotes(num_seen, hidden, through, shares, ~fits, between, gap_of(sigma))
+        nothing = np.zeros(len(point), np.bool_)
+        alone = SpotVotes(num_seen, hidden, through, nothing, shares, ~fits, between, gap_of(sigma))
+        next_to = next_to_moved(point, alone.moved, alone.static, spacing)
+        return dataclasses.replace(alone, next_to=next_to & fits[found])
 
     def moving_pixels(self, frame: Frame, sigma: float, misplaced: Mask, *, sparse: bool = False) -> Mask:
         """Return the pixels (H, W) of a frame whose surface moved: the kept views, but for misplaced ones, tell.
@@ -231,6 +241,21 @@ def has_moved(through: npt.NDArray[Any], votes: npt.NDArray[Any]) -> Mask:
     return np.asarray((through >= LEAST_THROUGH) & (through > SHARE_THROUGH * votes), np.bool_)
 
 
+def next_to_moved(point: Float64, moved: Mask, static: Mask, spacing: float) -> Mask:
+    """Return which spots (n,) are neither moved nor static, and next to spots that moved."""
+    from scipy.spatial import cKDTree
+
+    next_to: Mask = np.zeros(len(point), np.bool_)
+    unknown = np.flatnonzero(~moved & ~static)
+    if len(unknown) and np.count_nonzero(moved) >= LEAST_NEXT_TO:
+        of_moved, of_static = (
+            cKDTree(point[kind]).query_ball_point(point[unknown], NEXT_TO * spacing, return_length=True)
+            for kind in (moved, static)
+        )
+        next_to[unknown] = (of_moved >= LEAST_NEXT_TO) & (of_moved >= of_static)
+    return next_to
+
+
 def gap_of(sigma: float) -> float:
     """Return how much farther than a spot a surface is at least, relative, that shows that a view sees through it."""
     return max(GAP, GAP_SIGMAS * sigma)
@@ -248,6 +273,7 @@ class SpotVotes:
     Attributes:
         seen, hidden, through: (n,) uint16 views of each spot, without those that are misplaced; 0 of a spot that was
             found in one of these.
+        next_to: (n,) spots of which too few views tell, next to spots that moved.
         through_of_view: (V,) share of the spots of other views that a view sees through, of those that it sees or sees
             through; NaN of views whose depth was not kept.
         misplaced: (V,) views that see through many spots all over the image.
@@ -258,14 +284,15 @@ class SpotVotes:
     seen: UInt16
     hidden: UInt16
     through: UInt16
+    next_to: Mask
     through_of_view: Float64
     misplaced: Mask
     between: Int64
     gap: float
 
     @property
-    def columns(self) -> dict[str, UInt16]:
-        """(n,) the votes on each spot by name."""
+    def columns(self) -> dict[str, npt.NDArray[Any]]:
+        """(n,) the votes on each spot, and whether it is next to spots that moved, by name."""
         return {name: getattr(self, name) for name in OF_SPOTS}
 
     def of_views(self) -> dict[str, Any]:
@@ -285,8 +312,9 @@ class SpotVotes:
         misplaced = np.zeros(len(shares), np.bool_)
         misplaced[np.array(of_views["misplaced"], np.int64)] = True
         between = np.array(of_views["between"], np.int64).reshape(2)
-        num_seen, hidden, through = (columns[name].astype(np.uint16) for name in OF_SPOTS)
-        return cls(num_seen, hidden, through, shares, misplaced, between, float(of_views["gap"]))
+        num_seen, hidden, through = (columns[name].astype(np.uint16) for name in OF_SPOTS[:3])
+        next_to = columns["next_to"].astype(np.bool_)
+        return cls(num_seen, hidden, through, next_to, shares, misplaced, between, float(of_views["gap"]))
 
     @property
     def votes(self) -> Int64:
@@ -295,8 +323,8 @@ class SpotVotes:
 
     @property
     def moved(self) -> Mask:
-        """(n,) spots that moved: LEAST_THROUGH views see through it, and more than SHARE_THROUGH of all."""
-        return has_moved(self.through, self.votes)
+        """(n,) spots that moved: by the votes of views, or by the spots next to them."""
+        return has_moved(self.through, self.votes) | self.next_to
 
     @property
     def static(self) -> Mask:
@@ -329,7 +357,7 @@ class SpotVotes:
 
     def take(self, rows: Any) -> SpotVotes:
         """Return the votes on some of the spots."""
-        return dataclasses.replace(self, seen=self.seen[rows], hidden=self.hidden[rows], through=self.through[rows])
+        return dataclasses.replace(self, **{name: column[rows] for name, column in self.columns.items()})
 
 
 def firm(

@@ -96,9 +96,11 @@ class Meaning:
 
     @property
     def text(self) -> str:
-        """'by meaning: alpha .91 (.90 to .92); 63 % of the disagreement is between near classes'."""
+        """'by meaning: alpha .91 (.90 to .92); 63 % of the disagreement is between classes of near meaning'."""
         near_text = (
-            "" if math.isnan(self.near) else f"; {100 * self.near:.0f} % of the disagreement is between near classes"
+            ""
+            if math.isnan(self.near)
+            else f"; {100 * self.near:.0f} % of the disagreement is between classes of near meaning"
         )
         return f"by meaning: alpha {self.alpha.text()}{near_text}"
 

@@ -76,10 +76,10 @@ class Groupings:
 
     @property
     def text(self) -> str:
-        """'stable with 11 of 17 classes, 6.2 effective: door + curtain merged; alpha .82 (.80 to .84)', or ''."""
+        """'stable if 17 classes become 11, worth 6.2 of equal share: door + curtain; alpha .82 (.80 to .84)', or ''."""
         if (grouping := self.told) is None:
             return ""
         return (
-            f"{grouping.level} with {grouping.groups} of {self.classes} classes, {grouping.effective:.1f} effective:"
-            f" {grouping.text} merged; alpha {grouping.alpha.text()}"
+            f"{grouping.level} if {self.classes} classes become {grouping.groups}, worth {grouping.effective:.1f} of equal"
+            f" share: {grouping.text}; alpha {grouping.alpha.text()}"
         )

@@ -12,7 +12,7 @@ from semstab.report.terminal.layout import percent, wrapped
 MOST_PLACES = 3
 """Most places that are told."""
 
-WITHOUT = "VSS, SBD, entropy, flicker, classes and a verdict have no number: they are of labels"
+WITHOUT = "no VSS, SBD, entropy, flicker, classes and verdict: they need labels"
 
 
 def features_alone(features: FeatureAgreement, record: Record) -> Iterator[str]:

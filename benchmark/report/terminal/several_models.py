@@ -50,11 +50,11 @@ def miou(record: Record) -> float:
 
 
 def names_text(record: Record) -> str:
-    """Return how many names of a vocabulary are in use: '19 names, as many as 6.2 of equal size'; '' of others."""
+    """Return how many names of a vocabulary are in use: '19 names, worth 6.2 of equal share'; '' of others."""
     spots = None if record.statistics is None else record.statistics.spots
     if "@" not in record.unit.model or spots is None:
         return ""
-    return f"{record.summary.table.K} names, as many as {spots.effective_classes:.1f} of equal size"
+    return f"{record.summary.table.K} names, worth {spots.effective_classes:.1f} of equal share"
 
 
 OF_MAP = "voxels"
