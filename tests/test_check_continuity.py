@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import functools
 import os
+from dataclasses import replace
 from pathlib import Path
 
 import doctor
@@ -59,6 +60,20 @@ def test_poses_that_jump_are_refused_with_the_parts_to_fuse() -> None:
     verdict = quick_check(made, range(len(made)))
     assert verdict.state == "unsound"
     assert "--frames :15 and --frames 15:" in verdict.text
+
+
+@pytest.mark.parametrize("wrong", [(4, 11, 18), (4, 11, 18, 25)])
+def test_frames_that_do_not_fit_are_named_up_to_a_tenth_of_all(wrong) -> None:
+    """Of thirty frames three may have a wrong pose, or labels of other classes; four are too many."""
+    frames, few = doctor.scene(0), len(wrong) == 3
+    off = [replace(f, T_wc=doctor.moved(f.T_wc, (0.3, 0.0, 0.3))) if f.index in wrong else f for f in frames]
+    verdict = quick_check(doctor.Made(off), range(len(frames)))
+    assert verdict.state == ("sound" if few else "unsound")
+    assert ("4 of 30 frames do not fit" in verdict.text) is not few
+    assert sum("does not fit frames" in line for line in verdict.remarks) == 3 * few
+    renamed = [replace(f, labels=doctor.OTHERS[f.labels]) if f.index in wrong else f for f in frames]
+    said = [*doctor.said(renamed)]
+    assert sum("is it of another frame?" in line for line in said) == 3 * few
 
 
 @pytest.mark.skipif(not (DATA / "livingroom").is_dir(), reason="the real sequences are not here")
