@@ -97,6 +97,25 @@ def test_a_first_class_that_may_be_missing_is_no_remark():
     assert not [*id_remarks(maps, 255, void, maps)]
 
 
+BANDS, SHARP = [0, 0, 1, 2, 2, 255, 5, 5, 6, 7, 7], [0, 0, 2, 2, 2, 255, 5, 5, 7, 7, 7]
+
+
+@pytest.mark.parametrize(
+    ("rows", "said"),
+    [
+        ([BANDS] * 50, True),
+        ([BANDS] * 49, False),
+        ([BANDS[:5]] * 50, False),
+        ([BANDS] * 40 + [SHARP] * 20, True),
+        ([BANDS] * 40 + [SHARP] * 21, False),
+    ],
+)
+def test_bands_between_ids_are_half_of_fifty_pixels_or_more_at_the_borders_of_two_pairs_of_classes(rows, said):
+    """A border without a band has two pixels with the id of one side between ids of both."""
+    maps = [np.array([row]) for row in rows]
+    assert any("thin bands of ids" in line for line in id_remarks(maps, 255, None, maps)) is said
+
+
 def test_every_hypothesis_has_maps_of_the_shape_of_the_given_ones(frames):
     views = [View.of(frame, 500) for frame in frames[:5]]
     run = LabelRun([LabelledFrame(view, (), view.labels) for view in views])
