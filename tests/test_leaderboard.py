@@ -332,6 +332,15 @@ def test_a_file_holds_one_model_with_its_card(home, tmp_path) -> None:
     assert "card.yaml: unknown setting 'naem'; did you mean 'name'?" in line
 
 
+def test_cubes_of_twice_the_edge_hold_the_spots_of_eight(home) -> None:
+    spots = load_benchmark(home / "walls@1.yaml").geometry["one"]
+    rows = ((-1, 0, 2, 0, 9, 5), (-2, 1, 3, 0, 4, 3), (0, 0, 2, 0, 7, 6), (-1, 0, 2, 1, 8, 2))
+    large = dataclasses.replace(spots, edge=0.5, rows=rows).coarsened()
+    assert large.edge == 1.0
+    assert sorted(large.rows) == [(-1, 0, 1, 0, 13, 8), (-1, 0, 1, 1, 8, 2), (0, 0, 1, 0, 7, 6)]
+    assert large.needed == 16
+
+
 # --- The table --------------------------------------------------------------------------------------------------------
 
 

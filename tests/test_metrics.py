@@ -404,4 +404,4 @@ def test_maps_whose_voxels_have_more_places_than_keys_are_refused():
     _, keys = voxel_keys(np.zeros((1, 3), np.int32), last)
     assert keys.tolist() == [side * side * (side - 1) - 1]
     with pytest.raises(DataError, match="the maps span 2097152 x 2097152 x 2097152 voxels; leave out far depth"):
-        voxel_keys(np.zeros((1, 3), np.int32), last + [0, 0, 1])
+        voxel_keys(np.zeros((1, 3), np.int32), np.full((1, 3), side - 1, np.int32))
