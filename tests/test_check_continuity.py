@@ -14,6 +14,8 @@ from command_line import bench
 from posed_writer import write_posed
 
 from semstab.check import quick_check
+from semstab.check.continuity import Neighbours
+from semstab.check.conventions import Convention
 from semstab.datasets import open_dataset
 
 DATA = Path(os.environ.get("SEMSTAB_DATA", Path(__file__).parents[1] / "../shared/data"))
@@ -53,6 +55,14 @@ def test_check_names_the_map_of_another_model_than_the_first(tmp_path) -> None:
     text = " ".join(bench("check", "--data", folder, cwd=tmp_path).stdout.split())
     assert text.count("is it of another frame?") == 1
     assert "labels of other: the map of frame 011 " in text
+
+
+@pytest.mark.parametrize(("step", "positions"), [(0.39, set()), (0.41, {9, 10, 11, 12})])
+def test_a_step_of_four_times_the_steps_around_it_is_striking(step, positions) -> None:
+    """Steps of 0.1 m, but for the one from frame 10 on."""
+    along = np.cumsum([0.0, *(step if k == 10 else 0.1 for k in range(19))])
+    frames = [replace(f, T_wc=doctor.moved(np.eye(4), (x, 0, 0))) for f, x in zip(doctor.scene(0), along, strict=False)]
+    assert Neighbours(doctor.Made(frames), range(20), None, Convention()).striking() == positions
 
 
 def test_poses_that_jump_are_refused_with_the_parts_to_fuse() -> None:
