@@ -236,6 +236,16 @@ def test_options_that_cannot_be_used_are_refused(name, options, message):
         backends.check_options(name, voxel_size=1.0, num_classes=3, **options)
 
 
+@pytest.mark.parametrize("number", [0, 2])
+def test_the_number_of_a_cuda_device_is_below_the_number_of_devices(number):
+    o3c = pytest.importorskip("open3d").core
+    with (
+        patch.object(o3c.cuda, "device_count", return_value=number),
+        pytest.raises(ConfigError, match=f"device 'CUDA:{number}': Open3D sees {number} CUDA devices here"),
+    ):
+        backends.check_options("open3d", voxel_size=1.0, num_classes=3, device=f"CUDA:{number}")
+
+
 @pytest.mark.parametrize("name", ["numpy", "numba", "open3d", "open3d-projective"])
 def test_options_are_checked_without_a_map(name):
     cls = backends.REGISTRY.load(name)

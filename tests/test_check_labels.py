@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 
 import doctor
 import numpy as np
@@ -95,6 +96,32 @@ def test_a_first_class_that_may_be_missing_is_no_remark():
     road, void = (LabelSpace("s", (name, "a", "b", "c")) for name in ("road", "void"))
     assert any("never have the first id" in line for line in id_remarks(maps, 255, road, maps))
     assert not [*id_remarks(maps, 255, void, maps)]
+
+
+@pytest.mark.parametrize(("renamed", "again"), [(range(8, 30), ""), (range(9, 20), ", and again 1 more times")])
+def test_it_is_said_how_often_ids_change(renamed, again):
+    frames = [replace(f, labels=doctor.OTHERS[f.labels]) if f.index in renamed else f for f in doctor.scene(0)]
+    (line,) = (line for line in doctor.said(frames) if "have other ids" in line)
+    assert f" on{again}: 0 becomes 3, 1 becomes 5" in line
+
+
+BANDS, SHARP = [0, 0, 1, 2, 2, 255, 5, 5, 6, 7, 7], [0, 0, 2, 2, 2, 255, 5, 5, 7, 7, 7]
+
+
+@pytest.mark.parametrize(
+    ("rows", "said"),
+    [
+        ([BANDS] * 50, True),
+        ([BANDS] * 49, False),
+        ([BANDS[:5]] * 50, False),
+        ([BANDS] * 40 + [SHARP] * 20, True),
+        ([BANDS] * 40 + [SHARP] * 21, False),
+    ],
+)
+def test_bands_between_ids_are_half_of_fifty_pixels_or_more_at_the_borders_of_two_pairs_of_classes(rows, said):
+    """A border without a band has two pixels with the id of one side between ids of both."""
+    maps = [np.array([row]) for row in rows]
+    assert any("thin bands of ids" in line for line in id_remarks(maps, 255, None, maps)) is said
 
 
 def test_every_hypothesis_has_maps_of_the_shape_of_the_given_ones(frames):

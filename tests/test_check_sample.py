@@ -47,6 +47,14 @@ def test_the_sample_is_the_part_of_the_whole_reference_that_its_hash_draws(seed,
     np.testing.assert_array_equal(found.evidence[:], expected.evidence[:])
 
 
+@pytest.mark.parametrize("one_in", [2, 8, 64])
+def test_a_sample_of_one_in_many_is_that_share_and_part_of_a_thicker_one(one_in) -> None:
+    index = np.stack(np.meshgrid(*[np.arange(-20, 20)] * 3, indexing="ij")).reshape(3, -1)
+    drawn = in_sample(index, one_in)
+    assert np.count_nonzero(drawn) == pytest.approx(index.shape[1] / one_in, rel=0.15)
+    assert in_sample(index, one_in // 2)[drawn].all()
+
+
 @pytest.mark.parametrize("most", [5, 40])
 def test_a_sample_that_becomes_too_large_is_made_thinner_and_stays_exact(most, monkeypatch) -> None:
     monkeypatch.setattr(numpy_reference, "MOST", most)

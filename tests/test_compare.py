@@ -14,12 +14,15 @@ from command_line import bench
 from posed_config import configure
 from posed_writer import write_posed
 from rich.console import Console
+from simulated_events import log_of
 
 import semstab
 from semstab.compare_runs import load_comparison, markdown
 from semstab.comparison.differences import corrected, over_scenes
 from semstab.comparison.entries import open_runs
-from semstab.comparison.pairing import pair
+from semstab.comparison.locations import worse_areas
+from semstab.comparison.pairing import Common, pair
+from semstab.comparison.voxels import Region
 from semstab.core.files import read_sealed, write_sealed
 from semstab.data.contrast import Against, Contrast, RunComparison, SceneComparison
 from semstab.data.frames import Frame, Intrinsics
@@ -119,6 +122,25 @@ def test_what_is_written_comes_back_and_every_file_is_there(runs, fault):
     assert "new against old" in page
     assert page.count("<figure") > 3
     assert "http" not in page.replace("http://www.w3.org", "").replace("https://www.w3.org", "")
+
+
+def test_a_location_is_worse_from_one_of_ten_observations_on_that_turned():
+    """Four voxels each: one of ten turns, one of eleven turns, both the other way round, and nothing changes."""
+    steady, ten, eleven = np.zeros(11, int), np.array([0] * 9 + [1, -1]), np.array([0] * 10 + [1])
+    before = [steady - (np.arange(11) == 10), steady, ten, eleven, steady]
+    after = [ten, eleven, before[0], steady, steady]
+    index = np.array([[0, 4 * group + k // 2, k % 2] for group in range(5) for k in range(4)])
+    maps = {
+        name: log_of(np.repeat(labels, 4, axis=0), index=index).table()
+        for name, labels in (("base", before), ("other", after))
+    }
+    common = Common("observations", (), (), regions=lambda: iter([Region(maps)]), shown=0.0)
+    found = worse_areas(common, 1)
+    assert (found.changes.compared, found.changes.worse, found.changes.better) == (20, 4, 4)
+    (area,) = found.areas
+    assert (area.voxels, area.loss, area.improved_alike) == (4, pytest.approx(0.2), 1)
+    assert found.changes.shown.change.tolist() == [-0.2] * 4 + [0.2] * 4
+    assert found.changes.area.tolist() == [1] * 4 + [0] * 4
 
 
 def test_the_columns_go_along_in_an_export(runs, fault, tmp_path):

@@ -167,6 +167,8 @@ def test_without_a_georeference_coordinates_are_the_scenes_which_is_said(fused, 
     cloud = laspy.read(fused / "plain.laz")
     np.testing.assert_allclose(cloud.xyz, table.centers, atol=5.1e-4)
     assert cloud.header.parse_crs() is None
+    assert b"voxels of 0.25 m, coordinates of the scene\n" in written(fused, "plain.ply", "nowhere").read_bytes()
+    assert b"voxels of 0.25 m, WGS 84 / UTM zone 15N (EPSG:32615)\n" in written(fused, "placed.ply").read_bytes()
 
 
 def test_what_is_exported_can_be_chosen(fused, table):

@@ -6,7 +6,16 @@ import zipfile
 import numpy as np
 import pytest
 
-from semstab.core.files import atomic_path, keep_only, read_arrays, read_json, write_arrays, write_json, write_text
+from semstab.core.files import (
+    atomic_path,
+    keep_only,
+    read_arrays,
+    read_json,
+    write_arrays,
+    write_json,
+    write_stack,
+    write_text,
+)
 from semstab.errors import DataError
 
 
@@ -96,6 +105,22 @@ def test_arrays_are_read_as_they_were_written_or_not_at_all(tmp_path):
     path.write_bytes(b"PK")
     assert read_arrays(path) is None
     assert read_arrays(tmp_path / "nowhere.npz") is None
+
+
+@pytest.mark.parametrize("compressed", [False, True])
+def test_a_stack_of_layers_is_the_array_that_numpy_reads(tmp_path, monkeypatch, compressed):
+    """Also one that is larger than a zip without 64-bit sizes can hold, here 100 bytes."""
+    monkeypatch.setattr(zipfile, "ZIP64_LIMIT", 100)
+    layers = np.random.default_rng(0).random((3, 8, 9))
+    write_stack(tmp_path / "a.npz", "scores", iter(layers), 3, np.dtype(np.float32), compressed)
+    with np.load(tmp_path / "a.npz") as stored:
+        assert stored["scores"].dtype == np.float32
+        np.testing.assert_array_equal(stored["scores"], layers.astype(np.float32))
+    (entry,) = zipfile.ZipFile(tmp_path / "a.npz").infolist()
+    assert (entry.compress_type == zipfile.ZIP_DEFLATED) == compressed
+    write_stack(tmp_path / "b.npz", "scores", iter(layers), 3, None, compressed)
+    with np.load(tmp_path / "b.npz") as stored:
+        np.testing.assert_array_equal(stored["scores"], layers)
 
 
 def test_json_is_read_from_no_pipe(tmp_path):

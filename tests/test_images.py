@@ -139,6 +139,16 @@ def test_labels_of_rgb_png_go_by_the_colours_of_the_classes(tmp_path, image, ids
     np.testing.assert_array_equal(labels, np.array(ids)[IDS])
 
 
+@pytest.mark.parametrize("channels", [(0, 1), (0, 2), (1, 2)])
+def test_colours_of_eight_bits_a_channel_are_told_apart(tmp_path, channels):
+    """Colours that have a bit each, in two of the three channels."""
+    colors = [tuple(1 << bit if k == channel else 0 for k in range(3)) for channel in channels for bit in range(8)]
+    space = LabelSpace("bits", tuple(f"class {k}" for k in range(16)), colors=tuple(colors))
+    image = np.array([colors, colors], np.uint8)
+    labels = read_labels(written(tmp_path / "l.png", saved(image)), space)
+    assert labels.tolist() == [[*range(16)]] * 2
+
+
 def test_a_colour_of_no_class_names_colour_pixel_and_file(tmp_path):
     image = RGB.copy()
     image[2, 5] = (1, 2, 3)

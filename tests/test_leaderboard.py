@@ -30,9 +30,9 @@ from semstab.errors import ConfigError, DataError
 from semstab.leaderboard.board import board_of, boards, tables_of
 from semstab.leaderboard.definition import load_benchmark
 from semstab.leaderboard.geometry import geometry_file, save_geometry
-from semstab.leaderboard.submission import load_submission, submissions
+from semstab.leaderboard.submission import load_submission, require_whole, submissions
 from semstab.leaderboard.sums import completed, labelled_share
-from semstab.statistics.cluster_sums import chance_of, value
+from semstab.statistics.cluster_sums import ClusterSums, chance_of, value
 from semstab.statistics.intervals import estimate, scope_of
 
 ROOT = Path(__file__).parents[1]
@@ -296,6 +296,19 @@ def test_a_run_with_other_settings_is_not_handed_in(home, tmp_path) -> None:
     )
 
 
+def test_a_run_without_ground_truth_is_whole_for_a_definition_without_accuracy_alone(home, monkeypatch) -> None:
+    handle, definition = open_run(f"{home / 'run'}:good"), load_benchmark(home / "walls@1.yaml")
+    require_whole(definition, handle)
+    monkeypatch.setattr(ClusterSums, "truth", False)
+    fails(DataError, "one has no ground truth; run it again", require_whole, definition, handle)
+    require_whole(definition.model_copy(update={"statistics": False}), handle)
+    monkeypatch.undo()
+    entry = handle.scenes["one"]
+    entry = dataclasses.replace(entry, summary=dataclasses.replace(entry.summary, statistics=None))
+    less = dataclasses.replace(handle, scenes=handle.scenes | {"one": entry})
+    fails(DataError, "one has no statistics; run it again", require_whole, definition, less)
+
+
 def test_a_file_holds_one_model_with_its_card(home, tmp_path) -> None:
     several = submissions(home / "run", tmp_path / "x.semstab")
     fails(ConfigError, r"x.semstab: the run has several models \(bad, good, same\); choose one", next, several)
@@ -314,6 +327,15 @@ def test_a_file_holds_one_model_with_its_card(home, tmp_path) -> None:
         cwd=tmp_path,
     )  # fmt: skip
     assert "card.yaml: unknown setting 'naem'; did you mean 'name'?" in line
+
+
+def test_cubes_of_twice_the_edge_hold_the_spots_of_eight(home) -> None:
+    spots = load_benchmark(home / "walls@1.yaml").geometry["one"]
+    rows = ((-1, 0, 2, 0, 9, 5), (-2, 1, 3, 0, 4, 3), (0, 0, 2, 0, 7, 6), (-1, 0, 2, 1, 8, 2))
+    large = dataclasses.replace(spots, edge=0.5, rows=rows).coarsened()
+    assert large.edge == 1.0
+    assert sorted(large.rows) == [(-1, 0, 1, 0, 13, 8), (-1, 0, 1, 1, 8, 2), (0, 0, 1, 0, 7, 6)]
+    assert large.needed == 16
 
 
 # --- The table --------------------------------------------------------------------------------------------------------

@@ -27,7 +27,7 @@ from semstab.metrics import (
     summarise,
     vss,
 )
-from semstab.metrics.agreement import COUNTS, SUMS
+from semstab.metrics.agreement import COUNTS, SUMS, voxel_keys
 from semstab.testing import JS_HALF, SEQUENCES, as_frames, checks, sight_line
 
 
@@ -395,3 +395,13 @@ def test_maps_of_other_classes_or_voxel_sizes_cannot_be_compared():
         compare(TABLE, voxel_table([1, 2, 4], np.ones((3, 5))), UNITS)
     with pytest.raises(DataError, match="cannot be compared"):
         compare(TABLE, dataclasses.replace(TABLE, voxel_size=0.4), UNITS)
+
+
+def test_maps_whose_voxels_have_more_places_than_keys_are_refused():
+    """2^21 voxels along each axis are 2^63 places, one more than keys."""
+    side = 2**21
+    last = np.array([[side - 1, side - 1, side - 2]], np.int32)
+    _, keys = voxel_keys(np.zeros((1, 3), np.int32), last)
+    assert keys.tolist() == [side * side * (side - 1) - 1]
+    with pytest.raises(DataError, match="the maps span 2097152 x 2097152 x 2097152 voxels; leave out far depth"):
+        voxel_keys(np.zeros((1, 3), np.int32), np.full((1, 3), side - 1, np.int32))

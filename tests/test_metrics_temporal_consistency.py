@@ -159,6 +159,9 @@ def test_a_pixel_is_occluded_where_the_way_back_leads_elsewhere():
     hidden = occluded(forward, backward)
     assert hidden[:, -1].all()  # leaves the image
     assert np.argwhere(hidden[:, :-1]).tolist() == [[1, 2]]
+    forward, backward = (flow.transpose(1, 0, 2)[..., ::-1] for flow in (forward, backward))  # down the image
+    np.testing.assert_array_equal(occluded(forward, backward), hidden.T)
+    np.testing.assert_array_equal(occluded(-forward, -backward)[0], True)  # leaves the image at the top
 
 
 @pytest.mark.parametrize(

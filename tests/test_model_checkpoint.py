@@ -7,6 +7,7 @@ from types import SimpleNamespace
 import httpx2 as httpx
 import huggingface_hub
 import pytest
+import torch
 import transformers
 from huggingface_hub.errors import (
     GatedRepoError,
@@ -19,6 +20,7 @@ from model_folders import tiny
 from semstab.errors import ConfigError, DataError
 from semstab.models import create
 from semstab.models.checkpoint import Checkpoint, ModelOptions
+from semstab.models.devices import checked_device
 
 
 def fails(kind, match, name="segformer", **options):
@@ -109,6 +111,21 @@ def test_a_device_that_is_not_there(folder, device):
     fails(
         ConfigError, rf"^device {device}: torch cannot use it \(.*\); use cpu$", checkpoint=str(folder), device=device
     )
+
+
+def test_a_gpu_computes_in_full_precision(monkeypatch):
+    """Reduced precision flips labels; no GPU is needed to see what is set."""
+    monkeypatch.setattr(torch, "empty", lambda *size, device: None)
+    cudnn, matmul = torch.backends.cudnn, torch.backends.cuda.matmul
+    before = cudnn.allow_tf32, matmul.allow_tf32
+    try:
+        cudnn.allow_tf32 = matmul.allow_tf32 = True
+        checked_device("cpu")
+        assert (cudnn.allow_tf32, matmul.allow_tf32) == (True, True)
+        checked_device("cuda")
+        assert (cudnn.allow_tf32, matmul.allow_tf32) == (False, False)
+    finally:
+        cudnn.allow_tf32, matmul.allow_tf32 = before
 
 
 def test_unknown_options_and_values(folder):

@@ -190,6 +190,13 @@ def test_files_and_options_that_cannot_be_used(folder, net, monkeypatch, name, o
     assert "\n" not in str(caught.value)
 
 
+def test_torch_says_nothing_of_a_program_that_cannot_be_loaded(folder, caplog):
+    (folder / "text.pt2").write_text("no network")
+    with pytest.raises(DataError, match="cannot load it as an exported program"):
+        create(str(folder / "text.pt2"), classes=CLASSES)
+    assert not caplog.records
+
+
 @pytest.mark.parametrize("scores", [True, False])
 def test_logits_that_are_no_numbers_are_named(tmp_path, net, scores):
     path = save_onnx(tmp_path / "logs.onnx", net, after=[helper.make_node("Log", ["logits"], ["logs"])], gives="logs")

@@ -20,7 +20,7 @@ from semstab.errors import ConfigError, DataError
 from semstab.exports import export
 from semstab.metrics import dominant
 from semstab.other_maps import MapAgreement
-from semstab.other_maps.placing import fused, on_surface
+from semstab.other_maps.placing import Grid, fused, on_surface
 
 CRS, OFFSET = "EPSG:32615", (576714, 5188162, 200)
 COLORS = {"wall": (128, 64, 128), "door": (70, 70, 70), "window": (0, 130, 180)}
@@ -215,6 +215,15 @@ def test_a_voxel_has_the_class_of_most_of_its_points() -> None:
     assert grid.index[:, 0].tolist() == [-1, 0, 1, 2]
     assert grid.label.tolist() == [1, 1, 0, -1]
     assert grid.rows(np.array([[2, 0, 0], [3, 0, 0], [-1, 0, 0], [0, 1, 0]])).tolist() == [3, -1, 0, -1]
+
+
+def test_a_voxel_outside_the_box_of_a_map_is_in_no_row() -> None:
+    """Each has the key of a voxel in another row of the box; of its own corners the last one is not in the map."""
+    box = np.array([(x, y, z) for x in (5, 6) for y in (-3, -2, -1) for z in (7, 8, 9, 10)][:-1], dtype=np.int32)
+    grid = Grid(box, np.zeros(len(box), np.int64), 1.0)
+    around = np.array([(x, y, z) for x in range(4, 8) for y in range(-4, 1) for z in range(6, 12)])
+    within = {tuple(index): row for row, index in enumerate(box.tolist())}
+    assert grid.rows(around).tolist() == [within.get(tuple(index), -1) for index in around.tolist()]
 
 
 def test_asprs_codes_of_a_cloud_of_another_program(folder, table, tmp_path) -> None:

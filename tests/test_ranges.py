@@ -47,9 +47,9 @@ def test_nothing_is_said_where_it_is_not_known_or_labels_are_reliable_everywhere
     assert not RangeAgreement((NEAR, MIDDLE), 0.667, *reliable).is_told
 
 
-@pytest.mark.parametrize(("twice", "said"), [(100, False), (1500, True)])
+@pytest.mark.parametrize(("twice", "said"), [(100, False), (208, False), (209, True), (1500, True)])
 def test_a_range_from_which_hardly_a_spot_was_seen_twice_has_no_alpha(twice, said) -> None:
-    """Two views at the origin: 3,000 spots at 4 to 5 m, so many of them in both; 3,000 at 20 m, all in both."""
+    """Two views at the origin: 3,000 spots at 4 to 5 m, `twice` in both, 9 beyond 5 m; 3,000 at 20 m, all in both."""
     rng, n = np.random.default_rng(0), 3000
     index = np.concatenate([np.stack([np.full(n, x), *np.divmod(np.arange(n), 60)], axis=1) for x in (16, 80)])
     labels = np.repeat(rng.integers(0, 3, 2 * n)[:, None], 2, axis=1)

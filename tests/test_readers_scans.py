@@ -19,6 +19,7 @@ from semstab.check import check_scene
 from semstab.configure import load_config, resolve
 from semstab.data.frames import Frame
 from semstab.datasets import open_dataset, recognise
+from semstab.datasets.semantickitti import LEARNING_MAP, MOVING
 from semstab.errors import ConfigError, DataError
 
 
@@ -621,3 +622,9 @@ def test_ply_files_may_hold_predictions(plys, tmp_path):
     scene = sw.opened(SCANS["points_folder, PLY"], tmp_path)
     assert (scene.models, scene.ground_truth) == (("own",), False)
     np.testing.assert_array_equal(scene.frame(1, "own").labels[0], sw.scans()[1].walls)
+
+
+def test_what_moves_is_of_the_class_of_what_stands() -> None:
+    """Car, bicyclist, person, motorcyclist, on-rails, bus, truck and other-vehicle, as the benchmark joins them."""
+    assert [LEARNING_MAP[k] for k in MOVING] == [LEARNING_MAP[k] for k in (10, 31, 30, 32, 16, 13, 18, 20)]
+    assert [*MOVING] == [*range(252, 260)]

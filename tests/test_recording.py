@@ -253,6 +253,15 @@ def test_numbered_voxels_are_in_the_tab_that_explains_them_alone(run) -> None:
             assert sum(content.endswith(f"/{model}/flips") for content in queries) == 1
 
 
+def test_the_numbers_of_voxels_are_shown_beside_them_at_all_times(run) -> None:
+    numbered = {path: rows for path, rows in read(run / "recording.rrd").items() if "/flips_at/" in path}
+    assert len(numbered) == 2
+    for (row,) in numbered.values():
+        assert row["Points3D:labels"] == [str(k + 1) for k in range(len(row["Points3D:positions"]))]
+        assert row["Points3D:show_labels"] == [True]
+        assert all(":" in column or column.startswith("rerun.") for column in row), row  # no time
+
+
 def test_every_map_is_seen_from_above(run) -> None:
     blueprints = read_blueprints(run / "recording.rrd")  # one when the run starts, one when a model is fused
     eyes = [row for rows in blueprints for row in rows if "EyeControls3D:look_target" in row]

@@ -143,6 +143,7 @@ def test_counts_add_up_and_variation_of_information_is_symmetric(previous, curre
     assert found.matched + found.births == len(set(current.ravel().tolist()) - {0})
     assert found.matched + found.deaths == len(set(previous.ravel().tolist()) - {0})
     assert found.variation_of_information == pytest.approx(back.variation_of_information)
+    assert found.variation_of_information >= 0
 
 
 @checks

@@ -15,6 +15,7 @@ from records import record, study, voxels
 
 import semstab
 from semstab.core.palette import KIND_COLORS
+from semstab.data.statistics import StabilityVerdict
 from semstab.errors import ConfigError, DataError, MissingDependencyError
 from semstab.metrics import dominant, sbd, vss
 
@@ -49,6 +50,19 @@ def test_the_summary_has_the_number_that_decides_with_its_interval_and_the_level
             [statistics.verdict.probability, alpha.value, alpha.low, alpha.high, alpha.level],
         )
         assert row["compensated_flicker_percent"] == own.image_space.compensated_flicker_percent
+
+
+def test_the_row_of_a_unit_has_the_level_of_all_pixels_with_its_probability(run):
+    summary = run.result.runs[0]
+    for verdict, said in (
+        (StabilityVerdict("stable", 0.9, ""), ("stable", 0.9)),
+        (StabilityVerdict("stable", 0.9, "", "usable", 0.92, 0.7), ("usable", 0.7)),
+    ):
+        judged = dataclasses.replace(summary, statistics=dataclasses.replace(summary.statistics, verdict=verdict))
+        assert (judged.row()["verdict"], judged.row()["probability"]) == said
+    row = dataclasses.replace(summary, statistics=None).row()
+    assert row["verdict"] == ""
+    assert np.isnan([row[name] for name in ("probability", "alpha", "alpha_low", "agreeing")]).all()
 
 
 def test_a_run_at_a_prompt_is_a_few_lines(run):

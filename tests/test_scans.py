@@ -20,6 +20,8 @@ from semstab.datasets import open_dataset
 from semstab.errors import DataError
 from semstab.metrics import compensated_flicker
 from semstab.statistics import describe
+from semstab.statistics.loops.sparse import surface
+from semstab.statistics.sampler import _sparse  # noqa: TID251
 
 
 def a_scan(**changes):
@@ -28,6 +30,27 @@ def a_scan(**changes):
         "index": 3, "points": np.ones((4, 3), np.float32), "labels": np.zeros(4, np.uint8), "T_wc": np.eye(4),
     }  # fmt: skip
     return Frame(**fields | changes)
+
+
+@pytest.mark.parametrize("around", [False, True])
+def test_points_on_a_plane_say_its_inverse_depth_and_slopes(around):
+    """Inverse depth 0.5 + 0.02 u - 0.01 v: at (4, 3) it is 0.55, with slopes 0.02 / 0.55 and -0.01 / 0.55."""
+    v, u = (axis.ravel().astype(float) for axis in np.mgrid[:7, :9])
+    grid, w = np.arange(63, dtype=np.int32).reshape(7, 9), 0.5 + 0.02 * u - 0.01 * v
+    there, residual, nearest, squared, along_x, along_y = surface(grid, u, v, w, 4.0, 3.0, 2, around)
+    assert (there, along_x, along_y) == pytest.approx((0.55, 0.02 / 0.55, -0.01 / 0.55))
+    assert (nearest, squared, residual) == (3 * 9 + 4, 0, pytest.approx(0, abs=1e-6))
+    few = np.where(np.isin(grid, grid[3, 3:6]), grid, -1).astype(np.int32)
+    assert surface(few, u, v, w, 4.0, 3.0, 2, around)[:2] == (0, 0)
+
+
+@pytest.mark.parametrize(("every", "reach"), [(2, 3), (5, 6), (40, 12)])
+def test_neighbours_of_sparse_points_are_looked_for_as_far_as_points_are_apart(every, reach):
+    """Pixels of an image of 400 x 400, one in every row and column of some; by 1.1 times their spacing, at most 12."""
+    depth = np.zeros((400, 400), np.float32)
+    depth[::every, ::every] = 5
+    frame = Frame(0, depth, Intrinsics(200, 200, 200, 200), np.eye(4), labels=np.zeros((400, 400), np.uint8))
+    assert _sparse(frame, 3).reach == reach
 
 
 REFUSED = {

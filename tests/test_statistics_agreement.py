@@ -65,6 +65,14 @@ def test_psa_is_the_mean_over_pairs_of_frames(T):
     np.testing.assert_allclose(psa(log_of_evidence(evidence).table()), [by_pairs(e) for e in evidence])
 
 
+def test_psa_of_frames_without_a_common_class_is_zero_and_not_below():
+    evidence = np.zeros((500, 2, 8))
+    evidence[:, 0, :4], evidence[:, 1, 4:] = np.random.default_rng(0).dirichlet(np.ones(4), (2, 500))
+    found = psa(log_of_evidence(evidence).table())
+    assert found.min() == 0
+    assert found.max() < 1e-6
+
+
 def test_psa_has_the_same_expectation_for_every_number_of_frames_and_vss_has_not():
     rng = np.random.default_rng(1)
     pi = np.array([0.6, 0.3, 0.1])

@@ -10,6 +10,7 @@ import pytest
 from street import DRIVES, Street
 
 from semstab.data.frames import Frame, Intrinsics
+from semstab.data.statistics.moving import MisplacedFrame, poses_that_do_not_fit
 from semstab.statistics import Sampler, SpotObservations
 from semstab.statistics.moving import moving_percent, static_spots
 from semstab.statistics.votes import MOST_KEPT, SpotVotes, next_to_moved
@@ -108,6 +109,15 @@ def test_frames_with_wrong_poses_are_named_and_do_not_look_like_movers() -> None
     assert not spots.moved.any()
     assert (votes.through_of_view[10:13] > 0.1).all()
     assert (np.delete(votes.through_of_view, wrong) < 0.1).all()
+
+
+def test_six_stretches_of_frames_are_named_and_the_others_counted() -> None:
+    misplaced = [MisplacedFrame(k, f"{k:03d}", 0.5) for k in (0, 1, 4, 6, 8, 10, 12, 14)]
+    expected = "poses of frames 000 to 001, 004, 006, 008, 010, 012 do not fit: 50 % of their spots are seen through"
+    assert poses_that_do_not_fit(misplaced[:-1]) == expected
+    assert "008, 010, 012 and 1 more do not fit" in poses_that_do_not_fit(misplaced)
+    assert poses_that_do_not_fit(misplaced[2:3]).startswith("the pose of frame 004 does not fit: 50 % of its")
+    assert poses_that_do_not_fit([]) == ""
 
 
 def test_votes_change_neither_spots_nor_answers() -> None:

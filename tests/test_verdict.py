@@ -15,7 +15,7 @@ from semstab.data.statistics import UNKNOWN, HeadlineStatistics, Interval, Label
 from semstab.statistics import describe
 from semstab.statistics.intervals import probability_above
 from semstab.statistics.silence import silence
-from semstab.statistics.verdict import holds_all_levels, level_probabilities, verdict, why_undecided
+from semstab.statistics.verdict import LEAST_CLASSES, holds_all_levels, level_probabilities, verdict, why_undecided
 
 SPOTS = SpotAgreement(0.1, 1000, 100, 20, 20, 0.5, "road", 0.6, 1.0, (), None, 1.0, 1.0)
 
@@ -32,6 +32,11 @@ def judged(alpha, **spots):
 ])  # fmt: skip
 def test_an_interval_that_holds_both_limits_is_undecided(alpha, level):
     assert judged(alpha).level == level
+
+
+def test_spots_with_fewer_effective_classes_than_are_needed_are_uninformative():
+    assert judged((0.87, 0.83, 0.90), chance=1 / LEAST_CLASSES).level == "stable"
+    assert judged((0.87, 0.83, 0.90), chance=1.001 / LEAST_CLASSES).level == "uninformative"
 
 
 def test_the_reason_why_nothing_is_decided_does_not_contradict_itself():

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import json
+import shutil
 
 import cv2
 import numpy as np
@@ -264,6 +265,17 @@ def _numbers(out):
         for name, rows in series.items()
     }
     return runs, timeless, tables
+
+
+def test_truth_of_unknown_classes_is_left_out_and_named(tmp_path, caplog) -> None:
+    folder = write(tmp_path / "clip")
+    shutil.copytree(folder / "labels/right", folder / "labels/gt")
+    known = open_dataset("video", {"root": folder, "classes": CLASSES}).scene("clip")
+    assert known.ground_truth
+    assert not caplog.records
+    unknown = open_dataset("video", {"root": folder}).scene("clip")
+    assert not unknown.ground_truth
+    assert "clip: the classes of gt are not known, so it is not read" in caplog.text
 
 
 def test_a_killed_run_goes_on_with_the_next_video(tmp_path, monkeypatch) -> None:

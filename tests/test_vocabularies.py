@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+from unittest.mock import patch
 
 import numpy as np
 import pytest
@@ -13,6 +14,8 @@ from room_scene import CLASSES, Room, walk, write
 import semstab
 from semstab.core.files import write_image
 from semstab.data.features import Features
+from semstab.datasets import open_dataset
+from semstab.datasets.posed_folder import PosedFolder
 from semstab.errors import ConfigError, DataError
 from semstab.predict.vocabulary import Vocabulary, named
 from semstab.statistics.accumulate import sums_of_spots
@@ -42,6 +45,16 @@ def room(folder, model="net", frames=12, noise=0.7):
         values = cells + noise * rng.normal(size=cells.shape)
         np.save(folder / f"features/{model}/{i:03d}.npy", values.astype(np.float32))
     return folder
+
+
+def test_predictions_of_the_dataset_below_go_to_the_folder_of_the_run(tmp_path):
+    below = {"name": "posed_folder", "options": {"root": str(room(tmp_path / "room"))}}
+    options = {"dataset": below, "vocabularies": [str(vocabulary(tmp_path))]}
+    dataset = open_dataset("vocabularies", options, tmp_path / "run")
+    (scene,) = dataset.scenes
+    with patch.object(PosedFolder, "scene", autospec=True, side_effect=PosedFolder.scene) as opened:
+        dataset.scene(scene)
+    assert opened.call_args.args[0].run_folder == tmp_path / "run"
 
 
 def test_a_cell_has_the_likeliest_name(tmp_path):

@@ -279,7 +279,7 @@ def gives_features_alone(statistics: MapStatistics | None) -> bool:
     return features is not None and features.alone
 
 
-def handle_of(result: Result, model: str, source: Path | None = None, *, features: bool = False) -> RunHandle:
+def handle_of(result: Result, model: str, source: Path | None = None, *, features: bool) -> RunHandle:
     """Return one label source of a run, at the base settings and backend; `source` is its folder, if it has one.
 
     Raises:

@@ -63,12 +63,13 @@ class Changed:
         again = (base.op[rows[0]] >= 2) & (other.op[rows[1]] >= 2)
         base, other = (table.rows(table_rows[again]) for table, table_rows in zip((base, other), rows, strict=True))
         between = [disagreement(table)[1] for table in (base, other)]
+        change = (between[0] - between[1]).round(9)  # one of ten that turned is WORSE, whatever the last digit is
         true = right = None
         if truth is not None:
             true = join_truth(base, truth).label
             gained = (dominant(other) == true).astype(int) - (dominant(base) == true)
             right = np.where(true >= 0, gained, 0).astype(np.int64)
-        return cls(base, between[0] - between[1], joint_class((base, other)), true, right)
+        return cls(base, change, joint_class((base, other)), true, right)
 
     @property
     def matters(self) -> Mask:
