@@ -79,7 +79,8 @@ class Groupings:
         """'stable if 17 classes become 11, worth 6.2 of equal share: door + curtain; alpha .82 (.80 to .84)', or ''."""
         if (grouping := self.told) is None:
             return ""
+        worth = f"worth {grouping.effective:.1f} of equal share"
         return (
-            f"{grouping.level} if {self.classes} classes become {grouping.groups}, worth {grouping.effective:.1f} of equal"
-            f" share: {grouping.text}; alpha {grouping.alpha.text()}"
+            f"{grouping.level} if {self.classes} classes become {grouping.groups}, {worth}: {grouping.text}; alpha"
+            f" {grouping.alpha.text()}"
         )
