@@ -343,13 +343,13 @@ class SpotVotes:
 
     @property
     def false_share(self) -> float:
-        """Share of the known spots that errors alone call moved, if they meet views independently.
+        """Share of the spots known by votes that errors alone call moved, if they meet views independently.
 
         Of n votes, r see through the spot with the probability b(r; n, q), where q is `false_rate`.
         """
         from scipy import special
 
-        n, count = np.unique(self.votes[self.known], return_counts=True)
+        n, count = np.unique(self.votes[self.known & ~self.next_to], return_counts=True)
         if not len(n):
             return math.nan
         least = np.maximum(LEAST_THROUGH, np.floor(SHARE_THROUGH * n + 1e-9) + 1)
