@@ -26,7 +26,8 @@ from scipy.spatial.transform import Rotation
 import semstab
 from semstab import backends
 from semstab.comparison import voxels as common_voxels
-from semstab.comparison.differences import find
+from semstab.comparison.differences import differences_of
+from semstab.comparison.entries import open_compared
 from semstab.core.json_form import to_json
 from semstab.data import voxels
 from semstab.data.frames import Frame, Intrinsics
@@ -344,7 +345,7 @@ def assert_same_comparison(whole, tiles) -> None:
     """Of two label sources of a run: numbers, places that got worse, and what changed in each voxel."""
     said, columns = [], []
     for run in (whole, tiles):
-        found = find([f"{run}:a", f"{run}:b"])
+        found = differences_of(open_compared([f"{run}:a", f"{run}:b"]))
         said.append(json.loads(json.dumps(to_json(found.result))))
         parts = list(found.changes["wall", "b"].parts())
         together = {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}

@@ -81,47 +81,23 @@ def finish(live: LiveMap, stream: Stream, watch: Stopwatch) -> Work:
     """
     work, config, tile, files = live.work, live.config, live.work.tile, Files(live.work.start)
     fused = _fused_map(live, watch) if work.fuses else None
-    observations, sums, sample, analysis = live.sampled_observations(), dict[str, Float64](), None, None
-    features = live.sampled_features()
+    observations, features = live.sampled_observations(), live.sampled_features()
     with contextlib.closing(live.background), contextlib.closing(Background("semstab-files", 1)) as writer:
         if fused is not None and tile is None and not len(fused.table):
             raise no_voxels(live.task, config)
         if fused is not None and not config.statistics:  # else columns of the statistics go along
             writer.submit(partial(files.write, _map_savers(live, fused, None)))
         with watch("statistics"):
-            if fused is not None and work.unit.assessed:
-                log = fused.events if config.statistics else None
-                sample = MapSample.draw(fused.table, log, fused.truth, edges=config.strata)
-            if not work.unit.fuses:
-                sums = TableSums.nothing(len(live.task.mapping.target), config.strata).arrays()
-            elif fused is not None:
-                sums = (TableSums.of(fused.table, config.strata) if sample is None else sample.summary).arrays()
+            sample = _sample(live, fused)
+            analysis = None
             if sample is not None and tile is None:
                 analysis = analyse_sample(live.task, config, sample, observations, features)
             trim_malloc(least=SMALL if tile is None else 0)
-        result = TileResult(
-            {},
-            None if fused is None or fused.checked is None else fused.checked.result(),
-            _quality(stream),
-            live.origin,
-            None if stream.video is None else stream.video.result(),
-            series=live.rows.numbers,
-            sums=sums,
-            reduced=np.zeros(0) if fused is None else fused.reduced,
-            image=np.zeros((0, 0)) if stream.image_space is None else stream.image_space.rows.table(),
-            poses=stream.poses,
-            seen=np.concatenate([np.zeros((0, 3), np.int32), *live.tiles]),
-        )
-        record, of_frames = None, OfFrames({} if analysis is None else analysis.of_frames())
+        result = _result(live, stream, fused, sample)
+        record, of_frames = None, OfFrames()
         if tile is None:
             with watch("measure"):
-                record = record_of(work.unit, live.task, live.rows, result, analysis)
-                if work.unit.image_space:
-                    points = np.zeros((0, 3)) if fused is None else fused.table
-                    record = in_image_space(record, live.task, result, points)
-                if stream.pixels is not None:
-                    pixels, of_frames = pixel_statistics(live.task, stream.pixels)
-                    record = replace(record, pixels=pixels)
+                record, of_frames = _record(live, stream, fused, result, analysis)
         with watch("write"):
             writer.drain()
             files.write(_savers(live, stream, fused, observations, features, sample, analysis, of_frames))
@@ -131,9 +107,54 @@ def finish(live: LiveMap, stream: Stream, watch: Stopwatch) -> Work:
                 files.write({f"{tile.folder}/{tile.name}.npz": replace(result, files={**files.digests}).save})
     if record is None:
         return replace(work, files=files.returned)
-    record = replace(record, files=files.digests)
     table = fused.table if fused is not None and work.watched else None
-    return replace(work, record=record, files=files.returned, table=table)
+    return replace(work, record=replace(record, files=files.digests), files=files.returned, table=table)
+
+
+def _sample(live: LiveMap, fused: FusedMap | None) -> MapSample | None:
+    """Return the sample of a map that its statistics are of; None without a map or statistics."""
+    if fused is None or not live.work.unit.assessed:
+        return None
+    log = fused.events if live.config.statistics else None
+    return MapSample.draw(fused.table, log, fused.truth, edges=live.config.strata)
+
+
+def _result(live: LiveMap, stream: Stream, fused: FusedMap | None, sample: MapSample | None) -> TileResult:
+    """Return what a map, a tile or a pass over frames adds up to."""
+    sums, strata = dict[str, Float64](), live.config.strata
+    if not live.work.unit.fuses:
+        sums = TableSums.nothing(len(live.task.mapping.target), strata).arrays()
+    elif fused is not None:
+        sums = (TableSums.of(fused.table, strata) if sample is None else sample.summary).arrays()
+    return TileResult(
+        {},
+        None if fused is None or fused.checked is None else fused.checked.result(),
+        _quality(stream),
+        live.origin,
+        None if stream.video is None else stream.video.result(),
+        series=live.rows.numbers,
+        sums=sums,
+        reduced=np.zeros(0) if fused is None else fused.reduced,
+        image=np.zeros((0, 0)) if stream.image_space is None else stream.image_space.rows.table(),
+        poses=stream.poses,
+        seen=np.concatenate([np.zeros((0, 3), np.int32), *live.tiles]),
+    )
+
+
+def _record(
+    live: LiveMap, stream: Stream, fused: FusedMap | None, result: TileResult, analysis: Analysis | None
+) -> tuple[Record, OfFrames]:
+    """Return the record of a unit, and how often each of its frames stands alone."""
+    unit = live.work.unit
+    record = record_of(unit, live.task, live.rows, result, analysis)
+    of_frames = OfFrames({} if analysis is None else analysis.of_frames())
+    if unit.image_space:
+        points = np.zeros((0, 3)) if fused is None else fused.table
+        record = in_image_space(record, live.task, result, points)
+    if stream.pixels is not None:
+        pixels, of_frames = pixel_statistics(live.task, stream.pixels)
+        record = replace(record, pixels=pixels)
+    return record, of_frames
 
 
 class FusedMap(NamedTuple):
