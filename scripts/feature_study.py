@@ -18,6 +18,7 @@ scene:
     classes, meaning        of the classifier as a vocabulary; by the distances of its weights
     groups, _low, _high     of the vocabulary of groups
     named                   names of that vocabulary that have a label anywhere
+    verdict                 of the network's labels
     level, kept, classes_seen, effective, merged
                             the finest groups on which views agree, of the classes with a label: stable, else usable
 """
@@ -29,6 +30,7 @@ import math
 import shlex
 import subprocess
 import sys
+from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -115,6 +117,7 @@ def _row(data: str, scene: str, network: str, of: Mapping[tuple[str, str], Recor
         "meaning": classes.spots.meaning.alpha.value if classes.spots and classes.spots.meaning else math.nan,
         **_interval("groups", groups.headline.alpha),
         "named": groups.groupings.classes if groups.groupings else 1,
+        "verdict": own.verdict.level,
         "level": kept.level if kept else "", "kept": kept.groups if kept else math.nan,
         "classes_seen": own.groupings.classes if own.groupings else 1,
         "effective": kept.effective if kept else math.nan, "merged": kept.text if kept else "",
@@ -159,7 +162,8 @@ def tables(rows: Rows, accuracy: Mapping[tuple[str, str], Mapping[str, Any]]) ->
         "streets, means": streets_table(grid),
         "differences on streets": differences_table(grid),
         "correlations on streets": correlations_table(grid),
-        "distinctions that hold": kept_table(rows),
+        "distinctions that hold in the room": kept_table(room),
+        "distinctions that hold on streets": kept_on_streets(of_streets),
     }
 
 
@@ -168,10 +172,10 @@ COLUMNS = {"feature_alpha": "features", "alpha": "labels", "meaning": "by meanin
 
 def room_table(rows: Rows) -> list[str]:
     """Return the networks of the room, with intervals."""
-    lines = head(["network", *COLUMNS.values(), "mean cosine at a spot, of any two"])
+    lines = head(["network", *COLUMNS.values()])
     for each in rows:
         cells = [plain(each["meaning"]) if name == "meaning" else _with_ends(each, name) for name in COLUMNS]
-        lines.append(row([each["network"], *cells, f"{plain(each['cosine'])}, {plain(each['chance'])}"]))
+        lines.append(row([each["network"], *cells]))
     return lines
 
 
@@ -190,7 +194,7 @@ def streets_table(grid: Grid) -> list[str]:
 
 def differences_table(grid: Grid) -> list[str]:
     """Return by how much alpha of features, by meaning and of groups exceeds alpha of labels."""
-    lines, labels = head(["minus alpha of labels", "mean", "in so much of networks and streets"]), grid.of("alpha")
+    lines, labels = head(["minus alpha of labels", "mean", "share of networks and streets"]), grid.of("alpha")
     for name, title in COLUMNS.items():
         if name != "alpha":
             share = float((grid.of(name) > labels).mean())
@@ -224,23 +228,27 @@ def _text(found: tuple[float, float, float]) -> str:
 
 
 def kept_table(rows: Rows) -> list[str]:
-    """Return the finest groups of classes on which views agree, by network of the room, and counts on streets."""
-    lines = head(["network", "labels", "holds", "merged"])
+    """Return the finest groups of classes on which views agree, by network of the room."""
+    lines = head(["network", "labels", "verdict", "groups that hold", "merged"])
     for each in rows:
-        if each["data"] == "livingroom":
-            holds = f"{each['level']}: {each['kept']:.0f} of {each['classes_seen']:.0f}" if each["level"] else "nothing"
-            lines.append(row([each["network"], plain(each["alpha"]), holds, each["merged"] or "-"]))
-    for network in dict.fromkeys(each["network"] for each in rows if each["data"] == "streets"):
-        own = [each for each in rows if each["data"] == "streets" and each["network"] == network]
-        counts = [sum(each["level"] == level for each in own) for level in ("stable", "usable", "")]
-        pairs: dict[str, int] = {}
-        for each in own:
-            for group in filter(None, each["merged"].split(", ")):
-                pairs[group] = pairs.get(group, 0) + 1
-        most = sorted(pairs, key=lambda group: (-pairs[group], group))[:3]
-        often = ", ".join(f"{group} ({pairs[group]})" for group in most)
-        mean = float(np.nanmean([each["alpha"] for each in own]))
-        lines.append(row([network, plain(mean), "stable {} streets, usable {}, nothing {}".format(*counts), often]))
+        holds = f"{each['level']}: {each['kept']:.0f} of {each['classes_seen']:.0f}" if each["level"] else "-"
+        lines.append(row([each["network"], plain(each["alpha"]), each["verdict"], holds, each["merged"] or "-"]))
+    return lines
+
+
+def kept_on_streets(rows: Rows) -> list[str]:
+    """Return on how many streets all classes hold, or groups of them, and which classes are merged most often."""
+    lines = head(["network", "labels", "all classes", "stable groups", "usable groups", "neither", "merged most often"])
+    for network in dict.fromkeys(each["network"] for each in rows):
+        of_network = [each for each in rows if each["network"] == network]
+        levels = ["all" if each["verdict"] == "stable" else each["level"] for each in of_network]
+        merged = Counter(group for each in of_network for group in filter(None, each["merged"].split(", ")))
+        often = ", ".join(
+            f"{group} ({n})" for group, n in sorted(merged.items(), key=lambda item: (-item[1], item))[:1]
+        )
+        alpha = float(np.nanmean([each["alpha"] for each in of_network]))
+        counts = (str(levels.count(level)) for level in ("all", "stable", "usable", ""))
+        lines.append(row([network, plain(alpha), *counts, often or "-"]))
     return lines
 
 
