@@ -165,7 +165,7 @@ def verdict(
         f"two views see the same class at {same:.0%} of the spots",
     ]
     if static is not None:
-        parts.append(f"alpha of all spots {of_all_spots.value:.2f}, of which {static.moved:.1%} moved")
+        parts.append(f"alpha of all spots {short(of_all_spots.value)}, of which {static.moved:.1%} moved")
     if level == "uninformative":
         parts.insert(0, f"{spots.largest_share:.0%} of the observations are {spots.largest_class}")
     if not math.isnan(wrong.low):
@@ -222,12 +222,12 @@ def _for(basis: Interval) -> str:
 
 
 def _alpha(alpha: Interval, spots: SpotAgreement, name: str = "alpha") -> str:
-    """Return 'alpha 0.71 (0.69 to 0.73), probably unstable: car (98%)'."""
+    """Return 'alpha .71 (.69 to .73), probably unstable: car (98%)'."""
     chance = ", no better than chance" if alpha.value < 0 else ""
     unstable = [row for row in spots.critical_classes[:3] if row.unstable >= PROBABLE]
     names_text = ", ".join(f"{row.name} ({row.unstable:.0%})" for row in unstable)
     classes = f", probably unstable: {names_text}" if names_text else ""
-    return f"{name} {alpha.value:.2f} ({alpha.low:.2f} to {alpha.high:.2f}){chance}{classes}"
+    return f"{name} {alpha.text()}{chance}{classes}"
 
 
 def _flips(flips: Flipping) -> list[str]:

@@ -80,6 +80,6 @@ class Groupings:
         if (grouping := self.told) is None:
             return ""
         return (
-            f"{grouping.level} if {self.classes} classes become {grouping.groups}, worth {grouping.effective:.1f} of equal"
-            f" share: {grouping.text}; alpha {grouping.alpha.text()}"
+            f"{grouping.level} if {self.classes} classes become {grouping.groups}, worth {grouping.effective:.1f} of"
+            f" equal share: {grouping.text}; alpha {grouping.alpha.text()}"
         )
