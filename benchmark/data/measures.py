@@ -72,11 +72,11 @@ def by_chunk(formula: Callable[[Rows], Values]) -> Callable[[Beliefs], Values]:
     """Return a formula of voxels, computed without dense evidence of all of them."""
 
     @functools.wraps(formula)
-    def of(table: Beliefs) -> Values:
+    def of_table(table: Beliefs) -> Values:
         values: Values = np.concatenate([formula(rows) for rows in chunks(table)])  # type: ignore[assignment]
         return values
 
-    return of
+    return of_table
 
 
 def whole(formula: Callable[[Beliefs], Values]) -> Callable[[Beliefs], Values]:
@@ -93,13 +93,13 @@ def by_row(
     def decorate(formula: Callable[[Rows], Values]) -> Callable[[Beliefs], Values]:
         @whole
         @functools.wraps(formula)
-        def of(table: Beliefs) -> Values:
+        def of_table(table: Beliefs) -> Values:
             evidence = table.evidence
             if isinstance(evidence, Evidence):
                 return of_concentration(evidence.concentration)
             return formula(Rows(table.op, evidence, table.drift_sum))
 
-        return of
+        return of_table
 
     return decorate
 

@@ -66,7 +66,7 @@ class Belief:
             if name not in CATEGORIES:
                 raise ConfigError(f"no category '{name}'; {nearest(name, CATEGORIES)}")
 
-    def of(self, table: VoxelTable) -> Mask:
+    def mask(self, table: VoxelTable) -> Mask:
         """Return a mask (n,) of the voxels that meet the criteria."""
         believed = table.op >= max(self.min_op, 1)
         if self.min_psa > 0:
@@ -93,7 +93,7 @@ class FusedLabels:
             lambda tile: VoxelLookup(self._tiles[tile]), lambda lookup: len(lookup.table), AT_HAND
         )
 
-    def of(self, frame: Frame, pixel_stride: int = 1) -> Int64:
+    def labels_of(self, frame: Frame, pixel_stride: int = 1) -> Int64:
         """Return (H, W) rows 0..K-1 of the map's classes, UNSEEN or UNSTABLE, whatever the frame's own labels are.
 
         The frame is one of those that were fused, with every pixel_stride-th pixel of each axis.
@@ -117,7 +117,7 @@ class FusedLabels:
         voxels = rows_of(lookup.table, rows)
         if vote is not None:
             voxels = _without(vote, lookup, voxels, rows)
-        label = np.where(self._belief.of(voxels), dominant(voxels), UNSTABLE)
+        label = np.where(self._belief.mask(voxels), dominant(voxels), UNSTABLE)
         labels = np.full(len(points), UNSEEN)
         labels[met] = label[inverse]
         return labels

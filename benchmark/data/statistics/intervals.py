@@ -32,7 +32,7 @@ class Estimate:
         return Estimate(100 * self.value, 100 * self.low, 100 * self.high, level=self.level)
 
     @property
-    def of(self) -> str:
+    def interval_name(self) -> str:
         """The interval's name in print, '95 % CI'."""
         return f"{100 * self.level:g} % CI"
 

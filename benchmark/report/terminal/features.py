@@ -18,7 +18,7 @@ WITHOUT = "no VSS, SBD, entropy, flicker, classes and verdict: they need labels"
 def features_alone(features: FeatureAgreement, record: Record) -> Iterator[str]:
     """Yield alpha of features, by range, time and angle, the frames that stand out, and the worst places."""
     alpha = features.alpha
-    ends = "" if math.isnan(alpha.low) else f" ({alpha.of} {short(alpha.low)} to {short(alpha.high)})"
+    ends = "" if math.isnan(alpha.low) else f" ({alpha.interval_name} {short(alpha.low)} to {short(alpha.high)})"
     yield f"  FEATURES    alpha {short(alpha.value)}{ends}    {features.components} components"
     fraction = f", 1 in {features.one_in} kept" if features.one_in > 1 else ""
     yield from wrapped(
