@@ -271,7 +271,7 @@ MARGIN = Measure(key="margin", title="Margin", short="M", better="higher", of=ma
 RESERVED = frozenset((
     "K", "accuracy", "advice", "alpha", "alpha_by_meaning", "backend", "categories", "checked", "classes",
     "compensated_flicker_percent", "confused_with", "coverage", "ece", "entropy_between", "entropy_op2",
-    "entropy_within",
+    "entropy_within", "feature_alpha",
     "evidence", "files", "flicker_percent", "frames", "frames_empty", "frames_left_out", "fuse_ms_per_frame",
     "image_space", "input", "iou", "key", "label", "left_out", "mean_op", "means", "miou", "model", "name", "notes",
     "observation_accuracy", "observations", "op", "pixels", "points", "precision", "psa", "quality", "recurrent",

@@ -63,7 +63,7 @@ LEAST_VOTES = 2
 
 NEXT_TO, LEAST_NEXT_TO = 1.5, 2
 """An unknown spot moved if LEAST_NEXT_TO spots or more within NEXT_TO spacings of spots moved, and half of those there
-that are known: most such spots lie at an edge of the depth of a thing that moved, where no view tells."""
+that are known: most such spots lie at an edge of the depth of a thing that moved: no view tells there."""
 
 OF_SPOTS = ("seen", "hidden", "through", "next_to")
 """Votes on each spot, and whether it is next to spots that moved, by name."""
