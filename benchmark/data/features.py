@@ -78,7 +78,7 @@ class Features:
         inside = (column >= 0) & (column < w) & (row >= 0) & (row < h)
         return np.where(inside, row * w + column, -1).astype(np.int64)
 
-    def vectors_at(self, cell: Int64) -> npt.NDArray[np.floating[Any]]:
+    def at(self, cell: Int64) -> npt.NDArray[np.floating[Any]]:
         """Return the vectors (n, D) of cells (n,)."""
         return self.vectors.reshape(-1, self.D)[cell]
 

@@ -66,7 +66,7 @@ class Belief:
             if name not in CATEGORIES:
                 raise ConfigError(f"no category '{name}'; {nearest(name, CATEGORIES)}")
 
-    def mask(self, table: VoxelTable) -> Mask:
+    def of(self, table: VoxelTable) -> Mask:
         """Return a mask (n,) of the voxels that meet the criteria."""
         believed = table.op >= max(self.min_op, 1)
         if self.min_psa > 0:
@@ -117,7 +117,7 @@ class FusedLabels:
         voxels = rows_of(lookup.table, rows)
         if vote is not None:
             voxels = _without(vote, lookup, voxels, rows)
-        label = np.where(self._belief.mask(voxels), dominant(voxels), UNSTABLE)
+        label = np.where(self._belief.of(voxels), dominant(voxels), UNSTABLE)
         labels = np.full(len(points), UNSEEN)
         labels[met] = label[inverse]
         return labels

@@ -101,7 +101,7 @@ class FeatureStore:
         self._spot[new_rows], self._view[new_rows], self._vectors[new_rows] = (
             spot[rows],
             view,
-            features.vectors_at(cell[rows]),
+            features.at(cell[rows]),
         )
         self._count = end
         while self._count > self.most and self.share > 1:
