@@ -29,7 +29,8 @@ from semstab.data.statistics import Estimate
 from semstab.errors import ConfigError
 from semstab.exports.area_pictures import area_pictures
 from semstab.report.charts import dot_chart, sample
-from semstab.report.comparison.tables import IN_CLASSES, heading, scopes, sentences, tables, top_frames
+from semstab.report.comparison.sentences import sentences
+from semstab.report.comparison.tables import IN_CLASSES, heading, scopes, tables, top_frames
 from semstab.report.figures.located import metres
 from semstab.report.figures.maps import Panel, draw_changes
 from semstab.report.figures.style import Figure

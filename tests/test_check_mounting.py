@@ -37,7 +37,7 @@ def planted(of, **values):
     for name, value in values.items():
         change[{"fx": FX, "fy": FY, "right": 5, "down": 6, "forward": 7}[name]] = value
     made = MountingChange(change, np.zeros((ALL, ALL)))
-    return of.of({at: made.of(view) for at, view in of.views.items()})
+    return of.with_views({at: made.applied_to(view) for at, view in of.views.items()})
 
 
 def said(of):
@@ -88,7 +88,7 @@ def test_nothing_else_is_taken_for_it(plant):
 
 def test_few_points_and_data_that_are_refuted_already_tell_nothing():
     made = sample(11, doctor.with_fy(1.05))
-    few = made.of({at: doctor.replace(view, u=view.u[:9], v=view.v[:9]) for at, view in made.views.items()})
+    few = made.with_views({at: doctor.replace(view, u=view.u[:9], v=view.v[:9]) for at, view in made.views.items()})
     assert with_mounting(SOUND, few) == SOUND
     other = Verdict("unsound", "x", mend=("dataset.options.depth_scale: 1000",))
     assert with_mounting(other, made) == other

@@ -29,7 +29,8 @@ from semstab.data.frames import Frame, Intrinsics
 from semstab.data.georeference import Georeference
 from semstab.data.statistics import Interval
 from semstab.errors import ConfigError, DataError
-from semstab.report.comparison.tables import print_comparison, sentences
+from semstab.report.comparison.screen import print_comparison
+from semstab.report.comparison.sentences import sentences
 
 FAULTY = (2, 5, 8)
 CLASSES = ["wall", "door", "window", "floor"]
@@ -220,6 +221,25 @@ def test_a_terminal_of_80_columns_and_markdown_hold_it(fault):
     page = markdown(fault)
     assert page.startswith("## new against old\n")
     assert "| Measure | old | new |" in page
+
+
+def test_of_several_scenes_the_screen_shows_the_differences_over_all_and_verbose_each(fault):
+    (scene,) = fault.scenes
+    both = (dataclasses.replace(scene, scene="one"), dataclasses.replace(scene, scene="two"))
+    several = dataclasses.replace(fault, scenes=both)
+    brief, full = StringIO(), StringIO()
+    print_comparison(several, Console(file=brief, width=80))
+    print_comparison(several, Console(file=full, width=80), verbose=True)
+    assert sum(line.startswith(" Alpha  ") for line in brief.getvalue().splitlines()) == 1
+    assert "the largest is" not in brief.getvalue()
+    assert "in one (4 areas whose frames agree less; 1 area that is wrong now), two (4 areas" in " ".join(
+        brief.getvalue().split()
+    )
+    assert sum(line.startswith(" Alpha  ") for line in full.getvalue().splitlines()) == 3
+    assert full.getvalue().count("the largest is") == sum(
+        any(area.what == what for area in scene.against[0].areas) for _ in both for what in ("agreement", "truth")
+    )
+    assert " 0." not in brief.getvalue().split("Differences")[1]
 
 
 def renamed(scene: SceneComparison, overall: tuple[Against, ...]) -> SceneComparison:

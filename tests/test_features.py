@@ -490,7 +490,7 @@ def test_features_of_one_network_at_two_settings_are_compared(runs_of_features):
     assert found.difference.value == pytest.approx(noise.value - base.value)
     assert found.difference.low < found.difference.value < found.difference.high < 0
     assert f"features of noise are less stable than of base: alpha of features {found.difference.text('+')}" in said
-    assert f"{base.value:.3f} ({base.low:.3f}, {base.high:.3f})" in said
+    assert base.text(digits=3).replace(" to ", ", ") in said
     same = bench("compare", "base", "base", cwd=runs_of_features).stdout
     assert "do not differ significantly in stability" in same
     markdown = bench("compare", "base", "noise", "--markdown", cwd=runs_of_features).stdout

@@ -26,7 +26,7 @@ from semstab.cli import app
 from semstab.comparison import differences
 from semstab.comparison.entries import open_run, save_summary
 from semstab.data.measures import Measure, margin, registered, sbd
-from semstab.data.statistics import Interval
+from semstab.data.statistics import Interval, short
 from semstab.errors import ConfigError, DataError
 from semstab.gating import report as gate_report
 from semstab.gating.evaluation import LOST, bounded
@@ -535,7 +535,7 @@ def test_a_change_of_alpha_is_what_a_comparison_says_of_the_same_runs(run, quiet
     text, *_ = gate(new, base, gate_config(rules=rules[:1])).notes
     assert re.fullmatch(r"wall: the run gives no label to 1\d\.\d% of the pixels .* disagree", text)
     said = " ".join(cli("compare", base, new).output.split())
-    assert f"alpha {found.other:.3f} against {found.base:.3f}" in said
+    assert f"alpha {short(found.other, digits=3)} against {short(found.base, digits=3)}" in said
     assert (
         f"{found.base:.3f} to {found.other:.3f}, drop" in cli("gate", new, "--against", base, "--rule", rules[0]).output
     )

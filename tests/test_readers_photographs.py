@@ -38,7 +38,7 @@ def seen_at(scene, folder, size=SIZE):
     """Pixels (H, W, 2), from the corner of the first one, at which the photograph shows what the pinhole sees; K."""
     (frame, *_) = open_frames(scene, folder)
     u, v = np.meshgrid(np.arange(size[0], dtype=np.float32), np.arange(size[1], dtype=np.float32))
-    K = frame.camera.at(size[::-1])
+    K = frame.camera.intrinsics_at(size[::-1])
     found = undistorted(np.stack([u, v], axis=-1), frame.color_lens, K, size[::-1], "there")
     inside = (found[..., 0] > 1) & (found[..., 0] < size[0] - 2) & (found[..., 1] > 1) & (found[..., 1] < size[1] - 2)
     assert inside.mean() > 0.5
@@ -308,7 +308,7 @@ def test_a_real_flight_has_the_voxels_that_its_odm_project_has(brighton, tmp_pat
     frames = list(dataset.frames(dataset.folders[0]))[:6]
     poses = {f"{frame.name}.JPG": np.linalg.inv(frame.pose) for frame in frames}
     size = frames[0].camera.size
-    K = frames[0].camera.at(size[::-1])
+    K = frames[0].camera.intrinsics_at(size[::-1])
     write = {
         "metashape": lambda: ds.write_metashape_xml(tmp_path / "cameras.xml", poses, K_of(K), size),
         "pix4d": lambda: ds.write_pix4d_parameters(tmp_path / "params", poses, K_of(K), size),

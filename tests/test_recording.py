@@ -44,7 +44,7 @@ from semstab.recording import (
 )
 from semstab.recording.layout import Legend, SceneBounds, direction, fit
 from semstab.recording.timeline import Clock, log_file
-from semstab.report.ranking import answers
+from semstab.report.ranking import order_of_models
 from semstab.report.terminal import row_of
 from semstab.task import Task
 
@@ -242,7 +242,7 @@ def test_the_verdict_is_that_of_the_terminal(run) -> None:
     assert [line for line in last.splitlines() if line.startswith(("| a ", "| b "))] == [
         f"| {' | '.join(row[:3])} |" for row in rows
     ]
-    assert last.startswith("".join(f"{line}\n" for line in answers(result)))
+    assert last.startswith("".join(f"{line}\n" for line in order_of_models(result)))
 
 
 def test_numbered_voxels_are_in_the_tab_that_explains_them_alone(run) -> None:

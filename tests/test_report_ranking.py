@@ -19,7 +19,7 @@ from semstab.gating.gate import gate, gate_config
 from semstab.predict.predictor import parse_predictors
 from semstab.report.comparison.own_models import own_models
 from semstab.report.page import _card
-from semstab.report.ranking import answers, ranking
+from semstab.report.ranking import order_of_models, ranking
 from semstab.report.terminal import print_summary
 
 ERRORS = {"place": 0.05, "view": 0.05, "cell": 2.0, "flicker": 0.03}
@@ -63,7 +63,7 @@ def test_every_pair_is_compared_and_corrected(result):
 
 def test_a_map_of_nearly_one_class_has_no_rank(result):
     assert ranking(result[0]).unranked == ("constant",)
-    assert "not ranked, as nearly the whole map is one class: constant" in list(answers(result[0]))
+    assert "not ranked, as nearly the whole map is one class: constant" in list(order_of_models(result[0]))
 
 
 SIX = ["colour-clusters,clusters=6,name=six", "colour-clusters,clusters=6,seed=2,name=other"]
@@ -79,7 +79,7 @@ def test_models_with_other_classes_are_named_and_the_rest_is_compared(tmp_path):
     ):
         predictors = parse_predictors([*models, "colour-clusters,clusters=5,name=five"])
         result = semstab.run(resolve(predicted_config(predictors, None, given)), out=tmp_path / "run", report=False)
-        *answer, last = answers(result)
+        *answer, last = order_of_models(result)
         assert last == said
         assert [text.split()[0] in compared for text in answer] == ([True] if compared else [])
         assert bool(own_models(result)) == bool(compared)
@@ -105,7 +105,7 @@ def of_some(result, models, out):
 
 def test_two_models_are_one_sentence(result, tmp_path):
     found = of_some(result, ["twin", "nervous"], tmp_path / "run")
-    (text,) = answers(found)
+    (text,) = order_of_models(found)
     assert text.startswith("nervous is less stable than twin: alpha lower by ")
     assert printed(found, tmp_path / "run").index(text[:40]) < 300
 
@@ -127,7 +127,7 @@ def test_measures_that_say_the_opposite_of_alpha_are_named_in_one_line(
     }
     found = of_some(result, ["twin", "nervous"], tmp_path / "run")
     monkeypatch.setattr("semstab.report.ranking._measured", lambda records: numbers[records[0].unit.model])
-    told = list(answers(found))
+    told = list(order_of_models(found))
     assert len(told) == 1 + (said is not None)
     if said is not None:
         assert told[1].startswith("measures disagree: alpha is better for twin, but ")
@@ -147,7 +147,7 @@ def test_a_model_that_owes_its_order_to_what_it_leaves_out_is_not_shown_to_be_mo
 
     monkeypatch.setattr("semstab.comparison.ranking._common", silent)
     semstab.comparison.ranking._ranking.cache_clear()
-    first, second, *_ = answers(found)
+    first, second, *_ = order_of_models(found)
     (difference,) = ranking(found).differences
     semstab.comparison.ranking._ranking.cache_clear()
     assert (difference.shown, difference.silent) == (False, True)
@@ -172,7 +172,7 @@ def test_both_levels_are_printed_where_they_differ(result, tmp_path):
 def test_one_model_has_no_ranking(result, tmp_path):
     alone = of_some(result, ["twin"], tmp_path / "run")
     assert ranking(alone).ranks == ranking(alone).differences == ()
-    assert list(answers(alone)) == []
+    assert list(order_of_models(alone)) == []
 
 
 def test_a_gate_on_alpha_of_nearly_one_class_is_undecided(result):

@@ -212,7 +212,7 @@ def test_the_most_probable_level_is_the_verdict(low, high, level):
 
 
 def test_agreement_below_zero_is_no_better_than_chance():
-    assert "alpha -0.15 (-0.20 to -0.10), no better than chance" in judged(-0.2, -0.1).line
+    assert "alpha -.15 (-.20 to -.10), no better than chance" in judged(-0.2, -0.1).line
     assert "chance" not in judged(0.1, 0.2).line
 
 
@@ -269,7 +269,7 @@ def test_probabilities_of_the_levels_sum_to_one_and_the_line_says_what_to_do_and
         assert min(levels.values()) >= 0
     assert level_probabilities(replace(between(0.7, 0.9), value=LIMITS.stable))["stable"] == pytest.approx(0.5)
     assert judged(0.5, 0.6).line == (
-        "net: unstable (100%), do not act on its labels: alpha 0.55 (0.50 to 0.60), two views see the same class at"
+        "net: unstable (100%), do not act on its labels: alpha .55 (.50 to .60), two views see the same class at"
         " 73% of the spots; 5000 locations seen twice or more, 50% of the map; for this scene flown again, from 60"
         " frames"
     )
@@ -280,7 +280,7 @@ def test_the_line_names_unstable_classes_the_most_probable_first():
     rare, unknown = of_class("car", 0.1, 0.2, matters=False), of_class("sign", math.nan, math.nan)
     found = judged(0.9, 1.0, classes=(good, bad, worse, rare, unknown))
     assert found.level == "stable"
-    assert "alpha 0.95 (0.90 to 1.00), probably unstable: tree (100%), person (100%)," in found.line
+    assert "alpha .95 (.90 to 1.00), probably unstable: tree (100%), person (100%)," in found.line
 
 
 def test_voxels_seen_once_change_no_verdict():

@@ -34,34 +34,34 @@ PoseChange = Callable[[Float64], Float64]
 def rotations(change: PoseChange) -> PoseChange:
     """Return the change of poses whose rotations (3, 3) change."""
 
-    def of(T: Float64) -> Float64:
+    def with_changed_rotation(T: Float64) -> Float64:
         changed = T.copy()
         changed[:3, :3] = change(T[:3, :3])
         return changed
 
-    return of
+    return with_changed_rotation
 
 
 def quaternions(order: tuple[int, ...]) -> PoseChange:
     """Return the change of poses whose quaternions, as they were read, x y z w, are put in another order."""
 
-    def of(R: Float64) -> Float64:
+    def reordered(R: Float64) -> Float64:
         from scipy.spatial.transform import Rotation
 
         return np.asarray(Rotation.from_quat(Rotation.from_matrix(R).as_quat()[list(order)]).as_matrix())
 
-    return rotations(of)
+    return rotations(reordered)
 
 
 def angles(factor: float) -> PoseChange:
     """Return the change that multiplies the rotation angles of poses by `factor`."""
 
-    def of(R: Float64) -> Float64:
+    def scaled(R: Float64) -> Float64:
         from scipy.spatial.transform import Rotation
 
         return np.asarray(Rotation.from_rotvec(factor * Rotation.from_matrix(R).as_rotvec()).as_matrix())
 
-    return rotations(of)
+    return rotations(scaled)
 
 
 def positions(factor: float) -> PoseChange:
@@ -78,7 +78,7 @@ FIRST_NUMBER_LAST, LAST_NUMBER_FIRST = quaternions((1, 2, 3, 0)), quaternions((3
 
 def views(change: Callable[[View, Convention], View]) -> Callable[[Sample], Sample]:
     """Return the change of a sample whose views change."""
-    return lambda sample: sample.of(
+    return lambda sample: sample.with_views(
         {position: change(view, sample.configured) for position, view in sample.views.items()}
     )
 

@@ -49,7 +49,7 @@ class CameraChange:
     right: float = 0.0
     down: float = 0.0
 
-    def of(self, view: View) -> View:
+    def applied_to(self, view: View) -> View:
         """Return a view with the changed intrinsics."""
         K, width = view.camera, view.size[0]
         cx, cy = K.cx + self.right * width, K.cy + self.down * width
@@ -121,7 +121,9 @@ def find_camera(sample: Sample) -> CameraFit | None:
     Focal length and principal point are fitted in turn.
     """
     errors = functools.cache(
-        lambda camera: sample.of({position: camera.of(v) for position, v in sample.views.items()}).by_pair()
+        lambda camera: sample.with_views(
+            {position: camera.applied_to(v) for position, v in sample.views.items()}
+        ).by_pair()
     )
     if len(sample.pairs) < LEAST_PAIRS or not middle(present := errors(CameraChange())) > MIN_GAIN:
         return None
@@ -132,7 +134,7 @@ def find_camera(sample: Sample) -> CameraFit | None:
     if min(middle(_scaled(sample, factor)) for factor in SCALES.tolist()) <= SIMPLER * error:
         return None  # a depth that is a little too long or too short explains it as well
     first = next(iter(sample.views.values()))
-    return CameraFit(best, best.of(first).camera, first.camera, error, middle(present))
+    return CameraFit(best, best.applied_to(first).camera, first.camera, error, middle(present))
 
 
 def _moves() -> Iterator[Callable[[CameraChange], list[CameraChange]]]:
@@ -168,4 +170,4 @@ def _scaled(sample: Sample, factor: float) -> Float64:
     longer = {
         position: dataclasses.replace(v, depth=v.depth * np.float32(factor)) for position, v in sample.views.items()
     }
-    return sample.of(longer).by_pair()
+    return sample.with_views(longer).by_pair()

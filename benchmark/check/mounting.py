@@ -58,7 +58,7 @@ class MountingChange:
     values: Float64
     covariance: Float64
 
-    def of(self, view: View) -> View:
+    def applied_to(self, view: View) -> View:
         """Return a view with the changed calibration, whose camera stands elsewhere on what was tracked."""
         from scipy.spatial.transform import Rotation
 
@@ -149,7 +149,7 @@ def fitted_change(sample: Sample, free: Float64) -> MountingChange | None:
 
 
 def _changed(sample: Sample, change: MountingChange) -> Sample:
-    return sample.of({position: change.of(view) for position, view in sample.views.items()})
+    return sample.with_views({position: change.applied_to(view) for position, view in sample.views.items()})
 
 
 def _least_squares(pairs: list[tuple[Float64, Float64]]) -> tuple[Float64, Float64]:

@@ -180,7 +180,7 @@ class Sample:
     _inverse: dict[int, Float32] = field(default_factory=dict, init=False, repr=False)
     _placed: dict[tuple[int, Convention], Placed] = field(default_factory=dict, init=False, repr=False)
 
-    def of(self, views: dict[int, View]) -> Sample:
+    def with_views(self, views: dict[int, View]) -> Sample:
         """Return a sample of the same pairs, of which these are the views."""
         return Sample(views, self.pairs, self.configured)
 

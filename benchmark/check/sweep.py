@@ -46,7 +46,7 @@ class Swept:
 def _deskewed(sweep: Sweep) -> Callable[[Swept], Swept]:
     """Return how points and surfaces lie with the motion in such a sweep taken out."""
 
-    def of(surfaces: Surfaces, motion: Float64, motion_of_other: Float64) -> Surfaces:
+    def deskewed_pair(surfaces: Surfaces, motion: Float64, motion_of_other: Float64) -> Surfaces:
         share = share_of_sweep(surfaces.middle, sweep)
         return dataclasses.replace(
             surfaces,
@@ -55,7 +55,7 @@ def _deskewed(sweep: Sweep) -> Callable[[Swept], Swept]:
             middle=carried(surfaces.middle, motion_of_other, share),
         )
 
-    return lambda swept: Swept(tuple((of(*pair), *pair[1:]) for pair in swept.pairs))
+    return lambda swept: Swept(tuple((deskewed_pair(*pair), *pair[1:]) for pair in swept.pairs))
 
 
 HYPOTHESES = tuple(

@@ -44,7 +44,7 @@ def compare(
     from semstab.comparison.entries import open_compared
     from semstab.core.console import Console
     from semstab.core.types import THIS_SCENE
-    from semstab.report.comparison.tables import print_comparison
+    from semstab.report.comparison.screen import print_comparison
 
     with Console(stderr=True, quiet=quiet).status("opening") as status:
         handles = open_compared(runs)

@@ -72,11 +72,11 @@ def by_chunk(formula: Callable[[Rows], Values]) -> Callable[[Beliefs], Values]:
     """Return a formula of voxels, computed without dense evidence of all of them."""
 
     @functools.wraps(formula)
-    def of(table: Beliefs) -> Values:
+    def of_table(table: Beliefs) -> Values:
         values: Values = np.concatenate([formula(rows) for rows in chunks(table)])  # type: ignore[assignment]
         return values
 
-    return of
+    return of_table
 
 
 def whole(formula: Callable[[Beliefs], Values]) -> Callable[[Beliefs], Values]:
@@ -93,13 +93,13 @@ def by_row(
     def decorate(formula: Callable[[Rows], Values]) -> Callable[[Beliefs], Values]:
         @whole
         @functools.wraps(formula)
-        def of(table: Beliefs) -> Values:
+        def of_table(table: Beliefs) -> Values:
             evidence = table.evidence
             if isinstance(evidence, Evidence):
                 return of_concentration(evidence.concentration)
             return formula(Rows(table.op, evidence, table.drift_sum))
 
-        return of
+        return of_table
 
     return decorate
 
@@ -271,7 +271,7 @@ MARGIN = Measure(key="margin", title="Margin", short="M", better="higher", of=ma
 RESERVED = frozenset((
     "K", "accuracy", "advice", "alpha", "alpha_by_meaning", "backend", "categories", "checked", "classes",
     "compensated_flicker_percent", "confused_with", "coverage", "ece", "entropy_between", "entropy_op2",
-    "entropy_within",
+    "entropy_within", "feature_alpha",
     "evidence", "files", "flicker_percent", "frames", "frames_empty", "frames_left_out", "fuse_ms_per_frame",
     "image_space", "input", "iou", "key", "label", "left_out", "mean_op", "means", "miou", "model", "name", "notes",
     "observation_accuracy", "observations", "op", "pixels", "points", "precision", "psa", "quality", "recurrent",

@@ -315,7 +315,7 @@ class Tables:
         self._most = most
         self._loaded: dict[str, VoxelTable] = {}
 
-    def of(self, record: Record) -> VoxelTable:
+    def table_of(self, record: Record) -> VoxelTable:
         """Return the record's table."""
         slug = record.unit.slug
         if slug not in self._loaded:
@@ -516,7 +516,7 @@ class Result:
             "model",
             "backend",
             "verdict",
-            f"alpha ({UNKNOWN.of})",
+            f"alpha ({UNKNOWN.interval_name})",
             "voxels",
             "mean OP",
             *titles,

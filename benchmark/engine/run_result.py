@@ -130,7 +130,7 @@ def _alike(config: Config, a: Record, b: Record, tables: Tables) -> Agreement:
     units = a.unit, b.unit
     maps = [Tiles.open(file, VoxelTable) for record in (a, b) if (file := record.voxels_file) is not None]
     if not (a.in_tiles or b.in_tiles):
-        return compare(tables.of(a), tables.of(b), units, tolerance=config.tolerance)
+        return compare(tables.table_of(a), tables.table_of(b), units, tolerance=config.tolerance)
     return together([compare(first, second, units, tolerance=config.tolerance) for first, second in side_by_side(maps)])
 
 

@@ -157,17 +157,18 @@ def export(
             unit, _ = held.enter_context(task_of(run, record, result.manifest["inputs"], code))
         if classify is not None:
             return [_classified(chosen(joining.MEASURES), Path(classify), file, radius, settings) for file in files]
-        usual = {".tif": maps.RASTER_MEASURES}
-        return [
-            _taxonomy_written(Path(run), record, file)
-            if holds_taxonomy(file)
-            else _masks_written(unit, file)
-            if holds_masks(file)
-            else _places_written(chosen(("op",)), record, file, most)
-            if holds_places(file)
-            else _written(chosen(usual.get(file.suffix.lower())), file, settings)
-            for file in files
-        ]
+
+        def written(file: Path) -> Exported:
+            if holds_taxonomy(file):
+                return _taxonomy_written(Path(run), record, file)
+            if holds_masks(file):
+                return _masks_written(unit, file)
+            if holds_places(file):
+                return _places_written(chosen(("op",)), record, file, most)
+            usual = maps.RASTER_MEASURES if file.suffix.lower() == ".tif" else None
+            return _written(chosen(usual), file, settings)
+
+        return [written(file) for file in files]
 
 
 def _require_writable(files: Sequence[Path], inputs: Sequence[str | Path | None], task_format: str | None) -> None:

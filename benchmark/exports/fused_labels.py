@@ -93,7 +93,7 @@ class FusedLabels:
             lambda tile: VoxelLookup(self._tiles[tile]), lambda lookup: len(lookup.table), AT_HAND
         )
 
-    def of(self, frame: Frame, pixel_stride: int = 1) -> Int64:
+    def labels_of(self, frame: Frame, pixel_stride: int = 1) -> Int64:
         """Return (H, W) rows 0..K-1 of the map's classes, UNSEEN or UNSTABLE, whatever the frame's own labels are.
 
         The frame is one of those that were fused, with every pixel_stride-th pixel of each axis.

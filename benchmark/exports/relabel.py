@@ -123,7 +123,7 @@ def _fused_frames(task: Task, fused: FusedLabels, pixel_stride: int) -> Iterator
         if truth is not None:
             with contextlib.suppress(DataError):  # a frame without ground truth
                 true_frame = read(truth, index)
-        return frame, fused.of(frame, pixel_stride), true_frame
+        return frame, fused.labels_of(frame, pixel_stride), true_frame
 
     return (fetched.item for fetched in prefetch(read_and_fuse, task.indices))
 

@@ -10,6 +10,7 @@ import numpy as np
 
 from semstab.core.types import Int64
 from semstab.data.frames import Frame
+from semstab.data.statistics import short
 from semstab.exports.fused_labels import UNSEEN, UNSTABLE
 from semstab.metrics.correctness import mean_iou
 
@@ -83,8 +84,8 @@ class Relabelled:
         if self.correctness is not None:
             c = self.correctness
             yield f"  where both have a label and ground truth, {c.after.pixels:,} pixels:"
-            yield f"    accuracy {c.before.accuracy:.3f} before, {c.after.accuracy:.3f} after"
-            yield f"    mean IoU {c.before.miou:.3f} before, {c.after.miou:.3f} after"
+            yield f"    accuracy {short(c.before.accuracy, digits=3)} before, {short(c.after.accuracy, digits=3)} after"
+            yield f"    mean IoU {short(c.before.miou, digits=3)} before, {short(c.after.miou, digits=3)} after"
         if not self.leave_one_out:
             yield "  do not assess the stability of these maps: a voxel has one class in all of them"
 

@@ -22,7 +22,7 @@ from semstab.data.statistics import ORDER_KNOWN, Interval
 from semstab.errors import ConfigError, DataError
 from semstab.gating.result import Judgement, negative, verdict
 from semstab.gating.rules import Rule
-from semstab.report.comparison.tables import LEAST_LEFT_OUT, left_out
+from semstab.report.comparison.sentences import LEAST_LEFT_OUT, left_out
 from semstab.statistics.agreement import ALPHA, PSA, VOXEL_ALPHA
 from semstab.statistics.cluster_sums import ClusterSums, chance_of, functional, parts_of, value
 from semstab.statistics.correctness import ECE

@@ -137,11 +137,11 @@ def _any(broken: Mask) -> Mask:
 
 
 def _of_rows(part: ClusterSums, names: list[str]) -> Iterator[Impossible]:
-    yield Impossible("a sum is no number", _any(~np.isfinite(part.of(names))))
+    yield Impossible("a sum is no number", _any(~np.isfinite(part.side_by_side(names))))
     if count_distinct(keys_of(part)) < len(part.cell):
         yield Impossible("a cube has two rows of one frame", np.ones(len(part.cell), np.bool_))
     counts = [name for name in names if name in COUNTS]
-    yield Impossible("a count is negative", _any(part.of(counts) < -LEAST))
+    yield Impossible("a count is negative", _any(part.side_by_side(counts) < -LEAST))
 
 
 COUNTS = ("voxels", "observations", "own", "twice", "recurrent", "evidence", "known", "class_known")

@@ -27,7 +27,7 @@ from semstab.metrics.agreement import shared_rows
 from semstab.metrics.summary import categorise
 from semstab.recording.loops import first_of_blocks
 from semstab.report.narrative import outlying_line
-from semstab.report.ranking import answers
+from semstab.report.ranking import order_of_models
 from semstab.report.terminal import TEXTS, columns, row_of
 from semstab.statistics.moving import STATE_COLORS
 
@@ -314,11 +314,11 @@ PENDING = "The verdict follows when all frames are fused."
 def verdict_report(result: Result, scene: str) -> str:
     """Return the answer of a run, and the verdict of each model on a scene, in Markdown, as the terminal has them."""
     if not result.maps.records:
-        return "\n".join(f"{line}\n" for line in answers(result))
+        return "\n".join(f"{line}\n" for line in order_of_models(result))
     rows = [row_of(record) for record in result.select(scene=scene)]
     heads = (f"| {' | '.join(head for head, _ in columns()[:TEXTS])} |", f"|{'---|' * TEXTS}")
     table = [f"| {' | '.join(row[:TEXTS])} |" for row in rows]
-    return "\n".join([*(f"{line}\n" for line in answers(result)), *heads, *table])
+    return "\n".join([*(f"{line}\n" for line in order_of_models(result)), *heads, *table])
 
 
 def agreement_report(statistics: MapStatistics) -> str:

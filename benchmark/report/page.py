@@ -32,7 +32,7 @@ from semstab.report.html import filled, jpeg, lone_pictures, png, table_block
 from semstab.report.means import ENOUGH, by_model, describe, levels, over_recurrent, pooled, swept
 from semstab.report.narrative import not_assessed, noted, notes, outlying_line, warnings
 from semstab.report.places import described_places, map_frame
-from semstab.report.ranking import answers
+from semstab.report.ranking import order_of_models
 from semstab.report.saved_run import read_series
 from semstab.report.tables import tables
 from semstab.report.tables.table import relations
@@ -77,7 +77,7 @@ def render(
         subtitle=_subtitle(result),
         models=_legend(result.models),
         cards=[_card(name, records) for name, records in by_model(result.select()).items()],
-        answers=[relations(text) for text in answers(result)],
+        answers=[relations(text) for text in order_of_models(result)],
         noted=[relations(text) for text in noted(result)],
         advice=[sentence for study in filter_studies(everything) for sentence in advice(study)],
         warnings=[relations(text) for text in warnings(result)],
@@ -156,8 +156,8 @@ def _numbers(
         if estimate is None or math.isnan(estimate.low):
             return ""
         if scale == 1.0:
-            return f"{estimate.of} {short(estimate.low)} to {short(estimate.high)}"
-        return f"{estimate.of} {scale * estimate.low:z.0f} to {scale * estimate.high:z.0f}"
+            return f"{estimate.interval_name} {short(estimate.low)} to {short(estimate.high)}"
+        return f"{estimate.interval_name} {scale * estimate.low:z.0f} to {scale * estimate.high:z.0f}"
 
     head = None if single is None else single.headline
     alphas = [stats.headline.alpha.value for stats in assessed]

@@ -21,7 +21,7 @@ def ranking(result: Result) -> Ranking:
     return Ranking((), ()) if filter_studies(result) else rank_models(result)
 
 
-def answers(result: Result) -> Iterator[str]:
+def order_of_models(result: Result) -> Iterator[str]:
     """Yield the answer: the difference of two models, or the ranks of more; of videos the order by flicker."""
     if not result.maps.records:
         yield from _by_flicker(result)

@@ -98,7 +98,11 @@ class FeatureStore:
         if end > len(self._vectors):
             self._vectors = _longer(self._vectors, end)
         new_rows = slice(self._count, end)
-        self._spot[new_rows], self._view[new_rows], self._vectors[new_rows] = spot[rows], view, features.at(cell[rows])
+        self._spot[new_rows], self._view[new_rows], self._vectors[new_rows] = (
+            spot[rows],
+            view,
+            features.at(cell[rows]),
+        )
         self._count = end
         while self._count > self.most and self.share > 1:
             self.share //= 2

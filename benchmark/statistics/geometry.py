@@ -72,7 +72,7 @@ def rendered(frames: Iterable[Frame], world: VoxelTable, views: Iterable[Frame] 
     labels = _DominantLabels(world)
     for frame, view in ((frame, frame) for frame in frames) if views is None else _paired(frames, views):
         rendered_labels = np.full(view.shape, labels.ignore, dtype=labels.dtype)
-        rendered_labels[view.valid] = labels.at(voxel_index(back_project(view), world.voxel_size, view))
+        rendered_labels[view.valid] = labels.labels_at(voxel_index(back_project(view), world.voxel_size, view))
         yield dataclasses.replace(frame, labels=rendered_labels, scores=None)
 
 
@@ -113,7 +113,7 @@ class _DominantLabels:
         (self._keys,) = voxel_keys(world.index)
         self._labels = dominant(world).astype(self.dtype)
 
-    def at(self, index: Int64) -> npt.NDArray[np.integer]:
+    def labels_at(self, index: Int64) -> npt.NDArray[np.integer]:
         """Return labels (n,) of voxel indices (3, n)."""
         x, y, z = index - self._low[:, None]
         inside = (

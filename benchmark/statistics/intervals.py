@@ -194,7 +194,7 @@ def influences_of(sums: ClusterSums, number: Functional) -> Influences | None:
     """Return the influences on a number; None if it is undefined, or all is in one cube."""
     total = None
     for part, weight in parts_of(sums, number):
-        halves = number.pair_weight * part.of(number.pairs) if number.pairs else None
+        halves = number.pair_weight * part.side_by_side(number.pairs) if number.pairs else None
         influence = influences(part.index, columns_of(part, number), number.of, halves)
         if influence is None:
             return None

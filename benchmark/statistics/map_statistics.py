@@ -22,6 +22,7 @@ from semstab.data.statistics import (
     CorrectnessStatistics,
     DriftStatistics,
     EntropyParts,
+    FeatureAgreement,
     FlipRates,
     FrameAgreement,
     HeadlineStatistics,
@@ -212,10 +213,7 @@ def analyse(
     )
     agreement_of_features = None
     if features is not None:
-        alike = likeness(features)
-        of_features = feature_sums(features, alike)
-        sums = dataclasses.replace(sums, features=of_features)
-        agreement_of_features = feature_agreement(features, alike, of_features, scope, alone=alone, name=frame_name)
+        sums, agreement_of_features = _with_features(sums, features, scope, alone=alone, frame_name=frame_name)
     sample_columns, log = log_sums(sample, cubes)
     if log is not None:
         sample_columns["sbd_null"] = null
@@ -228,10 +226,8 @@ def analyse(
     headline = HeadlineStatistics(*confidence_intervals(headline_specs(sums, scope)))
     means = _means(locations, sums, scope)
     flips = FlippingSums.of(table, consistent, cubes).flipping(table.classes)
-    lone, outlying = None, None
-    if spots is not None:
-        lone = lone_disagreement(spots)
-        outlying = outlying_frames(lone, len(spots.views), name=frame_name)
+    lone = None if spots is None else lone_disagreement(spots)
+    outlying = None if spots is None or lone is None else outlying_frames(lone, len(spots.views), name=frame_name)
     agreement_of_spots = None if spots is None else spot_agreement(spots, sums, table, scope, critical, limits)
     moved = None if spots is None else moved_spots(spots, sums, headline.alpha, scope, frame_name)
     stability = verdict(
@@ -263,6 +259,21 @@ def analyse(
         summary, lone = _without_classes(summary), None
     moving = {} if spots is None else moving_percent(spots)
     return Analysis(summary, map_summary, sums, sample, shares, sample_columns, lone, moving)
+
+
+def _with_features(
+    sums: ClusterSums,
+    features: FeatureObservations,
+    scope: Scope,
+    *,
+    alone: bool,
+    frame_name: Callable[[int], str],
+) -> tuple[ClusterSums, FeatureAgreement]:
+    """Return the sums of a map with the sums of features, and the agreement of features."""
+    alike = likeness(features)
+    of_features = feature_sums(features, alike)
+    agreement = feature_agreement(features, alike, of_features, scope, alone=alone, name=frame_name)
+    return dataclasses.replace(sums, features=of_features), agreement
 
 
 def _without_classes(summary: MapStatistics) -> MapStatistics:

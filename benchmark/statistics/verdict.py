@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 
 from semstab.core.types import THIS_SCENE
@@ -154,31 +154,40 @@ def verdict(
         headline = dataclasses.replace(headline, alpha=static.alpha)
     level, probability = _level(headline, spots, limits)
     of_all, probability_of_all = _level(headline, spots, limits, spots.pairs)
-    silent = spots.labelled < limits.labelled
     result = StabilityVerdict(level, probability, "", labelled=spots.pixels_labelled)
     if of_all != level:
         result = dataclasses.replace(result, of_all=of_all, probability_of_all=probability_of_all)
-    wrong = headline.wrong_of_consistent_op3
-    same = spots.agreeing(of_all_spots.value)
-    parts = [
-        _alpha(headline.alpha, spots, "alpha" if static is None else "alpha (static)"),
-        f"two views see the same class at {same:.0%} of the spots",
-    ]
-    if static is not None:
-        parts.append(f"alpha of all spots {of_all_spots.value:.2f}, of which {static.moved:.1%} moved")
-    if level == "uninformative":
-        parts.insert(0, f"{spots.largest_share:.0%} of the observations are {spots.largest_class}")
-    if not math.isnan(wrong.low):
-        parts.append(f"{wrong.value:.0%} of the consistent locations are wrong ({wrong.low:.0%} to {wrong.high:.0%})")
-    if silent:
-        parts.append(f"{1 - spots.labelled:.0%} of the locations have no label in most frames")
-    if flips is not None and result.decisive in ACTED_ON:
-        parts += _flips(flips)
+    acted_on = flips if result.decisive in ACTED_ON else None
     how_sure = "" if math.isnan(probability) or level == "undecided" else f" ({probability:.0%})"
     stated = result.difference or f"{level}{how_sure}"
-    reasons = ", ".join(parts)
+    reasons = ", ".join(_reasons(level, headline, spots, static, of_all_spots, acted_on, limits))
     line = f"{model}: {stated}, {ADVICE[result.decisive]}: {reasons}; {support}; {_for(headline.alpha)}"
     return dataclasses.replace(result, line=line)
+
+
+def _reasons(
+    level: Level,
+    headline: HeadlineStatistics,
+    spots: SpotAgreement,
+    static: MovedSpots | None,
+    of_all_spots: Interval,
+    flips: Flipping | None,
+    limits: Limits,
+) -> Iterator[str]:
+    """Yield the numbers that the verdict rests on; `static` if alpha is over what stayed, `flips` if they count."""
+    if level == "uninformative":
+        yield f"{spots.largest_share:.0%} of the observations are {spots.largest_class}"
+    yield _alpha(headline.alpha, spots, "alpha" if static is None else "alpha (static)")
+    yield f"two views see the same class at {spots.agreeing(of_all_spots.value):.0%} of the spots"
+    if static is not None:
+        yield f"alpha of all spots {short(of_all_spots.value)}, of which {static.moved:.1%} moved"
+    wrong = headline.wrong_of_consistent_op3
+    if not math.isnan(wrong.low):
+        yield f"{wrong.value:.0%} of the consistent locations are wrong ({wrong.low:.0%} to {wrong.high:.0%})"
+    if spots.labelled < limits.labelled:
+        yield f"{1 - spots.labelled:.0%} of the locations have no label in most frames"
+    if flips is not None:
+        yield from _flips(flips)
 
 
 def _missing(spots: SpotAgreement | None, voxels: int) -> str:
@@ -222,12 +231,12 @@ def _for(basis: Interval) -> str:
 
 
 def _alpha(alpha: Interval, spots: SpotAgreement, name: str = "alpha") -> str:
-    """Return 'alpha 0.71 (0.69 to 0.73), probably unstable: car (98%)'."""
+    """Return 'alpha .71 (.69 to .73), probably unstable: car (98%)'."""
     chance = ", no better than chance" if alpha.value < 0 else ""
     unstable = [row for row in spots.critical_classes[:3] if row.unstable >= PROBABLE]
     names_text = ", ".join(f"{row.name} ({row.unstable:.0%})" for row in unstable)
     classes = f", probably unstable: {names_text}" if names_text else ""
-    return f"{name} {alpha.value:.2f} ({alpha.low:.2f} to {alpha.high:.2f}){chance}{classes}"
+    return f"{name} {alpha.text()}{chance}{classes}"
 
 
 def _flips(flips: Flipping) -> list[str]:

@@ -190,7 +190,7 @@ class Recorded:
     def _camera(self, topic: str, stamp: int) -> tuple[Camera, Lens | None]:
         cameras = self._content.cameras.get(topic)
         if cameras is not None and cameras.cameras and (self._options.intrinsics is None or topic != self._seen.topic):
-            return cameras.at(stamp)
+            return cameras.camera_at(stamp)
         if self._options.intrinsics is None and topic != self._seen.topic:
             return self._camera(self._seen.topic, stamp)  # colour without CameraInfo is taken to be as depth sees it
         if self._options.intrinsics is None:

@@ -111,7 +111,7 @@ class Cameras:
             self.stamps.append(stamp)
             self.cameras.append(camera)
 
-    def at(self, stamp: int) -> tuple[Camera, Lens | None]:
+    def camera_at(self, stamp: int) -> tuple[Camera, Lens | None]:
         """Return the last camera that was said until a stamp, else the first one."""
         return self.cameras[max(int(np.searchsorted(self.stamps, stamp, side="right")) - 1, 0)]
 

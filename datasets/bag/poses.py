@@ -103,7 +103,7 @@ class SensorPoses:
             DataError: What `at` raises, or if none has one.
         """
         offset, limit = round(self._options.time_offset * NANOSECONDS), self._options.max_pose_gap
-        poses, where = self.at([stamp + offset for stamp in stamps], sensor)
+        poses, where = self.poses_at([stamp + offset for stamp in stamps], sensor)
         num_posed = int(np.count_nonzero(np.isfinite(poses).all(axis=(1, 2))))
         if not num_posed:
             raise DataError(
@@ -112,7 +112,7 @@ class SensorPoses:
             )
         return poses, f"poses    {where}; around {num_posed} of {len(poses)} {what}s, at most {limit:g} s apart"
 
-    def at(self, stamps: Sequence[int], sensor: str) -> tuple[Poses, str]:
+    def poses_at(self, stamps: Sequence[int], sensor: str) -> tuple[Poses, str]:
         """Return poses (n, 4, 4) of the sensor at stamps, NaN if unknown, and the source of the poses.
 
         `sensor` is the frame of its messages.
@@ -127,17 +127,17 @@ class SensorPoses:
             series = Trajectory()
             for time, *pose in numbers.tolist():
                 series.add(round(time * NANOSECONDS), pose)
-            poses = series.at(_snapped(stamps, series.stamps), options.max_pose_gap, options.trajectory)
+            poses = series.poses_at(_snapped(stamps, series.stamps), options.max_pose_gap, options.trajectory)
             return self._from_body(poses, options.pose_frame or "", sensor, stamps, str(options.trajectory))
         chain, why = self._chain(sensor)
         if chain and (options.pose == TF or (options.pose is None)):
-            poses = self._transforms.at(chain, stamps, options.max_pose_gap, self._path)
+            poses = self._transforms.poses_at(chain, stamps, options.max_pose_gap, self._path)
             poses = poses @ self._extrinsics()
             by = f" by {', '.join(reversed(chain[1:-1]))}" if chain[1:-1] else ""
             return poses, f"{' and '.join(self._tf)}: {chain[0]} in {chain[-1]}{by}"
         if self._topic is None:
             raise DataError(f"{self._path}: no pose of the {self._sensor}: {why}")
-        poses = self._own.at(stamps, options.max_pose_gap, Path(f"{self._path}, {self._topic}"))
+        poses = self._own.poses_at(stamps, options.max_pose_gap, Path(f"{self._path}, {self._topic}"))
         body = options.pose_frame or self._of
         where = f"{self._topic}{f' in {self._frame}' if self._frame else ''}"
         return self._from_body(poses, bare(body), sensor, stamps, where)
@@ -157,7 +157,7 @@ class SensorPoses:
                 f" {sensor} if they are the {self._sensor}'s"
             )
         chain = chain[: chain.index(body) + 1]
-        mounted = self._transforms.at(chain, stamps, options.max_pose_gap, self._path)
+        mounted = self._transforms.poses_at(chain, stamps, options.max_pose_gap, self._path)
         return poses @ mounted, f"{where}, of {body}; {sensor} in it from {' and '.join(self._tf)}"
 
     def _extrinsics(self) -> Poses:

@@ -40,7 +40,7 @@ class Town:
 
     def moving(self, seconds: float, camera: Float64) -> TriangleSurface:
         """Return the moving cars and people near the camera (x, y, z) at a time."""
-        return join([movers.at(seconds, camera, self.ground) for movers in self.movers])
+        return join([movers.surface_at(seconds, camera, self.ground) for movers in self.movers])
 
 
 @lru_cache(maxsize=2)

@@ -72,7 +72,7 @@ class Movers:
         heading = np.where(along_s, 0.0, np.pi / 2) + np.where(speed < 0, np.pi, 0.0)
         return np.stack([np.where(along_s, along, across), np.where(along_s, across, along), heading], axis=1)
 
-    def at(self, seconds: float, camera: Float64, ground: Ground) -> TriangleSurface:
+    def surface_at(self, seconds: float, camera: Float64, ground: Ground) -> TriangleSurface:
         """Return the things at a time, those within SIGHT of the camera at (x, y, z)."""
         spots = self.spots(seconds)
         k = np.hypot(*(ground.points(*spots[:, :2].T)[:, :2] - camera[:2]).T) < SIGHT

@@ -243,7 +243,7 @@ class FileScene(Scene):
                 " undistorted"
             )
         camera = source.label_camera
-        K = None if camera is None else camera.at(shape, self.options.pixel_centre or 0.0)
+        K = None if camera is None else camera.intrinsics_at(shape, self.options.pixel_centre or 0.0)
         return at_image(self.geometry(index), shape, str(source.color or source.name), K)
 
     def depth(self, index: int) -> Float32:
@@ -354,7 +354,9 @@ class FileScene(Scene):
     def intrinsics(self, index: int, shape: tuple[int, ...]) -> Intrinsics:
         """Return the intrinsics of the frame's depth image, of shape (H, W); pixels."""
         camera, options = self._frame(index).camera, self.options
-        return Camera(camera.intrinsics, options.intrinsics_size or camera.size).at(shape, options.pixel_centre or 0.0)
+        return Camera(camera.intrinsics, options.intrinsics_size or camera.size).intrinsics_at(
+            shape, options.pixel_centre or 0.0
+        )
 
     def T_wc(self, index: int) -> Poses:
         """Return pose (4, 4) camera-to-world in metres, OpenCV camera axes; needs no labels.
@@ -475,7 +477,7 @@ class FileScene(Scene):
         camera = source.label_camera
         if camera is None:
             return fitted(values, shape, where, what)
-        K = camera.at(values.shape, self.options.pixel_centre or 0.0)
+        K = camera.intrinsics_at(values.shape, self.options.pixel_centre or 0.0)
         return fit(values, K, self.intrinsics(index, shape), (shape[0], shape[1]))
 
     def _sizes(self, index: int, shape: tuple[int, ...], path: Path, what: str) -> FrameSize:

@@ -48,7 +48,7 @@ class Camera:
         except DataError as error:
             raise DataError(f"{where}: {error}") from error
 
-    def at(self, shape: tuple[int, ...], centre: float = 0.0) -> Intrinsics:
+    def intrinsics_at(self, shape: tuple[int, ...], centre: float = 0.0) -> Intrinsics:
         """Return intrinsics, pixel centres at integers, of an image of the whole field of view, of shape (H, W, ...).
 
         `centre` is the dataset's coordinate of the first pixel's centre: 0, or 0.5 for coordinates from the corner.

@@ -99,7 +99,7 @@ def fitted(values: Pixels, shape: tuple[int, ...], where: str, what: str = "the 
     require_same_view(values.shape, shape, where, f"{what} {{}} but depth is {{}}")
     h, w = shape[:2]
     target = Intrinsics(1, 1, (w - 1) / 2, (h - 1) / 2)
-    return fit(values, Camera(target, (w, h)).at(values.shape), target, (h, w))
+    return fit(values, Camera(target, (w, h)).intrinsics_at(values.shape), target, (h, w))
 
 
 def at_image(frame: Frame, shape: tuple[int, int], where: str, K: Intrinsics | None = None) -> Frame:
@@ -187,7 +187,7 @@ def _source_pixels(
     """Return the column and row (H, W), in an image of the lens of shape `source`, of each pixel of the pinhole."""
     import cv2
 
-    inner = lens.camera.at(source)
+    inner = lens.camera.intrinsics_at(source)
     size = (shape[1], shape[0])
     maps: Any = cv2.fisheye.initUndistortRectifyMap if lens.model == "fisheye" else cv2.initUndistortRectifyMap
     x, y = maps(inner.matrix, np.array(lens.coefficients), np.eye(3), K.matrix, size, cv2.CV_32FC1)

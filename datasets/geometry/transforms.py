@@ -40,7 +40,7 @@ class Trajectory:
         self.stamps.append(stamp)
         self.numbers.extend(numbers)
 
-    def at(self, stamps: Sequence[int], max_gap: float, path: Path) -> Poses:
+    def poses_at(self, stamps: Sequence[int], max_gap: float, path: Path) -> Poses:
         """Return (n, 4, 4) at stamps, NaN for a stamp that is not between two poses at most `max_gap` seconds apart.
 
         Raises:
@@ -94,11 +94,11 @@ class Transforms:
         """Return whether any transform along the chain, from a frame upwards, changes over time."""
         return any(not self._above[child][parent].fixed for child, parent in itertools.pairwise(chain))
 
-    def at(self, chain: Sequence[str], stamps: Sequence[int], max_gap: float, path: Path) -> Poses:
+    def poses_at(self, chain: Sequence[str], stamps: Sequence[int], max_gap: float, path: Path) -> Poses:
         """Return poses (n, 4, 4) of the chain's first frame in its last one; NaN as `Trajectory.at`."""
         T = np.repeat(np.eye(4)[None], len(stamps), axis=0)
         for child, parent in itertools.pairwise(chain):
-            T = self._above[child][parent].at(stamps, max_gap, Path(f"{path}, {child} in {parent}")) @ T
+            T = self._above[child][parent].poses_at(stamps, max_gap, Path(f"{path}, {child} in {parent}")) @ T
         return T
 
 

@@ -177,30 +177,16 @@ def of_meta(about: Content) -> Iterator[Forgery]:
 # --- As somebody would ------------------------------------------------------------------------------------------------
 
 
-def by_hand() -> Iterator[Forgery]:  # noqa: PLR0915  a list
+def by_hand() -> Iterator[Forgery]:
     """Yield edits that would buy a rank if nobody looked."""
+    for forged in (
+        forged_text, forged_rows, forged_places, forged_scaled_sums, forged_agreement, forged_classes, forged_truth,
+    ):  # fmt: skip
+        yield from forged()
 
-    def statistics(parts: Parts) -> Iterator[Content]:
-        return (
-            scene["summary"]["statistics"] if "summary" in scene else scene["statistics"]
-            for scene in parts.content["scenes"]
-        )
 
-    def stated(key: str, **changes: Any) -> Callable[[Parts], None]:
-        def change(parts: Parts) -> None:
-            for own in statistics(parts):
-                own["headline"].setdefault(key, {}).update(changes)
-
-        return change
-
-    def level(parts: Parts, wanted: str = "stable") -> None:
-        for own in statistics(parts):
-            own["verdict"].update(level=wanted, of_all=None)
-
-    def unwrong(parts: Parts) -> None:
-        stated("wrong_of_consistent", value=0.0, low=0.0, high=0.0, undecided="x")(parts)
-        level(parts)
-
+def forged_text() -> Iterator[Forgery]:
+    """Yield edits of fields of the text."""
     yield "text", "nothing is wrong, the level is stable", unwrong
     yield "text", "the level is stable", level
     yield "text", "the level is usable", lambda parts: level(parts, "usable")
@@ -208,20 +194,9 @@ def by_hand() -> Iterator[Forgery]:  # noqa: PLR0915  a list
     yield "text", "alpha is .99, undecided", stated("alpha", value=0.99, undecided="x")
     yield "text", "alpha's interval is narrow", stated("alpha", low=0.98, high=0.99)
     yield "text", "accuracy is 1", stated("accuracy", value=1.0, low=1.0, high=1.0)
-
-    def flicker(parts: Parts) -> None:
-        for scene in parts.content["scenes"]:
-            scene["flicker"] = [0.01] * len(scene["flicker"])
-            scene.get("summary", scene)["flicker_percent"] = 0.01
-
     yield "text", "flicker is .01", flicker
     yield "text", "-5 ms a frame", lambda parts: parts.content["about"].update(milliseconds=-5.0, predicted=True)
     yield "text", "0.01 ms a frame", lambda parts: parts.content["about"].update(milliseconds=0.01, predicted=True)
-
-    def frames(parts: Parts) -> None:
-        for scene in parts.content["scenes"]:
-            scene.get("summary", scene)["frames"] += 100
-
     yield "text", "100 frames more", frames
     yield (
         "text",
@@ -230,11 +205,6 @@ def by_hand() -> Iterator[Forgery]:  # noqa: PLR0915  a list
             scene.update(frames=2 * scene["frames"], flicker=2 * scene["flicker"]) for scene in parts.content["scenes"]
         ],
     )
-
-    def classes(parts: Parts) -> None:
-        for own in statistics(parts):
-            own["spots"]["classes"] = own["spots"]["classes"][:1]
-
     yield "text", "class rows dropped", classes
     yield (
         "text",
@@ -244,36 +214,9 @@ def by_hand() -> Iterator[Forgery]:  # noqa: PLR0915  a list
     yield "text", "a scene twice", lambda parts: parts.content["scenes"].append(parts.content["scenes"][0])
     yield "text", "a scene fewer", lambda parts: parts.content["scenes"].pop()
 
-    # Of sums, in all scenes
 
-    def each(change: Callable[[Table, Content], None]) -> Callable[[Parts], None]:
-        def of(parts: Parts) -> None:
-            for sums, about in zip(parts.sums, parts.about, strict=True):
-                change(sums, about)
-
-        return of
-
-    def take(sums: Table, rows: np.ndarray) -> None:
-        for name in sums:
-            sums[name] = sums[name][rows]
-
-    def of_rows(choose: Callable[[Table], np.ndarray]) -> Callable[[Parts], None]:
-        return each(lambda sums, about: take(sums, choose(sums)))
-
-    def worst(share: float, parts: tuple[int, ...] = (1, 2, 3)) -> Callable[[Table], np.ndarray]:
-        """Leave out the cubes and views with the least agreement."""
-
-        def choose(sums: Table) -> np.ndarray:
-            rate = sums["agreeing"] / np.maximum(sums["observations"], 1)
-            first = sums["part"] == 1
-            bad = np.quantile(rate[first], share)
-            key = np.stack([sums[name] for name in ("ix", "iy", "iz", "frame")], axis=1)
-            left = {tuple(row) for row in key[first & (rate < bad)].tolist()}
-            out = np.array([tuple(row) in left for row in key.tolist()]) & np.isin(sums["part"], parts)
-            return np.flatnonzero(~out)
-
-        return choose
-
+def forged_rows() -> Iterator[Forgery]:
+    """Yield edits of rows of the sums, left out or doubled."""
     for share in (0.02, 0.05, 0.1, 0.3, 0.6):
         yield "rows", f"the worst {share:.0%} of cubes and views left out", of_rows(worst(share))
     yield "rows", "the worst 5 % of second answers left out", of_rows(worst(0.05, (2,)))
@@ -294,13 +237,9 @@ def by_hand() -> Iterator[Forgery]:  # noqa: PLR0915  a list
     yield "rows", "no second answers", of_rows(lambda sums: np.flatnonzero(sums["part"] < 2))
     yield "rows", "no third answers", of_rows(lambda sums: np.flatnonzero(sums["part"] < 3))
 
-    def put_all(**columns: Callable[[Table], np.ndarray]) -> Callable[[Table, Content], None]:
-        def change(sums: Table, about: Content) -> None:
-            sums.update({name: make(sums).astype(sums[name].dtype) for name, make in columns.items()})
 
-        return change
-
-    number = lambda sums: np.arange(len(sums["part"]))  # noqa: E731
+def forged_places() -> Iterator[Forgery]:
+    """Yield edits of cubes, frames and their sizes."""
     yield "places", "each row a cube of its own", each(put_all(ix=number))
     yield "places", "each cube its own", each(put_all(ix=lambda sums: 1000 * sums["ix"] + sums["frame"]))
     yield "places", "cubes a mile away", each(put_all(iz=lambda sums: sums["iz"] + 100))
@@ -316,13 +255,6 @@ def by_hand() -> Iterator[Forgery]:  # noqa: PLR0915  a list
         each(put_all(frame=lambda s: np.where(s["frame"] < 0, -1, s["frame"].max() - s["frame"]))),
     )
     yield "places", "one frame", each(put_all(frame=lambda sums: np.minimum(sums["frame"], 0)))
-
-    def said(**changes: Callable[[list[float]], list[float]]) -> Callable[[Table, Content], None]:
-        def change(sums: Table, about: Content) -> None:
-            about.update({name: make(about[name]) for name, make in changes.items()})
-
-        return change
-
     yield "places", "groups of 0 frames", each(said(step=lambda own: [0] * len(own)))
     yield "places", "groups of 64 frames", each(said(step=lambda own: [64] * len(own)))
     yield "places", "100 frames more were fused", each(said(fused=lambda own: [n + 100 for n in own]))
@@ -330,39 +262,12 @@ def by_hand() -> Iterator[Forgery]:  # noqa: PLR0915  a list
     yield "places", "cubes said to be twice as large", each(said(edge=lambda own: [2 * x for x in own]))
     yield "places", "cubes said to be half as large", each(said(edge=lambda own: [x / 2 for x in own]))
     yield "places", "voxels said to be larger", each(said(voxel_size=lambda own: [2 * x for x in own]))
-
-    def larger(times: int, frames: int) -> Callable[[Table, Content], None]:
-        """Join cubes, and frames, as honest sums would be made coarser: intervals get wide."""
-
-        def change(sums: Table, about: Content) -> None:
-            for name in ("ix", "iy", "iz"):
-                sums[name] = sums[name] // times
-            sums["frame"] = np.where(sums["frame"] < 0, -1, sums["frame"] // frames)
-            keys = np.stack([sums[name] for name in ("part", "ix", "iy", "iz", "frame")], axis=1)
-            rows, of = np.unique(keys, axis=0, return_inverse=True)
-            for name in list(sums):
-                summed = np.zeros(len(rows))
-                np.add.at(summed, of.ravel(), sums[name].astype(np.float64))
-                sums[name] = summed.astype(sums[name].dtype)
-            for k, name in enumerate(("part", "ix", "iy", "iz", "frame")):
-                sums[name] = rows[:, k]
-            about.update(edge=[times * x for x in about["edge"]], step=[frames * x for x in about["step"]])
-
-        return change
-
     for times, groups in ((2, 1), (4, 1), (64, 1), (1, 2), (1, 16), (64, 64)):
         yield "places", f"cubes {times} times as large, groups of {groups}", each(larger(times, groups))
 
-    numbers = lambda sums: [name for name in sums if name not in ("part", "ix", "iy", "iz", "frame")]  # noqa: E731
 
-    def times(factor: float, parts: tuple[int, ...] = (0, 1, 2, 3)) -> Callable[[Table, Content], None]:
-        def change(sums: Table, about: Content) -> None:
-            rows = np.isin(sums["part"], parts)
-            for name in numbers(sums):
-                sums[name] = np.where(rows, factor * sums[name], sums[name]).astype(sums[name].dtype)
-
-        return change
-
+def forged_scaled_sums() -> Iterator[Forgery]:
+    """Yield edits of sums that are multiplied."""
     for factor in (1000.0, 10.0, 2.0, 1.5, 0.5, 0.1):
         yield "all sums", f"times {factor:g}", each(times(factor))
         yield "all sums", f"of spots times {factor:g}", each(times(factor, (1, 2, 3)))
@@ -370,19 +275,9 @@ def by_hand() -> Iterator[Forgery]:  # noqa: PLR0915  a list
         yield "all sums", f"of second answers times {factor:g}", each(times(factor, (2,)))
         yield "all sums", f"of third answers times {factor:g}", each(times(factor, (3,)))
 
-    def within(parts: tuple[int, ...], **columns: Callable[[Table], np.ndarray]) -> Callable[[Table, Content], None]:
-        def change(sums: Table, about: Content) -> None:
-            rows = np.isin(sums["part"], parts)
-            made = {
-                name: np.where(rows, make(sums), sums[name]).astype(sums[name].dtype) for name, make in columns.items()
-            }
-            sums.update(made)
 
-        return change
-
-    def all_agree(sums: Table) -> np.ndarray:
-        return sums["observations"]
-
+def forged_agreement() -> Iterator[Forgery]:
+    """Yield edits of agreement of the answers."""
     for parts, of in (((1,), "first"), ((2,), "second"), ((3,), "third"), ((1, 2, 3), "all")):
         yield "agreement", f"all of {of} answers agree", each(within(parts, agreeing=all_agree))
         yield (
@@ -396,47 +291,21 @@ def by_hand() -> Iterator[Forgery]:  # noqa: PLR0915  a list
     yield "agreement", "second answers are near", each(within((2,), square=lambda s: s["square"] / 4))
     yield "agreement", "second answers are far", each(within((2,), square=lambda s: 4 * s["square"]))
     yield "agreement", "first answers are far", each(within((1,), square=lambda s: 4 * s["square"]))
-    zeros = lambda sums: 0 * sums["voxels"]  # noqa: E731
     yield (
         "agreement",
         "evidence of two classes swapped",
         each(within((1, 2, 3), evidence_0=lambda s: s["evidence_1"], evidence_1=lambda s: s["evidence_0"])),
     )
-
-    def even(sums: Table, about: Content) -> None:
-        """Say that all classes are as frequent: chance falls, and alpha rises."""
-        K, rows = about["K"], sums["part"] > 0
-        for k in range(K):
-            for name in (f"evidence_{k}", f"class_own_{k}"):
-                if name in sums:
-                    share = np.floor(sums["observations"] / K) + (k < sums["observations"] % K)
-                    sums[name] = np.where(rows, share, sums[name]).astype(sums[name].dtype)
-
     yield "agreement", "classes are as frequent as each other", each(even)
-
-    def answers(*of: int) -> Callable[[Table, Content], None]:
-        """Give the rows of these answers as the first, second and third ones."""
-
-        def change(sums: Table, about: Content) -> None:
-            rows = [np.flatnonzero(sums["part"] == part) for part in (0, *of)]
-            part = np.repeat(np.arange(4), [len(own) for own in rows]).astype(sums["part"].dtype)
-            take(sums, np.concatenate(rows))
-            sums["part"] = part
-
-        return change
-
     yield "agreement", "first and second answers exchanged", each(answers(2, 1, 3))
     yield "agreement", "answers in the opposite order", each(answers(3, 2, 1))
     yield "agreement", "third answers are the second ones", each(answers(1, 2, 2))
     yield "agreement", "third answers are the first ones", each(answers(1, 2, 1))
     yield "agreement", "second answers are the third ones", each(answers(1, 3, 3))
 
-    def named(change: Callable[[list[str]], list[str]]) -> Callable[[Table, Content], None]:
-        def of(sums: Table, about: Content) -> None:
-            about["classes"] = change(about["classes"])
 
-        return of
-
+def forged_classes() -> Iterator[Forgery]:
+    """Yield edits of classes."""
     yield "classes", "an unknown class", each(named(lambda own: ["x", *own[1:]]))
     yield "classes", "classes in another order", each(named(lambda own: own[::-1]))
     yield "classes", "no names", each(named(lambda own: []))
@@ -452,38 +321,212 @@ def by_hand() -> Iterator[Forgery]:  # noqa: PLR0915  a list
     )
     yield "classes", "no ground truth", each(lambda sums, about: about.update(truth=not about["truth"]))
 
-    def if_truth(**columns: Callable[[Table], np.ndarray]) -> Callable[[Table, Content], None]:
-        def change(sums: Table, about: Content) -> None:
-            if about["truth"]:
-                within((0,), **columns)(sums, about)
 
-        return change
-
+def forged_truth() -> Iterator[Forgery]:
+    """Yield edits of what is right by the ground truth."""
     yield "truth", "nothing consistent is wrong", each(if_truth(consistent_wrong=zeros))
     yield "truth", "nothing is consistent", each(if_truth(consistent_wrong=zeros, consistent=zeros))
     yield "truth", "all is right", each(if_truth(right=lambda s: s["known"]))
     yield "truth", "all is right, nothing wrong", each(if_truth(right=lambda s: s["known"], consistent_wrong=zeros))
-
-    def right(sums: Table, about: Content) -> None:
-        if not about["truth"]:
-            return
-        made = {"right": lambda s: s["known"], "consistent_wrong": zeros, "observed_right": lambda s: s["observed"]}
-        for k in range(about["K"]):
-            for name in ("class_right", "class_predicted"):
-                made[f"{name}_{k}"] = lambda s, k=k: s[f"class_known_{k}"]
-        within((0,), **made)(sums, about)
-
     yield "truth", "all is right, class by class", each(right)
-
-    def only_right(sums: Table) -> np.ndarray:
-        if "right" not in sums:
-            return np.arange(len(sums["part"]))
-        good = (sums["part"] > 0) | (sums["frame"] < 0) | (sums["right"] >= 0.8 * sums["known"])
-        return np.flatnonzero(good)
-
     yield "truth", "cubes that are mostly wrong left out", of_rows(only_right)
     for name in ("accuracy", "miou", "wrong_of_consistent"):
         yield "truth", f"{name} is stated as .99", stated(name, value=0.99, undecided="x")
+
+
+# Changes that these are made of
+
+
+def statistics(parts: Parts) -> Iterator[Content]:
+    return (
+        scene["summary"]["statistics"] if "summary" in scene else scene["statistics"]
+        for scene in parts.content["scenes"]
+    )
+
+
+def stated(key: str, **changes: Any) -> Callable[[Parts], None]:
+    def change(parts: Parts) -> None:
+        for own in statistics(parts):
+            own["headline"].setdefault(key, {}).update(changes)
+
+    return change
+
+
+def level(parts: Parts, wanted: str = "stable") -> None:
+    for own in statistics(parts):
+        own["verdict"].update(level=wanted, of_all=None)
+
+
+def each(change: Callable[[Table, Content], None]) -> Callable[[Parts], None]:
+    def of(parts: Parts) -> None:
+        for sums, about in zip(parts.sums, parts.about, strict=True):
+            change(sums, about)
+
+    return of
+
+
+def take(sums: Table, rows: np.ndarray) -> None:
+    for name in sums:
+        sums[name] = sums[name][rows]
+
+
+def of_rows(choose: Callable[[Table], np.ndarray]) -> Callable[[Parts], None]:
+    return each(lambda sums, about: take(sums, choose(sums)))
+
+
+def worst(share: float, parts: tuple[int, ...] = (1, 2, 3)) -> Callable[[Table], np.ndarray]:
+    """Leave out the cubes and views with the least agreement."""
+
+    def choose(sums: Table) -> np.ndarray:
+        rate = sums["agreeing"] / np.maximum(sums["observations"], 1)
+        first = sums["part"] == 1
+        bad = np.quantile(rate[first], share)
+        key = np.stack([sums[name] for name in ("ix", "iy", "iz", "frame")], axis=1)
+        left = {tuple(row) for row in key[first & (rate < bad)].tolist()}
+        out = np.array([tuple(row) in left for row in key.tolist()]) & np.isin(sums["part"], parts)
+        return np.flatnonzero(~out)
+
+    return choose
+
+
+def put_all(**columns: Callable[[Table], np.ndarray]) -> Callable[[Table, Content], None]:
+    def change(sums: Table, about: Content) -> None:
+        sums.update({name: make(sums).astype(sums[name].dtype) for name, make in columns.items()})
+
+    return change
+
+
+def said(**changes: Callable[[list[float]], list[float]]) -> Callable[[Table, Content], None]:
+    def change(sums: Table, about: Content) -> None:
+        about.update({name: make(about[name]) for name, make in changes.items()})
+
+    return change
+
+
+def larger(times: int, frames: int) -> Callable[[Table, Content], None]:
+    """Join cubes, and frames, as honest sums would be made coarser: intervals get wide."""
+
+    def change(sums: Table, about: Content) -> None:
+        for name in ("ix", "iy", "iz"):
+            sums[name] = sums[name] // times
+        sums["frame"] = np.where(sums["frame"] < 0, -1, sums["frame"] // frames)
+        keys = np.stack([sums[name] for name in ("part", "ix", "iy", "iz", "frame")], axis=1)
+        rows, of = np.unique(keys, axis=0, return_inverse=True)
+        for name in list(sums):
+            summed = np.zeros(len(rows))
+            np.add.at(summed, of.ravel(), sums[name].astype(np.float64))
+            sums[name] = summed.astype(sums[name].dtype)
+        for k, name in enumerate(("part", "ix", "iy", "iz", "frame")):
+            sums[name] = rows[:, k]
+        about.update(edge=[times * x for x in about["edge"]], step=[frames * x for x in about["step"]])
+
+    return change
+
+
+numbers = lambda sums: [name for name in sums if name not in ("part", "ix", "iy", "iz", "frame")]  # noqa: E731
+
+
+def times(factor: float, parts: tuple[int, ...] = (0, 1, 2, 3)) -> Callable[[Table, Content], None]:
+    def change(sums: Table, about: Content) -> None:
+        rows = np.isin(sums["part"], parts)
+        for name in numbers(sums):
+            sums[name] = np.where(rows, factor * sums[name], sums[name]).astype(sums[name].dtype)
+
+    return change
+
+
+def within(parts: tuple[int, ...], **columns: Callable[[Table], np.ndarray]) -> Callable[[Table, Content], None]:
+    def change(sums: Table, about: Content) -> None:
+        rows = np.isin(sums["part"], parts)
+        made = {name: np.where(rows, make(sums), sums[name]).astype(sums[name].dtype) for name, make in columns.items()}
+        sums.update(made)
+
+    return change
+
+
+def all_agree(sums: Table) -> np.ndarray:
+    return sums["observations"]
+
+
+zeros = lambda sums: 0 * sums["voxels"]  # noqa: E731
+
+
+def even(sums: Table, about: Content) -> None:
+    """Say that all classes are as frequent: chance falls, and alpha rises."""
+    K, rows = about["K"], sums["part"] > 0
+    for k in range(K):
+        for name in (f"evidence_{k}", f"class_own_{k}"):
+            if name in sums:
+                share = np.floor(sums["observations"] / K) + (k < sums["observations"] % K)
+                sums[name] = np.where(rows, share, sums[name]).astype(sums[name].dtype)
+
+
+def answers(*of: int) -> Callable[[Table, Content], None]:
+    """Give the rows of these answers as the first, second and third ones."""
+
+    def change(sums: Table, about: Content) -> None:
+        rows = [np.flatnonzero(sums["part"] == part) for part in (0, *of)]
+        part = np.repeat(np.arange(4), [len(own) for own in rows]).astype(sums["part"].dtype)
+        take(sums, np.concatenate(rows))
+        sums["part"] = part
+
+    return change
+
+
+def named(change: Callable[[list[str]], list[str]]) -> Callable[[Table, Content], None]:
+    def of(sums: Table, about: Content) -> None:
+        about["classes"] = change(about["classes"])
+
+    return of
+
+
+def if_truth(**columns: Callable[[Table], np.ndarray]) -> Callable[[Table, Content], None]:
+    def change(sums: Table, about: Content) -> None:
+        if about["truth"]:
+            within((0,), **columns)(sums, about)
+
+    return change
+
+
+def right(sums: Table, about: Content) -> None:
+    if not about["truth"]:
+        return
+    made = {"right": lambda s: s["known"], "consistent_wrong": zeros, "observed_right": lambda s: s["observed"]}
+    for k in range(about["K"]):
+        for name in ("class_right", "class_predicted"):
+            made[f"{name}_{k}"] = lambda s, k=k: s[f"class_known_{k}"]
+    within((0,), **made)(sums, about)
+
+
+def only_right(sums: Table) -> np.ndarray:
+    if "right" not in sums:
+        return np.arange(len(sums["part"]))
+    good = (sums["part"] > 0) | (sums["frame"] < 0) | (sums["right"] >= 0.8 * sums["known"])
+    return np.flatnonzero(good)
+
+
+def unwrong(parts: Parts) -> None:
+    stated("wrong_of_consistent", value=0.0, low=0.0, high=0.0, undecided="x")(parts)
+    level(parts)
+
+
+def flicker(parts: Parts) -> None:
+    for scene in parts.content["scenes"]:
+        scene["flicker"] = [0.01] * len(scene["flicker"])
+        scene.get("summary", scene)["flicker_percent"] = 0.01
+
+
+def frames(parts: Parts) -> None:
+    for scene in parts.content["scenes"]:
+        scene.get("summary", scene)["frames"] += 100
+
+
+def classes(parts: Parts) -> None:
+    for own in statistics(parts):
+        own["spots"]["classes"] = own["spots"]["classes"][:1]
+
+
+number = lambda sums: np.arange(len(sums["part"]))  # noqa: E731
 
 
 # --- What becomes of them ---------------------------------------------------------------------------------------------

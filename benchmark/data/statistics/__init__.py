@@ -21,7 +21,7 @@ from semstab.data.statistics.correctness import Correctness, CorrectnessStatisti
 from semstab.data.statistics.drift import DriftStatistics, Flipping, FlipRates, FrameDisagreement, OutlyingFrames
 from semstab.data.statistics.features import FeatureAgreement, FeaturePlace
 from semstab.data.statistics.groupings import Grouping, Groupings, Merge
-from semstab.data.statistics.intervals import CONFIDENCE, UNDEFINED, UNKNOWN, Estimate, Interval, short
+from semstab.data.statistics.intervals import CONFIDENCE, UNDEFINED, UNKNOWN, Estimate, Interval, short, without_zero
 from semstab.data.statistics.map_statistics import (
     ORDER_KNOWN,
     EntropyParts,
@@ -84,4 +84,5 @@ __all__ = [
     "metres",
     "poses_that_do_not_fit",
     "short",
+    "without_zero",
 ]

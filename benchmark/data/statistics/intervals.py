@@ -32,19 +32,24 @@ class Estimate:
         return Estimate(100 * self.value, 100 * self.low, 100 * self.high, level=self.level)
 
     @property
-    def of(self) -> str:
+    def interval_name(self) -> str:
         """The interval's name in print, '95 % CI'."""
         return f"{100 * self.level:g} % CI"
 
-    def text(self, sign: str = "") -> str:
+    def text(self, sign: str = "", *, digits: int = 2) -> str:
         """Return '.68 (.52 to .78)'; '.68' without an interval."""
-        ends = "" if math.isnan(self.low) else f" ({short(self.low, sign)} to {short(self.high, sign)})"
-        return f"{short(self.value, sign)}{ends}"
+        value, low, high = (short(number, sign, digits=digits) for number in (self.value, self.low, self.high))
+        return value if math.isnan(self.low) else f"{value} ({low} to {high})"
 
 
 def short(value: float, sign: str = "", *, digits: int = 2) -> str:
     """Return a number from -1 to 1 without the 0 before its point: '.55', '-.19', '1.00'; '-' if undefined."""
-    return "-" if math.isnan(value) else re.sub(r"^([+-]?)0\.", r"\1.", f"{value:{sign}z.{digits}f}")
+    return "-" if math.isnan(value) else without_zero(f"{value:{sign}z.{digits}f}")
+
+
+def without_zero(text: str) -> str:
+    """Return printed numbers without the 0 before their point: '.550 (-.101, 1.000)'."""
+    return re.sub(r"(?<![\d.,])0(?=\.\d)", "", text)
 
 
 UNDEFINED = Estimate(math.nan, math.nan, math.nan)

@@ -2,30 +2,14 @@
 
 from __future__ import annotations
 
-import dataclasses
 import math
-import textwrap
 from collections.abc import Iterator, Mapping, Sequence
-from pathlib import Path
 
-from semstab.comparison.locations import MOST
-from semstab.comparison.quantities import BY_CLASS, COVERAGE, FLICKER, HEADLINES, IOU, RECALL, by_name
-from semstab.core.console import Console
-from semstab.core.types import SCOPE_WORDS
-from semstab.data.contrast import (
-    Against,
-    Area,
-    Basis,
-    ComparedObservations,
-    Contrast,
-    FrameShare,
-    MapCoverage,
-    RunComparison,
-)
+from semstab.comparison.quantities import BY_CLASS, COVERAGE, HEADLINES, IOU, RECALL, by_name
+from semstab.data.contrast import Against, Area, ComparedObservations, Contrast, FrameShare, MapCoverage, RunComparison
 from semstab.data.measures import Quantity
 from semstab.data.statistics import CONFIDENCE, Interval
-from semstab.report.tables.table import Column, Group, Row, Table, to_terminal
-from semstab.report.terminal import WIDTH
+from semstab.report.tables.table import Column, Group, Row, Table
 from semstab.statistics.agreement import ALPHA, PSA
 from semstab.statistics.intervals import LEAST_FRAMES
 
@@ -158,7 +142,7 @@ def _class_rows(against: Against, quantities: Sequence[Quantity]) -> tuple[Row, 
 def _areas(comparison: RunComparison) -> Table:
     columns = (
         Column("number", "Area", 0), Column("what", "Lost"), Column("class", "Class"),
-        Column("confused_with", "Confused with"), Column("voxels", "Voxels", 0), Column("loss", "Loss", 2),
+        Column("confused_with", "Confused with"), Column("voxels", "Voxels", 0), Column("loss", "Loss", 3),
         *(Column(axis, axis, 2, over="Centre (m)") for axis in "xyz"), Column("size", "Size (m)", 2),
         Column("improved_alike", "Improved as much", 0), Column("frames", "Top contributing frames"),
     )  # fmt: skip
@@ -280,218 +264,3 @@ def _coverage_row(row: MapCoverage) -> Row:
         100 * row.common_share,
         row.alone,
     )
-
-
-# The results of a comparison in sentences, for the terminal, Markdown and the top of the report.
-
-MOST_CLASSES = 4
-"""Most classes that a sentence names."""
-
-BASES: dict[Basis, str] = {
-    "observations": "paired; alpha counts the views of a spot that all runs label",
-    "voxels": "paired on the voxels that all runs saw twice or more",
-    "cubes": "paired on cubes of space",
-    "flights": "not paired",
-    "images": "paired on frames",
-}
-
-
-def sentences(comparison: RunComparison) -> list[str]:
-    """Return the results of one run after the other, then notes on data that could not be compared."""
-    return [*answers(comparison), *(f"caution: {text}." for text in comparison.cautions), *notes(comparison)]
-
-
-def answers(comparison: RunComparison) -> list[str]:
-    """Return the differences, run by run."""
-    return [sentence for against in comparison.overall for sentence in _of_run(comparison, against)]
-
-
-def notes(comparison: RunComparison) -> list[str]:
-    """Return the paired data, and notes on data that could not be compared, scene by scene."""
-    lines = []
-    for scene in comparison.scenes:
-        if scene.basis in ("observations", "voxels"):
-            lines.append(f"{scene.scene}: {scene.voxels:,} voxels, {BASES[scene.basis]}.")
-        if scene.observations is not None:
-            lines += [f"{scene.scene}: {text}." for text in left_out(scene.observations)]
-        lines += [f"{scene.scene}: {note}." for note in scene.notes]
-    return lines
-
-
-def left_out(observations: ComparedObservations) -> Iterator[str]:
-    """Yield the share of the observations that each run left out, and alpha where that counts against it."""
-    for row in observations.ignored:
-        if row.missing >= LEAST_LEFT_OUT:
-            counted = f"alpha is {row.alpha:.3f} if the pixels that it leaves out disagree"
-            yield f"{row.model} gives no label to {row.missing:.1%} of the pixels that others label; {counted}"
-    if observations.depends and any(row.missing >= LEAST_LEFT_OUT for row in observations.ignored):
-        yield "the order of the runs depends on the pixels that were left out"
-
-
-LEAST_LEFT_OUT = 0.005
-"""Least share of pixels left without a label that is reported."""
-
-
-def _of_run(comparison: RunComparison, against: Against) -> Iterator[str]:
-    yield _stability(comparison, against)
-    if changes := _changes(against.contrasts, by_name([row for row in HEADLINES if row is not COVERAGE])):
-        yield f"{against.other}: {changes}."
-    yield from _coverage(comparison, against)
-    classes = {
-        name: [row for row in against.by_class if row.of == name]
-        for name in dict.fromkeys(r.of for r in against.by_class)
-    }
-    notes = {name: _changes(rows, by_name(BY_CLASS)) for name, rows in classes.items()}
-    if listed := [f"{name} ({text})" for name, text in notes.items() if text]:
-        unlisted = len(listed) - MOST_CLASSES
-        more = f" and {unlisted} more {'class' if unlisted == 1 else 'classes'}" if len(listed) > MOST_CLASSES else ""
-        yield f"{against.other} by class: {', '.join(listed[:MOST_CLASSES])}{more}."
-    for scene in comparison.scenes:
-        of_scene = next(row for row in scene.against if row.other == against.other)
-        for what in ("agreement", "truth"):
-            if areas := [area for area in of_scene.areas if area.what == what]:
-                yield f"{against.other} in {scene.scene}: {_of_areas(areas, scene.crs)}."
-
-
-def _flicker(comparison: RunComparison, against: Against) -> str:
-    """Return the difference of flicker, the one measure of videos."""
-    row = next((row for row in against.contrasts if row.measure == FLICKER.name), None)
-    if row is None:
-        return f"Flicker of {against.other} and {comparison.base} cannot be compared: run both on the same frames."
-    change, p = row.difference, "" if math.isnan(row.p_holm) else f", p {row.p_holm:.2g} (Holm)"
-    relation = {"better": "flickers less than", "worse": "flickers more than"}.get(
-        row.change, "is not shown to differ from"
-    )
-    return (
-        f"{against.other} {relation} {comparison.base}: flicker {row.other:.2f} %"
-        f" against {row.base:.2f} %, {change.value:+z.2f} ({change.low:+z.2f} to {change.high:+z.2f}){p}."
-    )
-
-
-def _stability(comparison: RunComparison, against: Against) -> str:
-    """Return the difference of alpha, on which verdicts rest."""
-    row = next((row for row in against.contrasts if row.measure == ALPHA.name), None)
-    if row is None and all(scene.basis == "images" for scene in comparison.scenes):
-        return _flicker(comparison, against)
-    if row is None:
-        return f"Alpha of {against.other} or {comparison.base} is not known: run it with more overlap between frames."
-    where = f" over {len(comparison.scenes)} scenes" if len(comparison.scenes) > 1 else ""
-    numbers = f"{ALPHA.word} {row.other:.3f} against {row.base:.3f}{where}"
-    if row.difference.value == row.difference.low == row.difference.high == 0:
-        return f"{against.other} is as stable as {comparison.base}: {numbers}, the same everywhere."
-    interval = f"{row.difference.value:+z.3f} ({row.difference.low:+z.3f} to {row.difference.high:+z.3f})"
-    p = "" if math.isnan(row.p_holm) else f", p {row.p_holm:.2g} (Holm)"
-    text = {"better": "is more stable than", "worse": "is less stable than"}
-    other, base = pair = against.other, comparison.base
-    if silent := [run.name for run in comparison.runs if run.uninformative and run.name in pair]:
-        which = f"{' and '.join(silent)} {'is' if len(silent) == 1 else 'are'} nearly one class all over"
-        return f"{other} and {base} are not ranked, as {which}: {numbers}, {interval}{p}."
-    if row.change:
-        return f"{other} {text[row.change]} {base}: {numbers}, {interval}{p}, {_flown_again(comparison, row)}."
-    why = f"; undecided: {row.difference.undecided}" if row.difference.undecided else ""
-    return (
-        f"Over all classes, no difference in stability between {other} and {base} is shown: {numbers},"
-        f" {interval}{p}, {_flown_again(comparison, row)}{why}."
-    )
-
-
-def _flown_again(comparison: RunComparison, row: Contrast) -> str:
-    """Return what the interval of a difference is for."""
-    words = SCOPE_WORDS[row.difference.scope]
-    return words.replace("this scene", "these scenes") if len(comparison.scenes) > 1 else words
-
-
-LEAST_COVERAGE = 0.005
-"""Least change of coverage that is reported: it is a count, so that any difference is a fact, however small."""
-
-
-def _coverage(comparison: RunComparison, against: Against) -> Iterator[str]:
-    for row in against.contrasts:
-        change = row.difference.value
-        if row.measure == COVERAGE.name and abs(change) >= LEAST_COVERAGE:
-            more = "more" if change > 0 else "fewer"
-            yield f"{against.other} covers {abs(change):.1%} {more} voxels than {comparison.base}."
-
-
-def _changes(rows: Sequence[Contrast], quantities: Mapping[str, Quantity]) -> str:
-    """Return 'worse in mIoU, recall; better in flicker'."""
-    listed = {
-        change: [quantities[row.measure].word for row in rows if row.change == change and row.measure in quantities]
-        for change in ("worse", "better")
-    }
-    return "; ".join(f"{change} in {', '.join(names)}" for change, names in listed.items() if names)
-
-
-def _of_areas(areas: Sequence[Area], crs: str) -> str:
-    first = areas[0]
-    lost = "whose frames agree less" if first.what == "agreement" else "that are wrong now"
-    count = f"{MOST} or more areas" if len(areas) == MOST else f"{len(areas)} area{'s' if len(areas) > 1 else ''}"
-    improved_text = f"noise would improve as many; {first.improved_alike or 'none'} improved by as much as the largest"
-    confused_with = f", confused with {first.confused_with}" if first.confused_with else ""
-    x, y, z = first.centre
-    system = f" of {crs}" if crs else ""
-    frames = f"; the top contributing frames are {top_frames(first.frames)}" if first.frames else ""
-    return (
-        f"{count} {lost} ({improved_text}); the largest is {first.voxels:,} voxels of"
-        f" {first.of}{confused_with}, at ({x:.2f}, {y:.2f}, {z:.2f}) m{system}{frames}"
-    )
-
-
-# --- In a terminal of 80 columns --------------------------------------------------------------------------------------
-
-SHOWN = {
-    "comparison": ("measure", "base", "other", "difference", "p_holm", "change"),
-    "comparison_classes": ("class", "worse", "better", ALPHA.name),
-    "comparison_areas": ("class", "confused_with", "voxels", "loss", "x", "y", "z"),
-}
-"""The columns of each table that fit; files have all of them."""
-
-LEGEND = (
-    "PSA: share of the pairs of frames that give a voxel one class; SBD excess: SBD minus SBD in random order; ECE:"
-    " belief against accuracy; consistent but wrong: share of the voxels whose frames agree on a wrong class; voxel"
-    " alpha: alpha of a voxel's frames; coverage: voxels, of the base's; p (Holm): corrected for all measures"
-)
-"""The meaning of the measures that the screen of a run does not explain."""
-
-LONGEST_NAME = 8
-"""The longest names of runs over the columns of their numbers."""
-
-
-def print_comparison(
-    comparison: RunComparison, console: Console, *, verbose: bool = False, out: Path | None = None
-) -> None:
-    """Print the answer in sentences, the differences and the notes; verbose: also classes and areas.
-
-    `out` is the folder that they were written to.
-    """
-    for sentence in (*answers(comparison), *(f"caution: {text}." for text in comparison.cautions)):
-        console.print(sentence, highlight=False, markup=False)
-    for table in tables(comparison):
-        if table.name == "comparison" or (verbose and table.name in SHOWN):
-            fitting = _fitting(table.only(*SHOWN[table.name]), comparison)
-            text = to_terminal(dataclasses.replace(fitting, caption=""), WIDTH)
-            console.print(f"\n{text}", highlight=False, markup=False, soft_wrap=True)
-        if table.name == "comparison":
-            legend = textwrap.wrap(f"  {LEGEND}", WIDTH, subsequent_indent="    ", break_on_hyphens=False)
-            console.print("\n".join([*legend, ""]), highlight=False, markup=False)
-    for sentence in notes(comparison):
-        wrapped = textwrap.wrap(f"  {sentence}", console.width, subsequent_indent="    ")
-        console.print("\n".join(wrapped), highlight=False, markup=False)
-    more = [*([] if verbose else ["-v: classes and areas"]), *([] if out else ["--out DIR: report.html, tables, maps"])]
-    if more:
-        console.print(f"  more     {'; '.join(more)}", highlight=False)
-
-
-def _fitting(table: Table, comparison: RunComparison) -> Table:
-    """Return a table with scenes as groups if the base is compared with one run, and with long names in the title."""
-    if len(comparison.runs) == 2:
-        pair = heading(comparison, "", comparison.overall[0])
-        groups = (dataclasses.replace(group, name=group.name.removesuffix(pair)) for group in table.groups)
-        table = dataclasses.replace(table, groups=tuple(groups))
-    heads = {column.key: column.header for column in table.columns if column.key in ("base", "other")}
-    if max(map(len, heads.values()), default=0) <= LONGEST_NAME:
-        return table
-    short = {"base": "Base", "other": "Other"}
-    columns = (dataclasses.replace(column, header=short.get(column.key, column.header)) for column in table.columns)
-    other = f", other: {heads['other']}" if heads["other"] != short["other"] else ""
-    return dataclasses.replace(table, title=f"{table.title} (base: {comparison.base}{other})", columns=tuple(columns))

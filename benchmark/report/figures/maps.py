@@ -354,7 +354,7 @@ class TopViews:
         """Return the measures of the unit's voxels, by OP."""
         slug = record.unit.slug
         if slug not in self._sums:
-            tables = record.tiles() if record.in_tiles else [self._tables.of(record)]
+            tables = record.tiles() if record.in_tiles else [self._tables.table_of(record)]
             self._sums[slug] = together([histograms(table) for table in tables])
         return self._sums[slug]
 
@@ -363,7 +363,7 @@ class TopViews:
         slug = record.unit.slug
         if self._last is None or self._last[0] != slug:
             large = record.in_tiles and record.summary.table.voxels > MOST
-            table = topmost(record.tiles(), up) if large else self._tables.of(record)
+            table = topmost(record.tiles(), up) if large else self._tables.table_of(record)
             self._last = slug, FromAbove.of(table, up)
         return self._last[1]
 

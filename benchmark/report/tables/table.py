@@ -15,6 +15,7 @@ from typing import Any, Literal
 
 from semstab.core.files import csv_text
 from semstab.data.measures import Quantity
+from semstab.data.statistics import without_zero
 from semstab.report.means import RepeatSpread
 from semstab.statistics import Estimate
 
@@ -26,6 +27,9 @@ ALL_VOXELS, OF_ROW = "All voxels", "Of these voxels"
 
 POPULATIONS = {ALL_VOXELS: "_all", OF_ROW: "", "OP>=2": "_op2", "OP>=3": "_op3"}
 """Headings over columns of measures, and the suffix that their keys have for it."""
+
+SHARE_DIGITS = 3
+"""Least decimals of measures from 0 to 1; metres, percent and counts have fewer."""
 
 Cell = str | int | float | RepeatSpread | Estimate
 Row = tuple[Cell, ...]
@@ -83,6 +87,11 @@ class Column:
             return self.number(cell)
         spread = "" if math.isnan(cell.sd) else f" ± {cell.sd:,.{self.digits}f}"
         return self.number(cell.mean) + spread
+
+    def short_text(self, cell: Cell) -> str:
+        """Return the cell on a screen: numbers of three decimals or more, which have no unit, without the leading 0."""
+        text = self.text(cell)
+        return without_zero(text) if self.digits is not None and self.digits >= SHARE_DIGITS else text
 
 
 @dataclass(frozen=True)
@@ -227,7 +236,7 @@ def to_terminal(table: Table, width: int = 0) -> str:
         grid.add_column(
             escape(header), justify="right" if number else "left", vertical="bottom", no_wrap=number, overflow="fold"
         )
-    for heading, rows in sections(table):
+    for heading, rows in sections(table, Column.short_text):
         if heading:
             grid.add_row(f"[bold]{escape(heading)}[/]")
         for row in rows:
@@ -256,14 +265,14 @@ def to_json(table: Table) -> dict[str, Any]:
     }
 
 
-def sections(table: Table) -> Iterator[tuple[str, list[list[str]]]]:
+def sections(table: Table, text: Callable[[Column, Cell], str] = Column.text) -> Iterator[tuple[str, list[list[str]]]]:
     """Yield the rows between two rules: the rows of a group under its name, then its total.
 
-    A single group has no heading.
+    A single group has no heading. `text` prints a cell.
     """
 
     def cells(row: tuple[Cell, ...]) -> list[str]:
-        return [column.text(cell) for column, cell in zip(table.columns, row, strict=True)]
+        return [text(column, cell) for column, cell in zip(table.columns, row, strict=True)]
 
     for group in table.groups:
         yield group.name if len(table.groups) > 1 else "", [cells(row) for row in group.rows]

@@ -18,12 +18,12 @@ WITHOUT = "no VSS, SBD, entropy, flicker, classes and verdict: they need labels"
 def features_alone(features: FeatureAgreement, record: Record) -> Iterator[str]:
     """Yield alpha of features, by range, time and angle, the frames that stand out, and the worst places."""
     alpha = features.alpha
-    ends = "" if math.isnan(alpha.low) else f" ({alpha.of} {short(alpha.low)} to {short(alpha.high)})"
+    ends = "" if math.isnan(alpha.low) else f" ({alpha.interval_name} {short(alpha.low)} to {short(alpha.high)})"
     yield f"  FEATURES    alpha {short(alpha.value)}{ends}    {features.components} components"
     fraction = f", 1 in {features.one_in} kept" if features.one_in > 1 else ""
     yield from wrapped(
-        f"mean cosine {features.cosine:.2f} of two views at one of {features.spots:,} spots{fraction},"
-        f" {features.chance:.2f} of any two"
+        f"mean cosine {short(features.cosine)} of two views at one of {features.spots:,} spots{fraction},"
+        f" {short(features.chance)} of any two"
     )
     yield from wrapped(WITHOUT)
     yield ""
@@ -47,7 +47,7 @@ def feature_lines(features: FeatureAgreement) -> Iterator[str]:
         outliers = features.outlying_frames.frames
         more = f" and {len(outliers) - 3} more" if len(outliers) > 3 else ""
         listed = ", ".join(
-            f"{outlier.name} (cosine {1 - 2 * outlier.share:.2f}, others {1 - 2 * outlier.null:.2f})"
+            f"{outlier.name} (cosine {short(1 - 2 * outlier.share)}, others {short(1 - 2 * outlier.null)})"
             for outlier in outliers[:3]
         )
         yield from wrapped(f"frames that stand out: {listed}{more}")
@@ -55,7 +55,7 @@ def feature_lines(features: FeatureAgreement) -> Iterator[str]:
         x, y, z = place.centre
         frames = ", ".join(map(str, place.frames))
         yield from wrapped(
-            f"place at ({x:.1f}, {y:.1f}, {z:.1f}) m: cosine {place.cosine:.2f},"
+            f"place at ({x:.1f}, {y:.1f}, {z:.1f}) m: cosine {short(place.cosine)},"
             f" {percent(place.share)} of the disagreement; frames {frames}"
         )
 

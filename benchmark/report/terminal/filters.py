@@ -7,15 +7,26 @@ import textwrap
 from rich.console import Console
 
 from semstab.data.records import Result
+from semstab.data.statistics import short
 from semstab.report.filter_study import advice, filter_studies
 from semstab.report.tables.filters import row as filter_row
+from semstab.report.tables.table import Cell
 from semstab.report.terminal.layout import WIDTH, number
+
+ALPHA_DIGITS = 3
 
 FILTER_HEADS = (
     ("", "chan-", "flick", "", "next", "accu-", "", "same,", "", "", "", ""),
     ("filter", "ged %", "%", "alpha", "%", "racy", "mIoU", "wrong", "lag", "cov.", "ms", ""),
 )
 """The two lines above the rows of filters: 'next' is the next frame, 'same, wrong' consistent but wrong labels."""
+
+
+def _cell(value: Cell, digits: int) -> str:
+    """Return a cell in print; alpha, the one with three digits, without the 0 before its point."""
+    if not isinstance(value, float):
+        return str(value)
+    return short(value, digits=digits) if digits == ALPHA_DIGITS else number(value, digits)
 
 
 def print_filter_study(result: Result, console: Console) -> None:
@@ -31,7 +42,7 @@ def print_filter_study(result: Result, console: Console) -> None:
                 console.print(f"    {part}", highlight=False, markup=False)
             name = f" +{last}" if first else last
             digits = (2, 1, 3, 1, 1, 1, 1, 1, 0, 0)
-            cells = [number(c, d) if isinstance(c, float) else str(c) for c, d in zip(row[1:-1], digits, strict=True)]
+            cells = [_cell(c, d) for c, d in zip(row[1:-1], digits, strict=True)]
             line = f"    {name:<17}{''.join(f'{cell:>6}' for cell in cells)}  {row[-1]}"
             console.print(line.rstrip(), highlight=False, markup=False, soft_wrap=True)
     text = (

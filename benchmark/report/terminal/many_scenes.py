@@ -13,7 +13,7 @@ from semstab.data.records import Record, Result
 from semstab.data.statistics import CONFIDENCE, Estimate, short
 from semstab.metrics import macro_mean
 from semstab.report.means import ENOUGH, by_model, pooled
-from semstab.report.ranking import answers
+from semstab.report.ranking import order_of_models
 from semstab.report.terminal.disagreement import class_lines
 from semstab.report.terminal.head import head_lines
 from semstab.report.terminal.layout import common_beginning, cut, laid_out, legend, number, percent, wrapped
@@ -33,7 +33,7 @@ def many_scenes(result: Result, records: Sequence[Record], width: int) -> Iterat
     """Yield the answer, a row for each model over all scenes, a line for each scene, and what refutes a verdict."""
     listed = ", ".join(result.scenes) if len(result.scenes) <= 3 else f"{len(result.scenes)} scenes"
     yield from head_lines(listed, result, [record.summary for record in records], width)
-    for text in (sentences := list(answers(result))):
+    for text in (sentences := list(order_of_models(result))):
         yield from wrapped(text)
     if sentences:
         yield ""

@@ -122,5 +122,5 @@ def _interval(estimate: Estimate, scale: float = 1.0) -> str:
     if math.isnan(estimate.low) or math.isnan(estimate.high):
         return ""
     if scale == 1.0:
-        return f" ({estimate.of} {short(estimate.low)} to {short(estimate.high)})"
+        return f" ({estimate.interval_name} {short(estimate.low)} to {short(estimate.high)})"
     return f" ({scale * estimate.low:z.0f} to {scale * estimate.high:z.0f} %)"

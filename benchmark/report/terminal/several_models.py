@@ -11,7 +11,7 @@ from semstab.data.statistics import UNDEFINED, short
 from semstab.metrics import CATEGORIES
 from semstab.predict.prompts import Changes
 from semstab.report.means import ENOUGH
-from semstab.report.ranking import answers
+from semstab.report.ranking import order_of_models
 from semstab.report.terminal.disagreement import class_lines, outlying_lines
 from semstab.report.terminal.head import head_lines
 from semstab.report.terminal.layout import common_beginning, cut, laid_out, legend, number, percent, percents, wrapped
@@ -22,7 +22,7 @@ from semstab.statistics.verdict import DANGEROUS
 def columns() -> list[tuple[str, str]]:
     """Return the head and the unit or the population of each number in a model's row, see `row_of`."""
     measure_columns = [(m.title, "OP>=3") for m in headlines()]
-    texts = [("model", ""), ("verdict", "p: probability"), (f"alpha ({UNDEFINED.of})", "")]
+    texts = [("model", ""), ("verdict", "p: probability"), (f"alpha ({UNDEFINED.interval_name})", "")]
     return [*texts, ("agree", "%"), ("flicker", "%"), *measure_columns, ("mIoU", "OP>=2")]
 
 
@@ -65,7 +65,7 @@ MOST_MAPS = 2
 def several_models(result: Result, records: Sequence[Record], width: int) -> Iterator[str]:
     """Yield which model is more stable where that is known, then a row for each model."""
     yield from head_lines(result.scenes[0], result, [record.summary for record in records], width)
-    for text in (sentences := list(answers(result))):
+    for text in (sentences := list(order_of_models(result))):
         yield from wrapped(text)
     if sentences:
         yield ""

@@ -7,7 +7,7 @@ from collections.abc import Iterator, Sequence
 from semstab.data.records import Record, Result
 from semstab.metrics.image_space import mean_over_scenes
 from semstab.report.means import by_model
-from semstab.report.ranking import answers, least_flicker_first
+from semstab.report.ranking import least_flicker_first, order_of_models
 from semstab.report.terminal.disagreement import outlying_lines
 from semstab.report.terminal.layout import laid_out, number, wrapped
 
@@ -38,7 +38,7 @@ def videos(result: Result, records: Sequence[Record], width: int) -> Iterator[st
     listed = result.scenes[0] if len(result.scenes) == 1 else f"{len(result.scenes)} videos"
     yield f"{listed}    {counts} frames of {sizes}, {classes} classes    no depth, no poses"
     yield ""
-    for text in answers(result):
+    for text in order_of_models(result):
         yield from wrapped(text)
     models, rows = by_model(records), [HEADS]
     for name in least_flicker_first(models):

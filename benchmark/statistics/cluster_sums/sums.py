@@ -96,7 +96,7 @@ class ClusterSums:
         """Return sums (m, 1), or (m, K) by class, of that name."""
         return self.columns[:, self.layout[name]]
 
-    def of(self, names: Sequence[str]) -> Float64:
+    def side_by_side(self, names: Sequence[str]) -> Float64:
         """Return sums (m, C) of several names side by side."""
         return np.concatenate([self[name] for name in names], axis=1)
 
@@ -165,7 +165,7 @@ class ClusterSums:
         """Return the sums without the columns of ground truth."""
         names = [name for name in self.layout if name not in OF_TRUTH]
         slices = side_by_side({name: self[name].shape[1] for name in names})
-        return dataclasses.replace(self, columns=self.of(names), layout=slices)
+        return dataclasses.replace(self, columns=self.side_by_side(names), layout=slices)
 
     def save(self, path: str | Path, *, single: bool = False) -> None:
         """Write Parquet, atomically; in single precision, which takes half the bytes and keeps seven digits."""
