@@ -5,7 +5,8 @@
     python scripts/mutate.py --at benchmark/metrics/summary.py:143  # all mutants of a line
 
 A mutant lives in a copy of the repository. It meets the tests that `make quick` runs after a change of its file, those
-that name its function or class first, until one fails; a test is said to have killed it only if it passes without it.
+that name its function or class first, of equally near ones those that take less time, until one fails. A test is said
+to have killed it only if it passes without it, and one that hangs only if it soon ends without it: else it stays open.
 Mutants that survive either do what the code did, or show that a test is missing: at most a quarter of those that change
 behaviour may. Where the time is over before all tests have started, a mutant stays open.
 """
@@ -34,7 +35,10 @@ from pathlib import Path
 from quick import FOLDERS, ROOT, module_of, selected
 
 HANGS = 120
-"""Seconds after the last test was started until a mutant counts as one that hangs."""
+"""Seconds after the last moment at which a test may start until it counts as one that hangs, ..."""
+
+SOON = HANGS / 5
+"""... if it ends within these seconds without the mutant: on a busy machine each test may take long."""
 
 SWAPPED: dict[type[ast.AST], type[ast.AST]] = {
     ast.Add: ast.Sub, ast.Sub: ast.Add, ast.Mult: ast.Div, ast.Div: ast.Mult, ast.And: ast.Or, ast.Or: ast.And,
@@ -174,26 +178,54 @@ class Copy:
         (self.folder / file).write_bytes(content)
         os.utime(self.folder / file, (stamp := next(self._stamps), stamp))
 
-    def first_failure(self, tests: list[str], seconds: float) -> str | None:
-        """Return the first test that fails, None if all pass, OPEN if some did not start within `seconds`."""
-        command = [sys.executable, "-m", "pytest", "-x", "-q", "--tb=no", "-rfE", "-p", "no:cacheprovider", *tests]
-        until = time.time() + seconds
+    def first_failure(self, tests: list[str], seconds: float, longest: float = HANGS) -> str | None:
+        """Return the first test that fails, None if all pass, OPEN if some did not start within `seconds`.
+
+        If a test is still at work `longest` seconds later, it is that test, after HANG.
+        """
+        options = ("-x", "-v", "--tb=no", "-rfE", "--durations=0", "-p", "no:cacheprovider")
+        command, until = [sys.executable, "-m", "pytest", *options, *tests], time.time() + seconds
         own = {"PYTHONPATH": str(self.folder / "src"), "SEMSTAB_TESTS_UNTIL": str(until), "COLUMNS": "300"}
         with subprocess.Popen(
             command, cwd=self.folder, env=os.environ | own, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True,
         ) as process:  # fmt: skip
             try:
-                said, _ = process.communicate(timeout=seconds + HANGS)
-            except subprocess.TimeoutExpired:
+                said, _ = process.communicate(timeout=seconds + longest)
+            except subprocess.TimeoutExpired as ended:
                 process.kill()
-                return HANG
+                said = ended.output or b""  # bytes, though the process was opened for text
+                return HANG + at_work(said.decode() if isinstance(said, bytes) else said)
+        record(said)
         if process.returncode in (0, 5):  # 5: no tests are left
             return OPEN if time.time() > until else None
         failed = re.search(r"^(?:FAILED|ERROR) (.*?)(?: - .*)?$", said, re.MULTILINE)
         return failed[1] if failed else f"pytest ended with code {process.returncode}: {said[-200:]}"
 
 
-HANG = "a test that hangs"
+def at_work(said: str) -> str:
+    """Return the test that pytest had begun, and not ended, when it was killed; '' if it had begun no test."""
+    last = said.rsplit("\n", 1)[-1].strip()
+    return last if "::" in last else ""
+
+
+def record(said: str) -> None:
+    """Keep how long the tests of each file took, as pytest lists it."""
+    seconds = collections.Counter[str]()
+    for taken, file in re.findall(r"^ *([\d.]+)s (?:call|setup|teardown) +([^:\s]+)::", said, re.MULTILINE):
+        seconds[file] += float(taken)
+    TAKEN.update({file: max(own, TAKEN.get(file, 0.0)) for file, own in seconds.items()})
+
+
+def cost(test: Path) -> float:
+    """Return the seconds that a test file took, or else, after all that are known, its size."""
+    return TAKEN.get(str(test), UNKNOWN + (ROOT / test).stat().st_size)
+
+
+TAKEN: dict[str, float] = {}
+"""Seconds that the tests of a file took with a mutant so far."""
+
+UNKNOWN = 1e6
+HANG = "a test that hangs: "
 OPEN = "open: the time was over before all tests had started"
 
 
@@ -202,7 +234,8 @@ def met(mutant: Mutant, copies: queue.Queue[Copy], seconds: float) -> str | None
     module = module_of(mutant.file)
     assert module is not None
     own = f"src/{module.replace('.', '/')}"
-    tests = sorted(selected({mutant.file}), key=lambda test: mutant.within not in (ROOT / test).read_text("utf-8"))
+    nearest = selected({mutant.file}, cost)
+    tests = sorted(nearest, key=lambda test: mutant.within not in (ROOT / test).read_text("utf-8"))
     words = [*map(str, tests), own + (".py" if (ROOT / f"{own}.py").exists() else "/__init__.py")]
     content, copied, passed = (ROOT / mutant.file).read_bytes(), copies.get(), list[str]()
     until = time.time() + seconds
@@ -213,6 +246,9 @@ def met(mutant: Mutant, copies: queue.Queue[Copy], seconds: float) -> str | None
                 found = copied.first_failure([*words, *passed], max(until - time.time(), 1))
             finally:
                 copied.write(mutant.file, content)
+            if found is not None and found.startswith(HANG):
+                test = found.removeprefix(HANG)
+                return found if test and copied.first_failure([test], SOON, 0.0) is None else OPEN
             if found is None or "::" not in found:
                 return found
             if copied.first_failure([found], seconds) is None:

@@ -15,7 +15,7 @@ import os
 import subprocess
 import sys
 import time
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -86,13 +86,15 @@ def distances(modules: Iterable[str]) -> dict[str, int]:
     return far
 
 
-def selected(files: set[Path]) -> list[Path]:
-    """Return the test files to run, the nearest first, then the core."""
+def selected(files: set[Path], cost: Callable[[Path], float] = lambda test: 0.0) -> list[Path]:
+    """Return the test files to run, the nearest first, of equally near ones the cheapest, then the core."""
     tests = sorted(path.relative_to(ROOT) for path in (ROOT / "tests").rglob("test_*.py"))
     named = {file.stem for file in files if module_of(file) is not None}
     far = distances([module for file in files if (module := module_of(file)) is not None])
     far |= {str(test): 0 for test in tests if test in files or named & set(test.stem.split("_"))}
-    near = sorted((test for test in tests if far.get(str(test), FAR) < FAR), key=lambda test: far[str(test)])
+    near = sorted(
+        (test for test in tests if far.get(str(test), FAR) < FAR), key=lambda test: (far[str(test)], cost(test))
+    )
     core = [(ROOT / "tests" / f"{name}.py").relative_to(ROOT) for name in CORE]
     return list(dict.fromkeys([*near, *core]))
 

@@ -24,6 +24,7 @@ CASES = {
     "ranges": "ranges",
     "labellers": "labellers",
     "doctor": "doctor",
+    "doctor-scans": "doctor_scans",
     "moving": "moving",
     "visits": "visits",
 }

@@ -98,11 +98,18 @@ def test_a_first_class_that_may_be_missing_is_no_remark():
     assert not [*id_remarks(maps, 255, void, maps)]
 
 
-@pytest.mark.parametrize(("renamed", "again"), [(range(8, 30), ""), (range(9, 20), ", and again 1 more times")])
-def test_it_is_said_how_often_ids_change(renamed, again):
-    frames = [replace(f, labels=doctor.OTHERS[f.labels]) if f.index in renamed else f for f in doctor.scene(0)]
+@pytest.mark.parametrize(
+    ("seed", "renamed", "said"),
+    [
+        (0, range(8, 30), "8 on: 0 becomes 3, 1 becomes 5"),
+        (0, range(9, 20), "9 on, and once more: 0 becomes 3, 1 becomes 5"),
+        (1, range(13, 30), "13 on: 0 becomes 3, 3 becomes 2"),
+    ],
+)
+def test_it_is_said_from_which_frame_on_and_how_often_ids_change(seed, renamed, said):
+    frames = [replace(f, labels=doctor.OTHERS[f.labels]) if f.index in renamed else f for f in doctor.scene(seed)]
     (line,) = (line for line in doctor.said(frames) if "have other ids" in line)
-    assert f" on{again}: 0 becomes 3, 1 becomes 5" in line
+    assert f"have other ids from frame {said}" in line
 
 
 BANDS, SHARP = [0, 0, 1, 2, 2, 255, 5, 5, 6, 7, 7], [0, 0, 2, 2, 2, 255, 5, 5, 7, 7, 7]

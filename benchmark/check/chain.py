@@ -98,12 +98,14 @@ class Chain:
         links: Agreement by two positions.
         usual: The median error of frames that follow each other; NaN if no frame sees another.
         maps: Contents of the label maps, by position; empty without labels.
+        contradicting: The least error of frames that contradict each other.
     """
 
     positions: Sequence[int]
     links: Mapping[Pair, Link]
     usual: float
     maps: Mapping[int, MapContent] = dataclasses.field(default_factory=dict)
+    contradicting: float = CONTRADICTS
 
     def error(self, a: int, b: int) -> float:
         """Return the error of two frames, or NaN if they were not compared."""
@@ -112,14 +114,14 @@ class Chain:
 
     def fits(self, a: int, b: int) -> bool:
         """Return whether two frames fit each other."""
-        return self.error(a, b) <= min(FITS, max(CONTRADICTS, APART * self.usual))
+        return self.error(a, b) <= min(FITS, max(self.contradicting, APART * self.usual))
 
     def contradicts(self, pair: Pair, *neighbours: Pair) -> bool:
         """Return whether two frames contradict each other, and their neighbours do not."""
         if not all(self.fits(*neighbour) for neighbour in neighbours):
             return False
         least = max(
-            CONTRADICTS,
+            self.contradicting,
             *(APART * error for error in (self.usual, *(self.error(*neighbour) for neighbour in neighbours))),
         )
         return self.error(*pair) >= least

@@ -25,6 +25,9 @@ LEAST_FOCAL = 8.0
 TO_CAMERA = np.array([[0.0, -1, 0, 0], [0, 0, -1, 0], [1, 0, 0, 0], [0, 0, 0, 1]])
 """From a LiDAR's axes (x forward, y left, z up) to the axes of a camera next to it (x right, y down, z forward)."""
 
+FARTHEST = 500.0
+"""Metres within which half of the points of a scan lie, if they are in metres."""
+
 PoseChange = Callable[[Float64], Float64]
 
 
@@ -178,6 +181,11 @@ def _nearer_to_their_sensors(sample: ScanSample) -> bool:
     return bool(np.median(from_sensor) < np.median(from_origin))
 
 
+def _in_reach(sample: ScanSample) -> bool:
+    """Return whether half of the points lie no farther than a LiDAR sees."""
+    return bool(np.median(np.concatenate(sample.ranges)) < FARTHEST)
+
+
 SCANS: tuple[Hypothesis[ScanSample], ...] = (
     Hypothesis(
         "inverse poses",
@@ -216,7 +224,18 @@ SCANS: tuple[Hypothesis[ScanSample], ...] = (
     Hypothesis("quaternions w x y z", scan_poses(FIRST_NUMBER_LAST), "write quaternions as x y z w"),
     Hypothesis("quaternions x y z w", scan_poses(LAST_NUMBER_FIRST), "write quaternions as w x y z"),
     Hypothesis("poses in millimetres", scan_poses(positions(0.001)), "divide the positions of the poses by 1000"),
-    Hypothesis("poses in kilometres", scan_poses(positions(1000.0)), "multiply the positions of the poses by 1000"),
+    Hypothesis(
+        "poses in kilometres",
+        scan_poses(positions(1000.0)),
+        "multiply the positions of the poses by 1000",
+        applies=_in_reach,
+    ),
+    Hypothesis(
+        "points in millimetres",
+        scan_poses(positions(1000.0)),
+        "divide the points by 1000",
+        applies=lambda sample: not _in_reach(sample),
+    ),
     Hypothesis(
         "angles in degrees, read as radians", scan_poses(angles(math.pi / 180)), "convert the angles to radians"
     ),
@@ -225,3 +244,61 @@ SCANS: tuple[Hypothesis[ScanSample], ...] = (
     ),
 )
 """Other readings of the poses of scans than the configured one."""
+
+
+def axes(*rows: tuple[float, float, float]) -> Callable[[ScanSample], ScanSample]:
+    """Return the change of scans whose points (x, y, z) are in other axes, given by the rows of a matrix (3, 3).
+
+    Points are left as they are: poses are carried into their axes.
+    """
+    change = np.eye(4)
+    change[:3, :3] = rows
+    return scan_poses(lambda T: change.T @ T @ change)
+
+
+def turned(degrees: float) -> Callable[[ScanSample], ScanSample]:
+    """Return the change of scans whose sensor is turned about z against the body that has the poses."""
+    cos, sin = math.cos(math.radians(degrees)), math.sin(math.radians(degrees))
+    turn = np.array([[cos, -sin, 0, 0], [sin, cos, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]])
+    return scan_poses(lambda T: T @ turn)
+
+
+X, Y, Z = (1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0)
+LEFT, DOWN = (0.0, -1.0, 0.0), (0.0, 0.0, -1.0)
+OF_SCANS: tuple[Hypothesis[ScanSample], ...] = (
+    Hypothesis(
+        "points with y mirrored",
+        axes(X, LEFT, Z),
+        "negate the y of the points, or convert the poses if they are left-handed",
+        applies=lambda sample: not sample.is_upside_down,
+    ),
+    Hypothesis("points with z mirrored", axes(X, Y, DOWN), "negate the z of the points"),
+    Hypothesis("points with x and y exchanged", axes(Y, X, Z), "exchange them"),
+    Hypothesis(
+        "points of a sensor with z down",
+        axes(X, LEFT, DOWN),
+        "negate the y and z of the points: poses are of a body with z up",
+        applies=lambda sample: sample.is_upside_down,
+    ),
+    *(
+        Hypothesis(
+            f"poses of another body, against which the LiDAR is turned by {degrees} degrees about z",
+            turned(degrees),
+            "apply the mounting of the sensor (its pose on the vehicle) to the poses",
+        )
+        for degrees in (90, 180, -90)
+    ),
+    Hypothesis(
+        "the poses of the next scans",
+        lambda sample: sample.delayed(1),
+        "poses are one scan late: give each scan the pose of its own time",
+        applies=lambda sample: sample.knows_poses,
+    ),
+    Hypothesis(
+        "the poses of the scans before",
+        lambda sample: sample.delayed(-1),
+        "poses are one scan early: give each scan the pose of its own time",
+        applies=lambda sample: sample.knows_poses,
+    ),
+)
+"""Mistakes of the files of scans that no setting mends; a level and straight drive does not show most of them."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import itertools
 import math
 from collections.abc import Callable, Iterator, Sequence
@@ -28,6 +29,9 @@ LEAST_RENAMED = 2
 
 REACH = 8
 """Frames on each side of a place, in the chain, that tell whether ids stay there."""
+
+BESIDE = 2
+"""Places before and after the found one at which ids may have changed."""
 
 ROLLING = 0.5
 """Share of the places that tell at which ids change: from then on they change from frame to frame."""
@@ -99,7 +103,7 @@ class Renamings:
         """Return the ids that change between the frames before a place in the chain and those from it on."""
         first, second = self.first, self.second
         near = (first >= at - reach) & (second < at + reach)
-        across = self.counts(near & (first < at) & (second >= at))
+        across = self._across(at, reach)
         before, after = self.counts(near & (second < at)), self.counts(near & (first >= at))
         totals, later = across.sum(axis=1), across.argmax(axis=1)
         is_decided = totals >= LEAST_POINTS
@@ -112,6 +116,26 @@ class Renamings:
         pairs = tuple((int(self.ids[i]), int(self.ids[later[i]])) for i in np.flatnonzero(moved))
         share = float(across[moved, targets].sum() / totals[moved].sum())
         return Renaming(at, pairs, share, tells=True)
+
+    def _across(self, at: int, reach: int) -> Int64:
+        """Return (K, K) counts over a place in the chain, of frames near it."""
+        first, second = self.first, self.second
+        return self.counts((first >= at - reach) & (first < at) & (second >= at) & (second < at + reach))
+
+    def placed(self, found: Renaming, reach: int) -> Renaming:
+        """Return a renaming at the place, of those next to it, over which most points of its classes follow it.
+
+        One place too early or late, more than half of the points may follow it, too.
+        """
+        before, after = (np.searchsorted(self.ids, side) for side in zip(*found.ids, strict=True))
+
+        def moved(at: int) -> Renaming:
+            across = self._across(at, reach)
+            share = float(across[before, after].sum() / max(1, across[before].sum()))
+            return dataclasses.replace(found, at=at, share=share)
+
+        nearby = range(max(1, found.at - BESIDE), min(self.count, found.at + BESIDE + 1))
+        return max(map(moved, nearby), key=lambda renaming: renaming.share)
 
 
 def _same(counts: Int64) -> Mask:
@@ -140,8 +164,8 @@ def wrong_ids(neighbours: Neighbours, chain: Chain) -> str | None:
             separate.append(change)
     if not separate:
         return None
-    first = min(separate, key=lambda change: change.at)
-    repeats = "" if len(separate) == 1 else f", and again {len(separate) - 1} more times"
+    first = ids.placed(min(separate, key=lambda change: change.at), REACH)
+    repeats = {0: "", 1: ", and once more"}.get(more := len(separate) - 1, f", and {more} more times")
     return (
         f"have other ids from frame {neighbours.named(chain.positions[first.at])} on{repeats}: {_listed(first)}"
         f" ({first.share:.0%} of the points of these classes): write the ids of one taxonomy in all frames"

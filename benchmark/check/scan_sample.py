@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import copy
 import math
 from collections.abc import Callable, Sequence
@@ -21,12 +22,20 @@ from semstab.core.arrays import evenly
 from semstab.core.types import Float32, Float64, Int64, Mask
 from semstab.data.frames import Frame
 from semstab.datasets import Scene
+from semstab.errors import DataError
 
 QUERIES = 2000
 """Points of a scan that are sought in another one, ..."""
 
 JUDGED = 4
 """... every so many of them beside surfaces, under each reading of the poses."""
+
+LEVELLED, LEVEL, BESIDE = 4, 0.95, 0.1
+"""Scans in which level surfaces are looked for; the least cosine of their slope; metres above or below the sensor."""
+
+MOSTLY, GROUND, OTHER_SIDE = 0.9, 0.1, 0.05
+"""Least share of points within 45 degrees of the horizon, least share of flat places that are level and above, and most
+level ones below for each of these."""
 
 EXACT = 1e-5
 """The least error: a smaller one is that of the arithmetic."""
@@ -85,7 +94,7 @@ class ScanSample:
         read = frames_at(positions, indices, reader(scene, source), passing_over=passing_over)
         self.scans: dict[int, Frame] = dict(read)
         self.poses: dict[int, Float64] = {position: scan.T_wc for position, scan in self.scans.items()}
-        clouds = {position: _Cloud(self.scans[position]) for position in compared & self.scans.keys()}
+        clouds = {position: Cloud(self.scans[position]) for position in compared & self.scans.keys()}
         self._clouds = {position: cloud for position, cloud in clouds.items() if len(cloud.rows)}
         self.pairs = [pair for pair in pairs_within(groups) if pair[0] < pair[1] and {*pair} <= self._clouds.keys()]
 
@@ -105,8 +114,23 @@ class ScanSample:
 
     def posed(self, change: Callable[[Float64], Float64]) -> ScanSample:
         """Return the same scans with each pose (4, 4) changed."""
+        return self._with({position: change(T) for position, T in self.poses.items()})
+
+    def delayed(self, by: int) -> ScanSample:
+        """Return the same scans with the poses of the scans `by` later in the sequence; at its ends with their own."""
+        scene = self.scene
+
+        def pose(position: int) -> Float64:
+            index = self.scans[position].index
+            with contextlib.suppress(DataError):
+                return scene.T_wc(min(max(index + by, 0), len(scene) - 1))
+            return self.poses[position]
+
+        return self._with({position: pose(position) for position in self.poses})
+
+    def _with(self, poses: dict[int, Float64]) -> ScanSample:
         other = copy.copy(self)
-        vars(other).update(poses={position: change(T) for position, T in self.poses.items()})
+        vars(other).update(poses=poses)
         for cached in {"met", "_errors", "_in_world"} & vars(other).keys():
             delattr(other, cached)
         return other
@@ -142,6 +166,28 @@ class ScanSample:
         """Return the middles (n, 3) of the points of scans that are compared, and the positions (n, 3) of the poses."""
         middle = [np.median(cloud.points, axis=0) for cloud in self._clouds.values()]
         return np.array(middle), np.array([self.poses[position][:3, 3] for position in self._clouds])
+
+    @property
+    def knows_poses(self) -> bool:
+        """Return whether poses of other scans are known without reading these."""
+        return type(self.scene).T_wc is not Scene.T_wc
+
+    @cached_property
+    def is_upside_down(self) -> bool:
+        """Return whether level surfaces, such as the ground, lie above the sensors and not below.
+
+        It takes scans to all sides, whose rays rise and fall by less than 45 degrees.
+        """
+        above = below = flat = flatter = points = 0
+        for cloud in [*self._clouds.values()][:LEVELLED]:
+            around = Surfaces.of(cloud.sought[::JUDGED], cloud.points, cloud.tree, np.eye(3), np.zeros(3))
+            level = around.flat & (np.abs(around.normal[:, 2]) > LEVEL)
+            above += int(np.count_nonzero(level & (around.middle[:, 2] > BESIDE)))
+            below += int(np.count_nonzero(level & (around.middle[:, 2] < -BESIDE)))
+            flat += int(np.count_nonzero(around.flat))
+            flatter += int(np.count_nonzero(np.abs(cloud.sought[:, 2]) < np.hypot(*cloud.sought[:, :2].T)))
+            points += len(cloud.sought)
+        return flatter > MOSTLY * points and above > GROUND * flat and below < OTHER_SIDE * above
 
     @property
     def between(self) -> float:
@@ -206,7 +252,7 @@ class ScanSample:
         return np.concatenate(first), np.concatenate(second)
 
 
-class _Cloud:
+class Cloud:
     """The points of a scan that have a range, and those of them that are sought in others.
 
     Attributes:

@@ -10,9 +10,9 @@ import dataclasses
 
 import numpy as np
 
-from semstab.check.hypotheses import SCANS
+from semstab.check.hypotheses import OF_SCANS, SCANS
 from semstab.check.scan_sample import ScanSample
-from semstab.check.trials import ranked
+from semstab.check.trials import Trial, ranked
 from semstab.check.verdict import Verdict
 
 BETTER = 0.67
@@ -30,21 +30,27 @@ FAR = 20_000.0
 HOPELESS = 0.05
 """The error from which on scans do not lie on each other, though no reading explains it."""
 
+UPSIDE_DOWN = (
+    "level surfaces lie above the sensors, and hardly any below, as if z of the points was mirrored, or pointed down"
+    " while poses are of a body with z up: the map is upside down if so; negate z, or carry the points into such axes"
+)
+
 
 def assess_scans(sample: ScanSample) -> Verdict:
     """Return whether scans lie on each other, and the reading of the poses under which they would."""
     pairs, ranges, settings = sample.pairs, sample.ranges, sample.scene.settings
     if not pairs:
         return Verdict("unclear", "it takes two scans with points to tell whether poses are right")
-    if (away := float(np.median(np.concatenate(ranges)))) > FAR:
+    if (away := float(np.median(np.concatenate(ranges)))) > FAR and is_elsewhere(sample, away):
         other = {"sensor": "world", "world": "sensor"}.get(settings.get("coordinates", ""))
         mend = None if other is None else f"coordinates: {other}"
         advice = "carry them into its axes" if mend is None else f"set {mend} (--option coordinates={other})"
         text = f"points lie {away / 1000:,.0f} km from their sensor, as in the axes of the world; {advice}"
         return Verdict("unsound", text, () if mend is None else (mend,))
-    now, trials = sample.fit(), ranked(SCANS, sample)
-    frames, best = len({p for pair in pairs for p in pair}), trials[0]
-    fits = (("as configured", now), *((trial.hypothesis.name, trial.fit) for trial in trials[:4]))
+    now, trials, mistakes = sample.fit(), ranked(SCANS, sample), ranked(OF_SCANS, sample)
+    frames, best = len({p for pair in pairs for p in pair}), likelier(trials[0], mistakes[0])
+    shown = trials[:4] if best is trials[0] else [best, *trials[:3]]
+    fits = (("as configured", now), *((trial.hypothesis.name, trial.fit) for trial in shown))
     about = Verdict("sound", "", (), now.error, now.share, frames, len(pairs), fits=fits)
     if best.is_right(sample, now, BETTER):
         reading = best.hypothesis
@@ -61,6 +67,7 @@ def assess_scans(sample: ScanSample) -> Verdict:
             f"scans do not lie on each other: the nearest point of another scan is {nearest:.1%} of the range away, and"
             " no reading of the poses explains it; check the order of poses and scans"
         )
+    remarks = (UPSIDE_DOWN,) if sample.is_upside_down else ()
     open_ = {trial.hypothesis.name for trial in trials if trial.fit.error <= ALIKE * now.error}
     return dataclasses.replace(
         about,
@@ -68,4 +75,16 @@ def assess_scans(sample: ScanSample) -> Verdict:
         " another scan",
         undetermined=tuple(hypothesis.name for hypothesis in SCANS if hypothesis.name in open_),
         reason="the sensor hardly moves or turns" if open_ else "",
+        remarks=remarks,
     )
+
+
+def is_elsewhere(sample: ScanSample, away: float) -> bool:
+    """Return whether points lie around another place than their sensor, and not `away` from it to all sides."""
+    middle, _ = sample.places
+    return bool(np.median(np.linalg.norm(middle, axis=1)) > away / 2)
+
+
+def likelier(reading: Trial[ScanSample], mistake: Trial[ScanSample]) -> Trial[ScanSample]:
+    """Return another reading of the poses, or else a mistake under which scans lie clearly nearer to each other."""
+    return mistake if mistake.fit.has_evidence and mistake.fit.error * ALIKE < reading.fit.error else reading

@@ -30,6 +30,7 @@ from semstab.check.no_depth import with_invalid_depth
 from semstab.check.registration import notes
 from semstab.check.reprojection import Sample, clusters, label_source, reader
 from semstab.check.scan_sample import ScanSample, quick_sample_of_scans
+from semstab.check.scan_verdict import verdict_of_scans
 from semstab.check.scans import assess_scans
 from semstab.check.sweep import with_sweep
 from semstab.check.verdict import Verdict
@@ -220,9 +221,9 @@ def _poses_that_do_not_fit(scene: Scene, frames: Sequence[Frame]) -> str:
 def _check_scans(
     scene: Scene, config: Config, models: Sequence[str], begun: Sequence[str], indices: Sequence[int], first: str | None
 ) -> SceneCheck:
-    """Check a scene of scans: their poses, what they share, voxels, and the ids of their labels."""
+    """Check a scene of scans: their poses, what they share, voxels, and their labels."""
     sample = ScanSample(scene, indices, first, clusters(len(indices), SCAN_CLUSTERS), fused=FUSED_FRAMES)
-    verdict = with_sweep(assess_scans(sample), sample)
+    verdict, findings = verdict_of_scans(sample, indices, models)
     scans, ranges = [*sample.scans.values()], sample.ranges
     valid = [len(valid_ranges) / scan.depth.size for valid_ranges, scan in zip(ranges, scans, strict=True)]
     tally = LabelTally(first or "")
@@ -238,6 +239,7 @@ def _check_scans(
         verdict=verdict,
         sources=scene.sources,
         labels=tuple(_labels(scene, name, indices, config, tally) for name in models),
+        label_findings=findings,
         notes=(*verdict.remarks, *begun),
     )
     if verdict.state == "unsound" or not sample.pairs:

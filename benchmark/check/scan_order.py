@@ -1,0 +1,138 @@
+"""Scans in order, each against those before it: where poses jump, and scans that do not fit those next to them."""
+
+from __future__ import annotations
+
+import itertools
+import math
+from collections import deque
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from semstab.check.chain import GAPS, LEAST_SEEN, STRIKING_SHIFT, Chain, Link
+from semstab.check.continuity import LEAVE_OUT, MOST_BAD, MOST_NAMED
+from semstab.check.reprojection import CONSISTENT, Pair, frames_at, motion, reader
+from semstab.check.scan_sample import Cloud
+from semstab.check.surfaces import Surfaces
+from semstab.check.verdict import Verdict
+from semstab.core.arrays import evenly
+from semstab.core.types import Float64, Int64
+from semstab.data.frames import Frame
+from semstab.datasets import Scene
+
+STRETCHES, LENGTH = 4, 10
+"""Stretches of successive scans that are read, and scans of each; of a short sequence all are read."""
+
+NEXT_TO, NEAREST = 8000, 3
+"""Points of a scan whose labels are held against those of the points next to them in it, and the number of these."""
+
+SOUGHT = 4
+"""Every fourth of the points that are sought is held against surfaces."""
+
+HIGH = 80
+"""Percentile of the points' errors that is the error of two scans: it is that of walls, which ground does not hide."""
+
+CONTRADICTS = 0.01
+"""Two scans contradict each other from this error on, if it is far from the usual one."""
+
+APART_BY = max(GAPS)
+
+
+@dataclass(frozen=True, eq=False)
+class InOrder:
+    """Scans in order.
+
+    Attributes:
+        chain: Their agreement.
+        rows: (2, n) rows of points of a scan, and of the nearest points of a later one, by their positions.
+        own: (2, n) rows of points of a scan, and of the nearest other points of the same scan, by its position.
+        labels: (N,) ids of all points of a scan, by its position; empty without labels.
+        ignore: The id of points without a label.
+    """
+
+    chain: Chain
+    rows: dict[Pair, Int64]
+    own: dict[int, Int64]
+    labels: dict[int, Int64]
+    ignore: int
+
+
+def in_order(scene: Scene, indices: Sequence[int], source: str | None) -> InOrder:
+    """Read scans in order and compare them; those that cannot be read are passed over."""
+    links, rows, own = dict[Pair, Link](), dict[Pair, Int64](), dict[int, Int64]()
+    labels, ignore, positions = dict[int, Int64](), -1, list[int]()
+    last = deque[tuple[int, Float64, Cloud]](maxlen=APART_BY)
+    for position, scan in _read(scene, indices, source):
+        if len((cloud := Cloud(scan)).rows) < LEAST_SEEN:
+            continue
+        positions.append(position)
+        if source is not None:
+            labels[position], ignore = scan.predicted.reshape(-1).astype(np.int64), scan.ignore_id
+            own[position] = _nearest_in(cloud)
+        for other, T, before in last:
+            if position - other in GAPS:
+                turn, shift = motion(T, scan.T_wc)
+                links[other, position], rows[other, position] = _linked(before, cloud, turn, shift)
+        last.append((position, scan.T_wc, cloud))
+    errors = [links[pair].error for pair in itertools.pairwise(positions) if pair in links]
+    usual = float(np.nanmedian(errors)) if np.isfinite(errors).any() else math.nan
+    return InOrder(Chain(positions, links, usual, contradicting=CONTRADICTS), rows, own, labels, ignore)
+
+
+def _read(scene: Scene, indices: Sequence[int], source: str | None) -> Iterator[tuple[int, Frame]]:
+    count, most = len(indices), STRETCHES * LENGTH
+    starts = [round(k * (count - LENGTH) / (STRETCHES - 1)) for k in range(STRETCHES)]
+    wanted = range(count) if count <= most else sorted({start + k for start in starts for k in range(LENGTH)})
+    return frames_at(set(wanted), indices, reader(scene, source), passing_over=True)
+
+
+def _nearest_in(cloud: Cloud) -> Int64:
+    """Return (2, n) rows of points of a scan, and of the nearest other points of it."""
+    chosen = np.array(evenly(len(cloud.rows), NEXT_TO), dtype=np.int64)
+    nearest = cloud.tree.query(cloud.points[chosen], k=1 + NEAREST)[1][:, 1:]
+    rows: Int64 = cloud.rows[np.stack([np.repeat(chosen, NEAREST), nearest.ravel()])]
+    return rows
+
+
+def _linked(first: Cloud, second: Cloud, turn: Float64, shift: Float64) -> tuple[Link, Int64]:
+    """Return how points of one scan lie on the surfaces of another, and the rows (2, n) of points that meet there."""
+    around = Surfaces.of(first.sought[::SOUGHT], second.points, second.tree, turn, shift)
+    errors = around.error[around.met]
+    distance, nearest = second.tree.query(first.sought @ turn.T + shift)
+    meet = distance <= CONSISTENT * np.linalg.norm(first.sought, axis=1)
+    rows = np.stack([first.rows[first.chosen], second.rows[nearest]])[:, meet]
+    error = float(np.percentile(errors, HIGH)) if len(errors) >= LEAST_SEEN else math.nan
+    return Link(error, float(around.near.mean()), math.nan, False, math.nan), rows
+
+
+def with_order(verdict: Verdict, scene: Scene, indices: Sequence[int], ordered: InOrder) -> Verdict:
+    """Return the verdict, with scans that do not fit those next to them, and the scan at which poses jump."""
+    if verdict.state != "sound":
+        return verdict
+    chain = ordered.chain
+
+    def named(position: int) -> str:
+        return scene.frame_name(indices[position])
+
+    misfits = chain.misfits()
+    if len(misfits) <= MOST_BAD * len(chain.positions):
+        verdict = verdict.remarking(*_said_of(misfits, chain, named))
+    if (shift := chain.without([position for position, _ in misfits]).shift()) is None:
+        return verdict
+    (before, first), error, usual = shift
+    text = (
+        f"poses jump at scan {named(first)}: points of scans before it lie {error:.2%} of their range from the surfaces"
+        f" of scans from it on, {usual:.2%} in others as far apart; correct the poses, or fuse the two parts one by one"
+        f" (--frames :{indices[before] + 1} and --frames {indices[first]}:)"
+    )
+    return verdict.refuted(text) if error >= STRIKING_SHIFT * usual else verdict.remarking(text)
+
+
+def _said_of(misfits: Sequence[tuple[int, Pair]], chain: Chain, named: Callable[[int], str]) -> Iterator[str]:
+    for position, (before, after) in misfits[:MOST_NAMED]:
+        yield (
+            f"scan {named(position)} does not fit scans {named(before)} and {named(after)} next to it:"
+            f" {chain.error(before, position):.1%} error, they fit each other with {chain.error(before, after):.2%};"
+            f" its pose is wrong: correct it, or leave the scan out ({LEAVE_OUT})"
+        )
