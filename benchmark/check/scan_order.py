@@ -14,7 +14,7 @@ from semstab.check.chain import GAPS, LEAST_SEEN, STRIKING_SHIFT, Chain, Link
 from semstab.check.continuity import LEAVE_OUT, MOST_BAD, MOST_NAMED
 from semstab.check.reprojection import CONSISTENT, Pair, frames_at, motion, reader
 from semstab.check.scan_sample import Cloud
-from semstab.check.surfaces import Surfaces
+from semstab.check.surfaces import LEAST_RANGE, Surfaces
 from semstab.check.verdict import Verdict
 from semstab.core.arrays import evenly
 from semstab.core.types import Float64, Int64
@@ -27,11 +27,15 @@ STRETCHES, LENGTH = 4, 10
 NEXT_TO, NEAREST = 8000, 3
 """Points of a scan whose labels are held against those of the points next to them in it, and the number of these."""
 
-SOUGHT = 4
-"""Every fourth of the points that are sought is held against surfaces."""
+SOUGHT = 2
+"""Every second of the points that are sought is held against surfaces."""
 
-HIGH = 80
-"""Percentile of the points' errors that is the error of two scans: it is that of walls, which ground does not hide."""
+ROUNDS, OUTLYING, STIFF = 5, 3.0, 0.01
+"""Rounds of a robust fit; multiple of the median distance from which on a point counts less; weight, as a share of the
+points, by which a motion that the surfaces hardly show, such as along a street, remains small."""
+
+LEAST_DISTANCE = 0.001
+"""Metres that distances from surfaces vary by at least."""
 
 CONTRADICTS = 0.01
 """Two scans contradict each other from this error on, if it is far from the usual one."""
@@ -96,14 +100,33 @@ def _nearest_in(cloud: Cloud) -> Int64:
 
 
 def _linked(first: Cloud, second: Cloud, turn: Float64, shift: Float64) -> tuple[Link, Int64]:
-    """Return how points of one scan lie on the surfaces of another, and the rows (2, n) of points that meet there."""
+    """Return how far one scan is off the surfaces of another, and the rows (2, n) of points that meet there."""
     around = Surfaces.of(first.sought[::SOUGHT], second.points, second.tree, turn, shift)
-    errors = around.error[around.met]
     distance, nearest = second.tree.query(first.sought @ turn.T + shift)
     meet = distance <= CONSISTENT * np.linalg.norm(first.sought, axis=1)
     rows = np.stack([first.rows[first.chosen], second.rows[nearest]])[:, meet]
-    error = float(np.percentile(errors, HIGH)) if len(errors) >= LEAST_SEEN else math.nan
-    return Link(error, float(around.near.mean()), math.nan, False, math.nan), rows
+    return Link(offset(around), float(around.near.mean()), math.nan, False, math.nan), rows
+
+
+def offset(around: Surfaces) -> float:
+    """Return the motion of points that brings them onto the surfaces, as a share of their range; NaN with few points.
+
+    It is one step of a registration of points to planes, by iteratively reweighted least squares: ground, on which
+    points stay wherever a scan is moved, does not hide an offset from the walls.
+    """
+    if np.count_nonzero(around.met) < LEAST_SEEN:
+        return math.nan
+    points = (around.points @ around.turn.T + around.shift)[around.met]
+    normal, range_ = around.normal[around.met], np.linalg.norm(around.points[around.met], axis=1)
+    distance = np.einsum("ni,ni->n", points - around.middle[around.met], normal)
+    rows, step = np.hstack([np.cross(points, normal), normal]), np.zeros(6)
+    limit = OUTLYING * max(float(np.median(np.abs(distance))), LEAST_DISTANCE)
+    stiff = STIFF * len(rows) * np.diag([float(np.median(range_)) ** 2] * 3 + [1.0] * 3)
+    for _ in range(ROUNDS):
+        weighted = rows / np.maximum(1, np.abs(distance + rows @ step) / limit)[:, None]
+        step = -np.linalg.solve(weighted.T @ rows + stiff, weighted.T @ distance)
+    moved = np.cross(step[:3], points) + step[3:]
+    return float(np.median(np.linalg.norm(moved, axis=1) / np.maximum(range_, LEAST_RANGE)))
 
 
 def with_order(verdict: Verdict, scene: Scene, indices: Sequence[int], ordered: InOrder) -> Verdict:
@@ -118,11 +141,13 @@ def with_order(verdict: Verdict, scene: Scene, indices: Sequence[int], ordered: 
     misfits = chain.misfits()
     if len(misfits) <= MOST_BAD * len(chain.positions):
         verdict = verdict.remarking(*_said_of(misfits, chain, named))
-    if (shift := chain.without([position for position, _ in misfits]).shift()) is None:
+    rest = chain.without([position for position, _ in misfits])
+    breaks = [(pair, chain.error(*pair), chain.usual) for pair in rest.breaks()]
+    if (jump := breaks[0] if breaks else rest.shift()) is None:
         return verdict
-    (before, first), error, usual = shift
+    (before, first), error, usual = jump
     text = (
-        f"poses jump at scan {named(first)}: points of scans before it lie {error:.2%} of their range from the surfaces"
+        f"poses jump at scan {named(first)}: points of scans before it are {error:.2%} of their range off the surfaces"
         f" of scans from it on, {usual:.2%} in others as far apart; correct the poses, or fuse the two parts one by one"
         f" (--frames :{indices[before] + 1} and --frames {indices[first]}:)"
     )
@@ -132,7 +157,7 @@ def with_order(verdict: Verdict, scene: Scene, indices: Sequence[int], ordered: 
 def _said_of(misfits: Sequence[tuple[int, Pair]], chain: Chain, named: Callable[[int], str]) -> Iterator[str]:
     for position, (before, after) in misfits[:MOST_NAMED]:
         yield (
-            f"scan {named(position)} does not fit scans {named(before)} and {named(after)} next to it:"
-            f" {chain.error(before, position):.1%} error, they fit each other with {chain.error(before, after):.2%};"
+            f"scan {named(position)} does not fit scans {named(before)} and {named(after)} next to it: its points are"
+            f" {chain.error(before, position):.1%} of their range off, theirs {chain.error(before, after):.2%};"
             f" its pose is wrong: correct it, or leave the scan out ({LEAVE_OUT})"
         )

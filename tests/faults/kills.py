@@ -2,7 +2,7 @@
 
     python tests/faults/kills.py [COUNT [SEED [KIND...]]]       make faults: 315, 35 of each of 9 kinds
 
-The kind `wide` is a run of 30 scenes and two models in two processes.
+The kind `wide` is a run of 12 scenes and two models in two processes.
 
 Each is then started again as it was, and has to leave what one without a kill leaves. Where several are at work on the
 machine, a kill may come after the end: those are counted apart. Beside these, a fifth as many are started twice at
@@ -41,6 +41,9 @@ from semstab.recording.target import is_whole
 Words = list[str]
 KINDS = ("csv", "parquet", "ply", "laz", "tif", "glb")
 """The formats that are exported at once."""
+
+ROOMS = 12
+"""Scenes of the kind `wide`."""
 
 TIMES = ("fuse_ms_per_frame", "stages_ms")
 
@@ -114,8 +117,8 @@ def of_files(out: Path) -> Any:
 def kinds(base: Path) -> dict[str, tuple[Callable[[Path], Words], Callable[[Path], Any]]]:
     """What is killed: its words for a folder, and what is compared of that."""
     wall = tiny_scene.write(base / "wall", models=("a", "b"), frames=20)
-    for k in range(30):
-        tiny_scene.write(base / f"rooms/room{k:02d}", models=("a", "b"), frames=4)
+    for k in range(ROOMS):
+        tiny_scene.write(base / f"rooms/room{k:02d}", models=("a", "b"), frames=2)
     flight = predicted_scene.write(base / "flight")
     for name, wrong in (("one", (5, 12)), ("two", (3,)), ("three", ())):
         video_scene.write(base / "clips" / name, wrong)
