@@ -174,7 +174,7 @@ def room_table(rows: Rows) -> list[str]:
     """Return the networks of the room, with intervals."""
     lines = head(["network", *COLUMNS.values()])
     for each in rows:
-        cells = [plain(each["meaning"]) if name == "meaning" else _with_ends(each, name) for name in COLUMNS]
+        cells = [_with_ends(each, name) if name.endswith("alpha") else plain(each[name]) for name in COLUMNS]
         lines.append(row([each["network"], *cells]))
     return lines
 
