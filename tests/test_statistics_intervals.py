@@ -115,7 +115,7 @@ def test_ends_of_an_agreement_grow_with_its_error_without_a_jump(value):
 def test_an_interval_says_its_level_and_what_follows_from_it_does_not_depend_on_that():
     sums = simulated(frames=32, observations=8, side=24)
     usual, narrow = estimate(sums, "alpha"), estimate(sums, "alpha", level=0.8)
-    assert (usual.level, narrow.level, narrow.of) == (0.95, 0.8, "80 % CI")
+    assert (usual.level, narrow.level, narrow.interval_name) == (0.95, 0.8, "80 % CI")
     assert narrow.high - narrow.low < 0.8 * (usual.high - usual.low)
     above = usual.value - (usual.value - usual.low) / 2
     assert 0.6 < probability_above(usual, above, "agreement") < 0.99

@@ -358,4 +358,4 @@ def test_prompts_of_a_model_with_its_own_text_encoder_are_ranked(tmp_path, model
     (difference,) = rank_models(result).differences
     assert {difference.model, difference.other} == {"net@few", "net@many"}
     assert difference.low < difference.value < difference.high
-    assert "net@many: 4 names, as many as" in screen
+    assert "net@many: 4 names, worth" in screen
