@@ -36,7 +36,8 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from streets import StudyError, write_rows
+from outcome import StudyError, exit_code
+from streets import write_rows
 from streets_analysis import Array, Grid, head, load, plain, row, signed, with_interval
 
 import semstab
@@ -263,15 +264,14 @@ def main(arguments: Sequence[str] | None = None) -> int:
     words = commands.add_parser("show", help="print the tables")
     words.add_argument("--results", type=Path, default=ROOT / "results")
     asked = parser.parse_args(arguments)
-    try:
+
+    def work() -> None:
         if asked.command == "run":
             run(asked.edgenets.absolute(), asked.room.absolute(), asked.work.absolute(), asked.results)
         else:
             show(asked.results)
-    except (StudyError, semstab.SemstabError) as error:
-        print(f"error: {error}", file=sys.stderr)
-        return 2
-    return 0
+
+    return exit_code(work)
 
 
 if __name__ == "__main__":

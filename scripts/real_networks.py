@@ -74,6 +74,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from outcome import StudyError, exit_code
 
 import semstab
 from semstab.core.files import atomic_path
@@ -184,10 +185,6 @@ class Row:
 MEASURES = ("alpha", "vss", "agree", "flicker")
 PARTS = ("within", "between")
 TITLES = {"alpha": "alpha", "vss": "VSS", "agree": "two frames agree", "flicker": "flicker"}
-
-
-class StudyError(Exception):
-    """Something that the user can mend, in one line."""
 
 
 def networks(folder: Path, trained_on: str) -> list[Network]:
@@ -632,7 +629,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     words.add_argument("--results", type=Path, default=ROOT / "results")
     words.add_argument("--figure", type=Path, default=FIGURE)
     asked = parser.parse_args(arguments)
-    try:
+
+    def work() -> None:
         if asked.command == "sequence":
             sequence(asked.clone, asked.data)
         elif asked.command == "run":
@@ -640,10 +638,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
             run(folders, asked.results, asked.only)
         else:
             show(asked.results, asked.figure)
-    except (StudyError, semstab.SemstabError) as error:
-        print(f"error: {error}", file=sys.stderr)
-        return 2
-    return 0
+
+    return exit_code(work)
 
 
 if __name__ == "__main__":

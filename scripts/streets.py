@@ -52,6 +52,7 @@ from typing import Any
 
 import cv2
 import numpy as np
+from outcome import StudyError, exit_code
 
 import semstab
 from semstab.backends import create
@@ -87,10 +88,6 @@ TR = {
         "-6.496203536139e-03 -3.339968064433e-01",
 }  # fmt: skip
 """Tr of KITTI's odometry, from the LiDAR to camera 0, by sequence."""
-
-
-class StudyError(Exception):
-    """Something that the user can mend, in one line."""
 
 
 def prepare(clone: Path, work: Path) -> None:
@@ -480,7 +477,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     words.add_argument("--results", type=Path, default=ROOT / "results")
     words.add_argument("--figures", type=Path, default=ROOT / "docs")
     asked = parser.parse_args(arguments)
-    try:
+
+    def work() -> None:
         if asked.command == "prepare":
             prepare(asked.clone, asked.work)
         elif asked.command == "predict":
@@ -489,10 +487,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
             run(asked.work.absolute(), asked.results)
         else:
             show(asked.results, asked.figures)
-    except (StudyError, semstab.SemstabError) as error:
-        print(f"error: {error}", file=sys.stderr)
-        return 2
-    return 0
+
+    return exit_code(work)
 
 
 if __name__ == "__main__":

@@ -162,7 +162,7 @@ def gate(
         if not result.passed:
             return
     if save_baseline is not None:
-        save_summary(open_run(new, features=True), save_baseline)
+        save_summary(open_run(new), save_baseline)
         print_lines([f"{save_baseline}: a baseline of {save_baseline.stat().st_size:,} bytes"], quiet=quiet)
 
 

@@ -186,21 +186,19 @@ def open_compared(named: Sequence[str | os.PathLike[str]]) -> tuple[RunHandle, .
         ConfigError: If there are fewer than two, and as `open_runs` does.
         DataError: As `open_runs` does.
     """
-    handles = open_models(named[0], features=True) if len(named) == 1 else open_runs(named, features=True)
+    handles = open_models(named[0]) if len(named) == 1 else open_runs(named)
     if len(handles) < 2:
         raise ConfigError("there is nothing to compare the run with; name two runs or more, the base first")
     return handles
 
 
-def open_runs(named: Sequence[str | os.PathLike[str]], *, features: bool = False) -> tuple[RunHandle, ...]:
+def open_runs(named: Sequence[str | os.PathLike[str]]) -> tuple[RunHandle, ...]:
     """Open folders of runs or studies, 'FOLDER:MODEL', and small summaries, under the shortest distinct names.
-
-    With `features` also label sources that give features alone.
 
     Raises:
         ConfigError, DataError: As `open_run` does.
     """
-    runs = [open_run(source, features=features) for source in named]
+    runs = [open_run(source) for source in named]
     folders = ["" if run.source is None else run.source.resolve().name for run in runs]
     models = [run.model for run in runs]
     folder_and_model = [f"{folder}:{model}" for folder, model in zip(folders, models, strict=True)]
@@ -217,30 +215,28 @@ def open_runs(named: Sequence[str | os.PathLike[str]], *, features: bool = False
     return tuple(replace(run, name=name) for run, name in zip(runs, names, strict=True))
 
 
-def open_models(named: str | os.PathLike[str], *, features: bool = False) -> tuple[RunHandle, ...]:
+def open_models(named: str | os.PathLike[str]) -> tuple[RunHandle, ...]:
     """Open all label sources of one run that have the classes that most of them have; ground truth is left out.
 
-    Models that give features alone are left out, too, unless the run has no others and `features` allows them.
+    Models that give features alone are left out, too, unless there are no others.
 
     Raises:
         ConfigError, DataError: As `open_run` does.
     """
     path, model_named = run_and_model(named)
     if model_named is not None or not path.is_dir():
-        return (open_run(named, features=features),)
-    return models_of(load_result(path), path if isinstance(named, str | Path) else None, features=features)
+        return (open_run(named),)
+    return models_of(load_result(path), path if isinstance(named, str | Path) else None)
 
 
-def models_of(result: Result, source: Path | None = None, *, features: bool = False) -> tuple[RunHandle, ...]:
+def models_of(result: Result, source: Path | None = None) -> tuple[RunHandle, ...]:
     """Return the label sources of a run that have the classes that most of them have, without the ground truth.
 
     Models that give features alone are left out, unless there are no others.
     """
     names = [model for model in result.models if model != GROUND_TRUTH]
-    of_models = [handle_of(result, model, source, features=True) for model in names]
+    of_models = [handle_of(result, model, source) for model in names]
     handles = [handle for handle in of_models if not handle.features_alone] or of_models
-    for handle in () if features else handles:
-        handle.require_labels()
     scenes = set.intersection(*({*handle.scenes} for handle in handles)) if handles else set()
     if not scenes:
         return tuple(handles)
@@ -249,10 +245,8 @@ def models_of(result: Result, source: Path | None = None, *, features: bool = Fa
     return tuple(handle for handle in handles if handle.model in shared)
 
 
-def open_run(named: str | os.PathLike[str], *, features: bool = False) -> RunHandle:
+def open_run(named: str | os.PathLike[str]) -> RunHandle:
     """Open a run's only label source, or the one that 'FOLDER:MODEL' selects, at the base settings and backend.
-
-    With `features` also one that gives features alone.
 
     Raises:
         ConfigError: If there is no such folder or label source, or several.
@@ -265,12 +259,10 @@ def open_run(named: str | os.PathLike[str], *, features: bool = False) -> RunHan
     if path.is_file():
         small = load_summary(path)
         _chosen(path, [small.model], model)
-        if not features:
-            small.require_labels()
         return small
     result = load_result(path)
     source = path if isinstance(named, str | Path) else None
-    return handle_of(result, _chosen(path, result.models, model), source, features=features)
+    return handle_of(result, _chosen(path, result.models, model), source)
 
 
 def gives_features_alone(statistics: MapStatistics | None) -> bool:
@@ -279,12 +271,8 @@ def gives_features_alone(statistics: MapStatistics | None) -> bool:
     return features is not None and features.alone
 
 
-def handle_of(result: Result, model: str, source: Path | None = None, *, features: bool) -> RunHandle:
-    """Return one label source of a run, at the base settings and backend; `source` is its folder, if it has one.
-
-    Raises:
-        ConfigError: If it gives features alone, unless `features` allows that.
-    """
+def handle_of(result: Result, model: str, source: Path | None = None) -> RunHandle:
+    """Return one label source of a run, at the base settings and backend; `source` is its folder, if it has one."""
     seed = result.manifest.get("seed")
     scenes = {
         scene: Entry(
@@ -295,10 +283,7 @@ def handle_of(result: Result, model: str, source: Path | None = None, *, feature
         for record in result.select(model=model)
         for scene in [record.unit.scene]
     }  # fmt: skip
-    handle = RunHandle(model, source, model, scenes)
-    if not features:
-        handle.require_labels()
-    return handle
+    return RunHandle(model, source, model, scenes)
 
 
 def shared_scenes(runs: Sequence[RunHandle]) -> tuple[str, ...]:

@@ -26,6 +26,7 @@ def calibrate_run(run: str | Path, *, precision: float = 0.95, confidence: float
         ConfigError, DataError: As `open_run` does, and for a scene whose ground truth was not fused.
     """
     handle = open_run(run)
+    handle.require_labels()
     maps, sampled = [], 1.0
     for scene, entry in handle.scenes.items():
         record = entry.with_voxels("a calibration")

@@ -105,8 +105,10 @@ def gate(new: str | os.PathLike[str], against: str | os.PathLike[str] | None, co
     """
     parsed = [parse(text) for text in config.rules]
     of_features = all(rule.measure.quantity is FEATURE_ALPHA for rule in parsed)
-    run = open_run(new, features=of_features)
-    base = None if against is None else open_run(against, features=of_features)
+    run = open_run(new)
+    base = None if against is None else open_run(against)
+    for handle in () if of_features else filter(None, (run, base)):
+        handle.require_labels()
     scenes = tuple(run.scenes) if base is None else shared_scenes([base, run])
     runs, judgements, notes = GateRuns(run, base, scenes), list[Judgement](), _notes(run, base, scenes)
     for parsed_rule in parsed:

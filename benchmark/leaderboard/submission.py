@@ -123,6 +123,7 @@ def submissions(run: Path, path: Path, card: ModelCard | None = None) -> Iterato
         raise ConfigError(f"{what}: the run has several models ({', '.join(models)}); choose one with --model")
     for model in models:
         handle = open_run(f"{run}:{model}")
+        handle.require_labels()
         require_whole(benchmark, handle)
         about = _about(benchmark, result, config, handle, card or ModelCard())
         scenes = {scene: _in_cubes(entry, benchmark.geometry[scene]) for scene, entry in handle.scenes.items()}

@@ -125,6 +125,7 @@ def compare_visits(
     alignment = None if align is None else Alignment.read(Path(align))
     visits, scenes, visited_by_scene = [], list[VisitedScene](), dict[str, Visited]()
     for handle in handles:
+        handle.require_labels()
         if handle.source is None or not handle.source.is_dir():
             raise ConfigError(f"{handle.where}: two visits are read again frame by frame; give the folder of a run")
         visits.append(Visit(handle.name, str(handle.source), handle.model))
