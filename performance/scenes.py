@@ -1,6 +1,7 @@
 """Frames drawn at random: boxes on a plane, walls round a camera, or slopes, cast by Open3D.
 
 Nothing is tuned to a scene: what is drawn, in what size, from where and with which errors is up to a random generator.
+Every other scene with boxes or slopes is seen obliquely.
 """
 
 from __future__ import annotations
@@ -20,6 +21,10 @@ CLASSES = (7, 21, 41, 150)
 PIXELS_A_VOXEL = 5.0, 16.0
 """Edge of a voxel, in pixels at the median depth: 14 is 20 cm in a 4K image from 40 m. Open3D's own integration is slow
 in smaller voxels, and would make a scene take minutes."""
+
+
+OBLIQUE = 15.0, 35.0
+"""Degrees below the horizon of an oblique view."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -61,7 +66,7 @@ def drawn(seed: int, sizes: tuple[tuple[int, int], ...] = SIZES) -> Scene:
         height=height,
         K=int(rng.choice(CLASSES)),
         altitude=altitude,
-        pitch=float(rng.uniform(-5, 40) if inside else rng.uniform(20, 90)),
+        pitch=float(rng.uniform(-5, 40) if inside else rng.uniform(*OBLIQUE) if seed % 2 else rng.uniform(20, 90)),
         field_of_view=float(rng.uniform(50, 90)),
         far=float(altitude * rng.uniform(3, 8)),
         step=float(altitude * rng.uniform(0.01, 0.06)),
@@ -77,14 +82,14 @@ def _log_uniform(rng: np.random.Generator, low: float, high: float) -> float:
     return float(np.exp(rng.uniform(np.log(low), np.log(high))))
 
 
-def views(scene: Scene, frames: int) -> tuple[list[semstab.Frame], float]:
-    """The frames of a scene, without any error, and the size of its voxels."""
+def views(scene: Scene, frames: int) -> tuple[list[semstab.Frame], float, float]:
+    """The frames of a scene, without any error; the size of its voxels, and its median depth, in metres."""
     caster, made = _caster(scene), []
     for index in range(frames):
         made.append(_view(scene, caster, index))
     seen = made[0].depth[made[0].depth > 0]
-    pixel = float(np.median(seen)) / made[0].intrinsics.fx if len(seen) else 0.01
-    return made, float(f"{scene.pixels_a_voxel * pixel:.2g}")
+    middle = float(np.median(seen)) if len(seen) else 1.0
+    return made, float(f"{scene.pixels_a_voxel * middle / made[0].intrinsics.fx:.2g}"), middle
 
 
 def spoilt(scene: Scene, frame: semstab.Frame, noise: float) -> semstab.Frame:

@@ -26,7 +26,7 @@ ROOT = Path(__file__).parents[1]
 
 SMALL = {
     "fusion": ("96x54", "--sizes 96x54 --rounds 1 --conditions", "noise 0.3 %"),
-    "random-scenes": ("worst", "--sizes 96x54 --scenes 1 --noise 0.3 --many 1 --rounds 1"),
+    "random-scenes": ("worst", "--sizes 96x54 --scenes 1 --percent 0.3 --voxels 2 --many 1 --rounds 1"),
     "casting": ("96x54", "--size 96x54 --triangles 200 --rounds 1"),
     "end-to-end": ("96x54", "--size 96x54 --frames 2 --runs 1 --noise 0 --voxel-size 1 --backend numpy --depth png"),
     "recording": ("ratio", "--size 96x54 --frames 2 --runs 1 --backend numpy"),

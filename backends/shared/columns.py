@@ -165,18 +165,22 @@ def blocks_of(index: Int64, resolution: int) -> tuple[Int32, Int64, Int32]:
     size = 1 << max(4, (2 * len(index)).bit_length())
     blocks, block = np.empty((len(index), 3), dtype=np.int32), np.empty(len(index), dtype=np.int64)
     offset, slots = np.empty(len(index), dtype=np.int32), np.full(size, -1, dtype=np.int32)
-    n = _number(index, resolution, blocks, block, offset, slots)
+    shift = resolution.bit_length() - 1
+    n = _number(index, resolution, shift if resolution == 1 << shift else -1, blocks, block, offset, slots)
     return blocks[:n], block, offset
 
 
 @serial
-def _number(index, r, blocks, block, offset, slots):
-    """Number the blocks in order of appearance, and return how many there are."""
+def _number(index, r, shift, blocks, block, offset, slots):
+    """Number the blocks in order of appearance, and return how many there are; a shift of 0 or more: r is 2^shift."""
     mask = slots.shape[0] - 1
     n = 0
     for v in range(index.shape[0]):
         x, y, z = index[v, 0], index[v, 1], index[v, 2]
-        a, b, c = x // r, y // r, z // r
+        if shift >= 0:
+            a, b, c = x >> shift, y >> shift, z >> shift
+        else:
+            a, b, c = x // r, y // r, z // r
         offset[v] = ((z - c * r) * r + (y - b * r)) * r + (x - a * r)
         at = np.int64(mix((a * 73856093) ^ (b * 19349663) ^ (c * 83492791)) & np.uint64(mask))
         while slots[at] >= 0:

@@ -1,9 +1,10 @@
 """CPU time of a frame of scenes drawn at random, and of Open3D's own VoxelBlockGrid.integrate on the same frames.
 
 scenes.py draws geometry, height, pitch, field of view, range, resolution, classes, size of the voxels and errors of the
-labels; noise is the standard deviation of depth in per cent of it. As in `fusion`, times are those of later frames,
-most of whose voxels are known, user and system time of all threads; 'faster' is Open3D's own time over that of the
-backend. A backend is left out of a scene where its map is said to take more than --most-gb.
+labels; noise is the standard deviation of depth, in per cent of it or in voxels at the median depth. As in `fusion`,
+times are those of later frames, most of whose voxels are known, user and system time of all threads; 'faster' is
+Open3D's own time over that of the backend. A backend is left out of a scene where its map is said to take more than
+--most-gb.
 
 The roofline is about frames that touch so --many voxels. Floor are the bytes that have to move: the image once, and of
 each voxel the lines of the cache with its slot, and with its record, which is also written; the rate is that of a copy
@@ -46,10 +47,10 @@ def floor_bytes(frame: semstab.Frame, voxels: int) -> int:
 
 
 def measured(
-    scene: scenes.Scene, views: Any, size: float, noise: float, names: Any, most_gb: float, rounds: int
+    scene: scenes.Scene, views: Any, size: float, noise: str, share: float, names: Any, most_gb: float, rounds: int
 ) -> Any:
-    """The row of a scene at a level of noise."""
-    frames = [scenes.spoilt(scene, view, noise / 100) for view in views]
+    """The row of a scene at a level of noise, a share of depth."""
+    frames = [scenes.spoilt(scene, view, share) for view in views]
     for frame in frames:
         fusion.prepare(frame)
     counter = create("numba", voxel_size=size, num_classes=scene.K)
@@ -70,7 +71,8 @@ def measured(
 def main(
     scenes_: int = 20,
     seed: int = 0,
-    noise: tuple[float, ...] = (0.0, 0.05, 0.3, 1.0),
+    percent: tuple[float, ...] = (0.0, 0.05, 0.3, 1.0),
+    voxels: tuple[float, ...] = (0.25, 0.75, 2.0),
     sizes: tuple[str, ...] = tuple(f"{w}x{h}" for w, h in scenes.SIZES),
     backends: tuple[str, ...] = ("numba", "open3d"),
     most_gb: float = 3.0,
@@ -80,16 +82,18 @@ def main(
 ) -> Any:
     own = {f"{name}_{what}": spec for name in backends for what, spec in (("ms", ".1f"), ("faster", ".2f"))}
     table = measuring.Table(
-        seed="", kind="", width="", height="", K="", voxel_size="g", noise="g", voxels=",", integrate_ms=".1f", **own
+        seed="", kind="", width="", height="", K="", voxel_size="g", noise="", voxels=",", integrate_ms=".1f", **own
     )
     for number in range(seed, seed + scenes_):
         scene = scenes.drawn(number, tuple(map(measuring.sides, sizes)))
-        views, voxel_size = scenes.views(scene, FRAMES)
-        for level in noise:
-            table.add(**measured(scene, views, voxel_size, level, backends, most_gb, rounds))
+        views, size, middle = scenes.views(scene, FRAMES)
+        shares = {f"{level:g} %": level / 100 for level in percent}
+        shares |= {f"{level:g} voxels": level * size / middle for level in voxels}
+        for level, share in shares.items():
+            table.add(**measured(scene, views, size, level, share, backends, most_gb, rounds))
     print()
-    ratios = measuring.Table(noise="g", backend="", scenes="", median=".2f", worst=".2f")
-    for level in noise:
+    ratios = measuring.Table(noise="", backend="", scenes="", median=".2f", worst=".2f")
+    for level in dict.fromkeys(row["noise"] for row in table.rows):
         for name in backends:
             found = [row[f"{name}_faster"] for row in table.rows if row["noise"] == level and row[f"{name}_faster"]]
             if found:
@@ -97,7 +101,7 @@ def main(
     if large := [row for row in table.rows if row["voxels"] >= many and row[f"{backends[0]}_ms"]]:
         rate = copy_rate()
         print(f"\nroofline of {backends[0]}, a copy moves {rate / 1e9:.1f} GB/s\n")
-        roofline = measuring.Table(seed="", noise="g", voxels=",", MB_at_least=".0f", ms=".1f", share=".0%")
+        roofline = measuring.Table(seed="", noise="", voxels=",", MB_at_least=".0f", ms=".1f", share=".0%")
         for row in large:
             ms = row[f"{backends[0]}_ms"]
             row["share"] = row["floor_bytes"] / rate / (ms / 1e3)
