@@ -6,6 +6,8 @@ of its pixels, follows from a pixel and its slope, however steeply the surface i
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 
 from semstab.core.compiled import serial
@@ -28,6 +30,9 @@ of models do not lie in their faces; a multiple of the 64ths in which a log tell
 
 MOST_PLACES = 1 << 16
 """Most places that are looked at in a block of pixels: a pixel of damaged depth may show thousands of kilometres."""
+
+AT_ONCE = 64
+"""Places of a block that are looked at in one go."""
 
 STEEPEST = 32.0
 """Largest area that a pixel shows, in those that it would show if the surface faced it."""
@@ -68,25 +73,32 @@ def fraction(number):
 @serial
 def inverse(depth, row, column):
     """Return the inverse depth of a pixel; 0 without valid depth and outside of the image."""
-    if row < 0 or column < 0 or row >= depth.shape[0] or column >= depth.shape[1]:
-        return 0.0
-    d = np.float64(depth[row, column])
-    return 1.0 / d if 0.0 < d < np.inf else 0.0
+    return inverse_of(depth_at(depth, row, column))
+
+
+@serial
+def depth_at(depth, row, column):
+    """Return the depth of a pixel, 0 outside of the image."""
+    inside = (row >= 0) & (column >= 0) & (row < depth.shape[0]) & (column < depth.shape[1])
+    return np.float64(depth[row, column]) if inside else 0.0
+
+
+@serial
+def inverse_of(depth):
+    """Return inverse depth, 0 without valid depth; without branches, as `slope`, for vectors."""
+    valid = (depth > 0.0) & (depth < np.inf)
+    return (1.0 if valid else 0.0) / (depth if valid else 1.0)
 
 
 @serial
 def slope(before, here, after):
     """Return the slope of inverse depth by the minmod limiter: the smaller of both sides, 0 at an edge or a peak."""
     left, right = here - before, after - here
-    if before > 0.0 and after > 0.0:
-        if left * right <= 0.0:
-            return 0.0
-        return left if abs(left) < abs(right) else right
-    if before > 0.0:
-        return left if abs(left) < 0.5 * here else 0.0
-    if after > 0.0:
-        return right if abs(right) < 0.5 * here else 0.0
-    return 0.0
+    smaller = left if abs(left) < abs(right) else right
+    smaller = smaller if left * right > 0.0 else 0.0
+    only = left if before > 0.0 else right
+    only = only if ((before > 0.0) | (after > 0.0)) & (abs(only) < 0.5 * here) else 0.0
+    return smaller if (before > 0.0) & (after > 0.0) else only
 
 
 @serial
@@ -196,23 +208,20 @@ def in_world(x, y, z, T):
 
 
 @serial
-def free(px, py, pz, edge, share, low, table, taken):
-    """Return the hash of a point's coarse cell if it is in the sample and has no spot, else -1; it is taken if so."""
-    i, j, k = cell_of(px, py, pz, edge)
-    cell_hash = np.int64(hash_cell(i, j, k))
-    if cell_hash >= share:
-        return np.int64(-1)
+def takes(i, j, k, low, table, added):
+    """Return whether a coarse cell within reach has no spot, which may then be added."""
     a, b, c = i - low[0], j - low[1], k - low[2]
     if a < 0 or b < 0 or c < 0 or a >= SPAN or b >= SPAN or c >= SPAN:
-        return np.int64(-1)
-    return cell_hash if is_new(table, (a << (2 * BITS)) | (b << BITS) | c, taken) else np.int64(-1)
+        return False
+    return is_new(table, (a << (2 * BITS)) | (b << BITS) | c, added)
 
 
 @serial
 def add_spot(px, py, pz, edge, share, low, table, point, hashed, n):
     """Add a point as spot n if its coarse cell is in the sample and has none; return how many spots there are."""
-    cell_hash = free(px, py, pz, edge, share, low, table, True)
-    if cell_hash < 0:
+    i, j, k = cell_of(px, py, pz, edge)
+    cell_hash = hash_cell(i, j, k)
+    if cell_hash >= share or not takes(i, j, k, low, table, True):
         return n
     point[n, 0], point[n, 1], point[n, 2], hashed[n] = px, py, pz, cell_hash
     return n + 1
@@ -249,6 +258,57 @@ def number_of(expected, chance):
 
 
 @serial
+def draw_places(top, left, stride, number, numbers, u, v):
+    """Draw places in a block of pixels, by a chain of hashes that goes on after `number`."""
+    for i in range(len(u)):
+        number = mixed(np.uint32(number + np.uint32(0x9E3779B9)))
+        numbers[i] = number
+        v[i] = top + stride * fraction(number)
+        u[i] = left + stride * fraction(np.uint32(number ^ np.uint32(0x27D4EB2F)))
+
+
+@serial
+def look_at(depth, camera, T, edge, u, v, shown, here, cell, hashed):
+    """Find the inverse depth of the pixels of places, and the coarse cells that they show, with their hashes.
+
+    shown (5, n) is work space, for the depth of the pixels and of those next to them. The loops are apart since
+    arithmetic alone becomes vector instructions.
+    """
+    fx, fy, cx, cy = camera
+    H, W = depth.shape
+    for i in range(len(u)):
+        row, column = np.int64(v[i]), np.int64(u[i])
+        if 0 < row < H - 1 and 0 < column < W - 1:
+            shown[0, i], shown[1, i], shown[2, i] = depth[row, column], depth[row, column - 1], depth[row, column + 1]
+            shown[3, i], shown[4, i] = depth[row - 1, column], depth[row + 1, column]
+        else:
+            shown[0, i] = depth_at(depth, row, column)
+            shown[1, i], shown[2, i] = depth_at(depth, row, column - 1), depth_at(depth, row, column + 1)
+            shown[3, i], shown[4, i] = depth_at(depth, row - 1, column), depth_at(depth, row + 1, column)
+    for i in range(len(u)):
+        w = inverse_of(shown[0, i])
+        along_x = slope(inverse_of(shown[1, i]), w, inverse_of(shown[2, i]))
+        along_y = slope(inverse_of(shown[3, i]), w, inverse_of(shown[4, i]))
+        dx, dy = u[i] - np.floor(u[i]) - 0.5, v[i] - np.floor(v[i]) - 0.5
+        here[i], shown[0, i] = w, max(w + along_x * dx + along_y * dy, 0.5 * w)
+    for i in range(len(u)):
+        z = 1.0 / (shown[0, i] if shown[0, i] > 0.0 else 1.0)
+        px, py, pz = in_world((u[i] - 0.5 - cx) / fx * z, (v[i] - 0.5 - cy) / fy * z, z, T)
+        cell[0, i], cell[1, i], cell[2, i] = cell_of(px, py, pz, edge)
+    for i in range(len(u)):
+        hashed[i] = hash_cell(cell[0, i], cell[1, i], cell[2, i])
+
+
+@serial
+def places_of_block(depth, camera, row, column, here, stride, per_area, chance):
+    """Return how many places to look at in a block of pixels, by the area that it shows."""
+    fx, fy, cx, cy = camera
+    along_x, along_y = slopes(depth, row, column, here, stride)
+    block_area = area(here, along_x, along_y, (column - cx) / fx, (row - cy) / fy, fx, fy) * stride * stride
+    return number_of(per_area * block_area, chance)
+
+
+@serial
 def new_in_image(depth, camera, T, allowed, edge, share, low, stride, factor, density, seed, table, point, hashed):
     """Add spots where an image shows a coarse cell without one; return how many.
 
@@ -258,6 +318,9 @@ def new_in_image(depth, camera, T, allowed, edge, share, low, stride, factor, de
     """
     H, W = depth.shape
     fx, fy, cx, cy = camera
+    u, v, here, shown = np.empty(AT_ONCE), np.empty(AT_ONCE), np.empty(AT_ONCE), np.empty((5, AT_ONCE))
+    cell = np.empty((3, AT_ONCE), np.int64)
+    cell_hash, numbers = np.empty(AT_ONCE, np.uint32), np.empty(AT_ONCE, np.uint32)
     columns = (W + stride - 1) // stride
     total, n = (H + stride - 1) // stride * columns, 0
     at = np.int64(seed % total)
@@ -269,35 +332,30 @@ def new_in_image(depth, camera, T, allowed, edge, share, low, stride, factor, de
         number = np.uint32(np.uint32(seed) ^ (np.uint32(at) * np.uint32(0x85EBCA6B)))
         places, done = np.int64(1), np.int64(0)
         while done < places:
-            number = mixed(np.uint32(number + np.uint32(0x9E3779B9)))
-            v = top + stride * fraction(number)
-            u = left + stride * fraction(np.uint32(number ^ np.uint32(0x27D4EB2F)))
-            row, column = np.int64(v), np.int64(u)
-            v, u = v - 0.5, u - 0.5
-            here = inverse(depth, row, column)
-            done += 1
-            if here == 0.0:
-                continue
-            along_x, along_y = slopes(depth, row, column, here)
-            z = 1.0 / max(here + along_x * (u - column) + along_y * (v - row), 0.5 * here)
-            px, py, pz = in_world((u - cx) / fx * z, (v - cy) / fy * z, z, T)
-            is_taken = free(px, py, pz, edge, share, low, table, False) < 0
-            if done == 1:
-                along_x, along_y = slopes(depth, row, column, here, stride)
-                block_area = area(here, along_x, along_y, (column - cx) / fx, (row - cy) / fy, fx, fy) * stride * stride
-                places = number_of(
-                    density * block_area / (edge * edge), fraction(np.uint32(number ^ np.uint32(0x165667B1)))
-                )
-                if places == 0:
-                    break
-            if is_taken:
-                continue
-            there = smoothed(depth, row, column, here, u - column, v - row, allowed)
-            z = 1.0 / (there if there > 0.5 * here else here)
-            px, py, pz = in_world((u - cx) / fx * z, (v - cy) / fy * z, z, T)
-            n = add_spot(px, py, pz, edge, share, low, table, point, hashed, n)
-            if n == len(hashed):
-                return n
+            some: Any = min(places - done, AT_ONCE)
+            draw_places(top, left, stride, number, numbers[:some], u[:some], v[:some])
+            look_at(depth, camera, T, edge, u[:some], v[:some], shown, here, cell, cell_hash)
+            number = numbers[some - 1]
+            for i in range(some):
+                if here[i] == 0.0:
+                    continue
+                row, column = np.int64(v[i]), np.int64(u[i])
+                if done == 0:
+                    chance = fraction(np.uint32(number ^ np.uint32(0x165667B1)))
+                    per_area = density / (edge * edge)
+                    places = places_of_block(depth, camera, row, column, here[i], stride, per_area, chance)
+                    if places == 0:
+                        break
+                if cell_hash[i] >= share or not takes(cell[0, i], cell[1, i], cell[2, i], low, table, False):
+                    continue
+                x, y = u[i] - 0.5, v[i] - 0.5
+                there = smoothed(depth, row, column, here[i], x - column, y - row, allowed)
+                z = 1.0 / (there if there > 0.5 * here[i] else here[i])
+                px, py, pz = in_world((x - cx) / fx * z, (y - cy) / fy * z, z, T)
+                n = add_spot(px, py, pz, edge, share, low, table, point, hashed, n)
+                if n == len(hashed):
+                    return n
+            done += some
     return n
 
 
