@@ -53,10 +53,13 @@ def fuse_sequence(fusion: Fusion) -> Iterator[Work]:
             for stream in (stream for stream in fusion.streams if index in stream.frames):
                 with fusion.failing(stream.maps):
                     frame, reports = stream.prepare(fetched), {}
+                    fusion.drain()
                     for live in (live for live in stream.maps if index in live.frames):
                         with fusion.failing([live]):
                             live.warm_up(frame.frame)
                             reports[live] = live.integrate(frame, fusion.watch)
+                    for live in (live for live in stream.maps if live in reports):
+                        with fusion.failing([live]):
                             live.sample(frame, fusion.watch)
                     rows = stream.measure(frame, reports)
                     stream.notify(frame, rows)
@@ -159,6 +162,12 @@ class Fusion:
     def _give_up(self, lost: Sequence[LiveMap]) -> None:
         for stream in self.streams:
             stream.maps = [live for live in stream.maps if live not in lost]
+
+    def drain(self) -> None:
+        """Wait for the threads of all maps, so that none takes the time of a map that is timed next."""
+        for live in [live for stream in self.streams for live in stream.maps]:
+            with self.failing([live]):
+                live.drain()
 
     def lap(self) -> dict[str, float]:
         """Return the seconds of each stage since the last work."""

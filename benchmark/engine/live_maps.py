@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import json
 import math
 import time
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import partial
 from typing import Any
@@ -57,7 +58,8 @@ class LiveMap:
     Attributes:
         backend: The backend, or None if nothing is fused; `truth` fuses the ground truth, `hard` the likeliest class of
             soft scores.
-        background: The thread that fuses a frame into the reference while it is measured.
+        background, sampling: The threads that fuse a frame into the reference, and find spots in it, while it is
+            measured.
         tiles: (n, 3) each frame and a tile that it meets, if nothing is fused; `origin` is the voxel of the first
             camera.
     """
@@ -69,6 +71,7 @@ class LiveMap:
     sampler: Sampler | None = None
     reference: NumpySample | None = None
     background: Background = field(default_factory=lambda: Background("semstab-reference", 1))
+    sampling: Background = field(default_factory=lambda: Background("semstab-sample", 1))
     hard: FusionBackend | None = None
     rows: Series = field(default_factory=Series)
     observations: int = 0
@@ -76,6 +79,8 @@ class LiveMap:
     frames: range | frozenset[int] = range(0)
     tiles: list[Int32] = field(default_factory=list)
     origin: tuple[int, int, int] | None = None
+    _seconds: float = math.nan
+    """Seconds of the fusion of the last frame."""
 
     @classmethod
     def of(cls, work: Work, scene: Scene) -> LiveMap:
@@ -133,18 +138,15 @@ class LiveMap:
         if self.backend is None:
             points = int(np.count_nonzero(frame.valid)) if self.work.tile is None else 0
             return FrameReport(frame.index, points, voxels=0, new_voxels=0, drift_sum=0.0, seconds=0.0, map_voxels=0)
-        self.background.drain()  # it would take the time of the map
         started = time.perf_counter()
         with watch(f"fuse {self.name.backend}"):
             report = self.backend.integrate(frame)
-        seconds = time.perf_counter() - started
+        self._seconds = time.perf_counter() - started
         if not isinstance(report, FrameReport):
             raise ConfigError(
                 f"backend '{self.name.backend}': integrate returned a {type(report).__name__}; it returns a"
                 " semstab.data.results.FrameReport (docs/tutorials/own-backend.md)"
             )
-        if self.reference is not None:
-            self.background.submit(partial(self._integrate_reference, self.reference, frame, seconds, watch))
         if frame.scores is not None and self.work.unit.image_space:
             with watch("reduced scores"):
                 self.hard = self.hard or self.new_map(log=False)
@@ -158,16 +160,12 @@ class LiveMap:
             return dataclasses.replace(report, drift_sum=nan, map_vss_all=nan, map_entropy_all=nan)
         return report
 
-    @staticmethod
-    def _integrate_reference(reference: NumpySample, frame: Frame, seconds: float, watch: Stopwatch) -> None:
-        with watch("reference"):
-            reference.integrate(frame, seconds)
-
     def sample(self, prepared: Decoded, watch: Stopwatch) -> None:
-        """Keep a sample of what the frame observes."""
-        with watch("sample"):
-            if self.sampler is not None:
-                self.sampler.add(prepared.frame)
+        """Begin to take the frame into the reference and into the sample of spots, in threads; see `drain`."""
+        if self.reference is not None:
+            self.background.submit(partial(self._add_to_reference, self.reference, prepared.frame, watch))
+        if self.sampler is not None:
+            self.sampling.submit(partial(self._add_to_sample, self.sampler, prepared.frame, watch))
         if not self.work.fuses and self.work.tile is not None:
             frame, voxel_size = prepared.frame, self.config.voxel_size
             if self.origin is None:
@@ -175,6 +173,25 @@ class LiveMap:
                 self.origin = x, y, z
             met = tiles_met(frame, voxel_size, self.work.tile.size)
             self.tiles.append(np.column_stack([np.full(len(met), frame.index, np.int32), met]))
+
+    def _add_to_reference(self, reference: NumpySample, frame: Frame, watch: Stopwatch) -> None:
+        with watch("reference"):
+            reference.integrate(frame, self._seconds)
+
+    def _add_to_sample(self, sampler: Sampler, frame: Frame, watch: Stopwatch) -> None:
+        with watch("sample"):
+            sampler.add(frame)
+
+    @contextlib.contextmanager
+    def threads(self) -> Iterator[None]:
+        """End the threads after the block."""
+        with contextlib.closing(self.background), contextlib.closing(self.sampling):
+            yield
+
+    def drain(self) -> None:
+        """Wait for the threads, which would take the time of whatever map is timed next."""
+        self.background.drain()
+        self.sampling.drain()
 
     @property
     def left_out(self) -> list[int]:

@@ -80,9 +80,10 @@ def finish(live: LiveMap, stream: Stream, watch: Stopwatch) -> Work:
         DataError: If no pixel of a whole map was valid.
     """
     work, config, tile, files = live.work, live.config, live.work.tile, Files(live.work.start)
+    live.drain()
     fused = _fused_map(live, watch) if work.fuses else None
     observations, features = live.sampled_observations(), live.sampled_features()
-    with contextlib.closing(live.background), contextlib.closing(Background("semstab-files", 1)) as writer:
+    with contextlib.closing(Background("semstab-files", 1)) as writer, live.threads():
         if fused is not None and tile is None and not len(fused.table):
             raise no_voxels(live.task, config)
         if fused is not None and not config.statistics:  # else columns of the statistics go along
