@@ -13,11 +13,11 @@ from corners import combination
 from PIL import Image
 from posed_writer import write_posed
 
+from semstab import LabelSpace
 from semstab.check.label_ids import id_remarks
 from semstab.check.label_maps import MAPS, LabelledFrame, LabelRun
 from semstab.check.labels import check_labels
 from semstab.check.reprojection import View
-from semstab.data.labels import LabelSpace
 
 NAMES = [f"{k:03d}" for k in range(doctor.FRAMES)]
 OF_ALL = [each for each in doctor.MISTAKES if "of one frame" not in each.name]  # found in 7 of 10 scenes: docs/check.md

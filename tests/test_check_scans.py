@@ -8,8 +8,8 @@ import pytest
 from corners import corners
 from street import Street
 
+from semstab import Frame
 from semstab.check.scan_order import LENGTH, STRETCHES, in_order
-from semstab.data.frames import Frame
 
 
 @pytest.fixture(autouse=True)

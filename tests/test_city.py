@@ -12,8 +12,8 @@ import numpy as np
 import pytest
 from corners import combination
 
+from semstab import Frame
 from semstab.core.files import read_json
-from semstab.data.frames import Frame
 from semstab.datasets import GROUND_TRUTH, open_dataset
 from semstab.datasets.city import City, CityScene, SimulatedModel
 from semstab.datasets.city.ground import Ground

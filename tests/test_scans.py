@@ -12,11 +12,11 @@ from corners import corners
 from street import IDS, Street, write_street
 
 import semstab
+from semstab import Frame, Intrinsics
 from semstab.check import check, scans
 from semstab.check.hypotheses import SCANS, scan_poses
 from semstab.check.trials import Hypothesis
 from semstab.configure import load_config
-from semstab.data.frames import Frame, Intrinsics
 from semstab.datasets import open_dataset
 from semstab.errors import DataError
 from semstab.metrics import compensated_flicker

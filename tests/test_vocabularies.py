@@ -12,8 +12,8 @@ from command_line import bench, error_of
 from room_scene import CLASSES, Room, walk, write
 
 import semstab
+from semstab import Features
 from semstab.core.files import write_image
-from semstab.data.features import Features
 from semstab.datasets import open_dataset
 from semstab.datasets.posed_folder import PosedFolder
 from semstab.errors import ConfigError, DataError
