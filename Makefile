@@ -2,13 +2,14 @@
 BIN := .venv/bin
 TESTS := $(BIN)/pytest -n auto --maxprocesses 4 --dist loadfile --no-loadscope-reorder
 
-.PHONY: help setup setup-dev bench quick test docs fuzz fuzz-short faults mutants lint format clean
+.PHONY: help setup setup-dev bench quick test docs fuzz fuzz-short combinations faults mutants lint format clean
 
 help:
 	@echo 'make bench   set up, then fuse the built-in city with Open3D: semstab-bench --backend open3d'
 	@echo 'make test    set up, then lint, types and import contract beside a minute of damaged files, and the test suite'
 	@echo 'make quick   between edits, a minute at most: ruff, and the tests of what changed since the last commit'
 	@echo 'make fuzz    damage files of every kind for an hour (FUZZ_SECONDS=3600 FUZZ_SEED=1); fuzz-short: the same 10,000 inputs everywhere'
+	@echo 'make combinations  the tests that make test leaves out: combinations of what it tests one by one; make fuzz begins with them'
 	@echo 'make faults  kill 315 runs (of 30 scenes, over videos, too), studies, predictions, exports and conversions (FAULTS=315), fill their disk, and see that nothing is lost'
 	@echo 'make mutants  change 100 lines of the product, one at a time (MUTANTS="--lines 100 --seed 0"), and say which the tests find'
 	@echo 'make docs    build the documentation into site/, warnings are errors; type its tutorials, and the examples of the help, as they stand'
@@ -40,8 +41,11 @@ docs: setup-dev
 
 FUZZ_SECONDS := 3600
 FUZZ_SEED := 1
-fuzz: setup-dev
+fuzz: combinations
 	$(BIN)/python tests/fuzz/fuzz.py --seconds $(FUZZ_SECONDS) --seed $(FUZZ_SEED)
+
+combinations: setup-dev
+	$(TESTS) -m combination --ignore tests/docs
 
 fuzz-short: setup-dev
 	$(BIN)/python tests/fuzz/fuzz.py --inputs 10000 --seconds 300 --seed 1

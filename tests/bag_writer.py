@@ -12,7 +12,7 @@ import cv2
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from semstab.data.frames import Frame
+from semstab import Frame
 
 if TYPE_CHECKING:
     from scan_writers import Scan

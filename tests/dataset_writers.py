@@ -15,9 +15,8 @@ import numpy as np
 from posed_writer import write_posed
 from scipy.spatial.transform import Rotation
 
+from semstab import Frame, VoxelTable
 from semstab.backends import create
-from semstab.data.frames import Frame
-from semstab.data.voxels import VoxelTable
 from semstab.datasets import open_dataset
 
 W, H, COUNT, SHRUNK = 48, 32, 4, 10

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from semstab.data.labels import LabelSpace
+from semstab import LabelSpace
 from semstab.datasets.formats.images import PNG_SIGNATURE
 from semstab.errors import DataError
 

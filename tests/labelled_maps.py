@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import trimesh
 
-from semstab.data.voxels import VoxelTable
+from semstab import VoxelTable
 from semstab.metrics import dominant
 
 

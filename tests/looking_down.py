@@ -8,7 +8,7 @@ import numpy as np
 import trimesh
 from scipy.spatial.transform import Rotation
 
-from semstab.data.frames import Frame, Intrinsics
+from semstab import Frame, Intrinsics
 
 W, H = 24, 16
 K = Intrinsics(20, 20, 11.5, 7.5)

@@ -9,8 +9,8 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
+from semstab import VoxelTable
 from semstab.data.results import FrameReport
-from semstab.data.voxels import VoxelTable
 from semstab.errors import ConfigError, DataError
 
 

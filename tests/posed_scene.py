@@ -8,7 +8,7 @@ import yaml
 from PIL import Image
 from posed_writer import write_posed
 
-from semstab.data.frames import Frame, Intrinsics
+from semstab import Frame, Intrinsics
 from semstab.datasets import open_dataset
 
 H, W, K = 6, 8, 3

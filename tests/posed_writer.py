@@ -7,8 +7,8 @@ from pathlib import Path
 
 import yaml
 
+from semstab import Frame
 from semstab.convert import CONVERSION_FILE, DepthFormat, SceneFolder
-from semstab.data.frames import Frame
 
 
 def write_posed(

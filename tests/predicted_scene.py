@@ -8,7 +8,7 @@ import numpy as np
 from pictures import blobs
 from posed_writer import write_posed
 
-from semstab.data.frames import Frame, Intrinsics
+from semstab import Frame, Intrinsics
 
 HEIGHT, WIDTH, FOCAL = 48, 80, 40.0
 

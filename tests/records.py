@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 
+from semstab import Result, VoxelTable
 from semstab.config import BASE
-from semstab.data.records import Record, Result, Variation
+from semstab.data.records import Record, Variation
 from semstab.data.results import UnitName, UnitSummary
-from semstab.data.voxels import VoxelTable
 from semstab.metrics import summarise
 
 CLASSES = ("a", "b", "c")

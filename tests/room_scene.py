@@ -8,8 +8,7 @@ from pathlib import Path
 import numpy as np
 from posed_writer import write_posed
 
-from semstab.data.frames import Frame, Intrinsics
-from semstab.data.labels import LabelSpace
+from semstab import Frame, Intrinsics, LabelSpace
 from semstab.datasets import Scene, open_dataset
 
 WIDTH, HEIGHT, FOCAL = 96, 72, 80.0

@@ -6,7 +6,7 @@ import math
 
 import numpy as np
 
-from semstab.data.events import Events
+from semstab import Events
 from semstab.statistics import SpotObservations, Views
 
 

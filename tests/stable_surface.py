@@ -16,11 +16,10 @@ import reference
 import tiny_scene
 
 import semstab
-from semstab import backends, conformance, datasets, models
+from semstab import GateConfig, backends, conformance, datasets, gate, models
 from semstab.cli.execution import DISAGREE
 from semstab.config import Config
 from semstab.engine import Observer
-from semstab.gating.gate import GateConfig, gate
 from semstab.gating.report import as_json
 from semstab.gating.result import EXIT_CODES
 from semstab.predict.filters import Filter

@@ -6,8 +6,7 @@ import dataclasses
 
 import numpy as np
 
-from semstab import backends
-from semstab.data.frames import Frame, Intrinsics
+from semstab import Frame, Intrinsics, backends
 from semstab.statistics import Sampler
 
 K = 3

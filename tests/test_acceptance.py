@@ -14,12 +14,12 @@ from simulated_events import grid, log_of
 from typer.testing import CliRunner
 
 import semstab
+from semstab import AcceptanceThresholds, VoxelTable
 from semstab.cli import app
 from semstab.data.measures import dominant, vss
-from semstab.data.voxels import VoxelTable
 from semstab.errors import ConfigError, DataError
 from semstab.statistics import acceptance
-from semstab.statistics.acceptance import AcceptanceThresholds, calibrate
+from semstab.statistics.acceptance import calibrate
 from semstab.statistics.correctness import Truth
 
 OF_FEW = acceptance._of_few

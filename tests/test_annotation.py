@@ -16,7 +16,7 @@ from posed_writer import write_posed
 from pycocotools.coco import COCO
 
 import semstab
-from semstab.data.frames import Frame, Intrinsics
+from semstab import Frame, Intrinsics
 from semstab.datasets import open_dataset
 from semstab.errors import ConfigError, DataError
 from semstab.exports.annotation import outlined

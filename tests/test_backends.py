@@ -13,10 +13,9 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 from oracle import Oracle
 
-from semstab import backends
+from semstab import Frame, Intrinsics, backends
 from semstab.backends.numpy_reference import NumpyReference
 from semstab.core.files import read_json
-from semstab.data.frames import Frame, Intrinsics
 from semstab.errors import ConfigError, DataError
 from semstab.metrics import dominant, entropy, sbd, vss
 from semstab.testing import EXACT, SUMS, BackendConformance, checks, random_frames, sight_line, voxels

@@ -10,11 +10,11 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from room_scene import AXES, CAMERA, HEIGHT, RAY_LENGTH, WIDTH, Room, opened, rigid, turn, walk, write
 
+from semstab import Frame
 from semstab.check import quick_check, require_sound
 from semstab.check.conventions import Convention
 from semstab.check.reprojection import MAX_PIXELS, STEPS, Sample, View, clusters, median_of_seen, pairs_within
 from semstab.core.arrays import evenly
-from semstab.data.frames import Frame
 from semstab.datasets import open_dataset
 from semstab.errors import DataError
 from semstab.pixels.warp import correspond

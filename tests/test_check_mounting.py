@@ -11,11 +11,11 @@ import pytest
 from command_line import bench
 from posed_writer import write_posed
 
+from semstab.check import Verdict
 from semstab.check.inspection import Inspection
 from semstab.check.mounting import ALL, ARM, FX, FY, MountingChange, fitted_change, with_mounting
 from semstab.check.reprojection import clusters
 from semstab.check.scene_check import CLUSTERS, POINTS
-from semstab.check.verdict import Verdict
 from semstab.datasets import open_dataset
 
 DATA = Path(os.environ.get("SEMSTAB_DATA", Path(__file__).parents[1] / "../shared/data"))

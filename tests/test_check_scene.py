@@ -19,14 +19,13 @@ from room_scene import AXES, CAMERA, CLASSES, RAY_LENGTH, Room, opened, rigid, w
 from typer.testing import CliRunner
 
 import semstab
+from semstab import Frame, LabelSpace
 from semstab.check import check, check_scene, quick_check
 from semstab.check.coverage import SIZES, plane_residuals
 from semstab.check.histogram import LabelTally
 from semstab.check.reprojection import View
 from semstab.cli import app
 from semstab.configure import load_config, resolve
-from semstab.data.frames import Frame
-from semstab.data.labels import LabelSpace
 from semstab.errors import ConfigError, DataError
 
 DATA = Path(os.environ.get("SEMSTAB_DATA", Path(__file__).parents[1] / "../shared/data"))

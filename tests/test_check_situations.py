@@ -7,6 +7,7 @@ from dataclasses import replace
 import doctor
 import numpy as np
 import pytest
+from corners import corners
 from dataset_writers import write_labels, write_tum
 from posed_writer import write_posed
 from typer.testing import CliRunner
@@ -23,13 +24,18 @@ LIKE_OTHERS = ("poses turned by 2", "labels upside down from")
 
 FOUND = [each for each in doctor.SITUATIONS if not each.name.startswith(HARD + LIKE_OTHERS)]
 
+AS_ANOTHER = ("identity as pose in 5 frames", "poses in another frame of reference", "labels three frames late")
+"""Situations that are said in the words of another one here."""
+
+CORNERS = [each for each in FOUND if not each.name.startswith(AS_ANOTHER)]
+
 
 @pytest.fixture(scope="module")
 def frames():
     return doctor.scene(SEED)
 
 
-@pytest.mark.parametrize("situation", FOUND, ids=lambda each: each.name)
+@pytest.mark.parametrize("situation", corners(FOUND, kept=CORNERS), ids=lambda each: each.name)
 def test_check_and_a_run_name_it_in_the_same_words(situation, frames, monkeypatch) -> None:
     planted = situation.plant(frames)
     if all(np.array_equal(own.T_wc, f.T_wc) for own, f in zip(planted, frames, strict=True)):  # mistakes of labels

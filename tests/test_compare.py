@@ -17,6 +17,7 @@ from rich.console import Console
 from simulated_events import log_of
 
 import semstab
+from semstab import Frame, Intrinsics
 from semstab.compare_runs import load_comparison, markdown
 from semstab.comparison.differences import corrected, over_scenes
 from semstab.comparison.entries import open_runs
@@ -25,7 +26,6 @@ from semstab.comparison.pairing import Common, pair
 from semstab.comparison.voxels import Region
 from semstab.core.files import read_sealed, write_sealed
 from semstab.data.contrast import Against, Contrast, RunComparison, SceneComparison
-from semstab.data.frames import Frame, Intrinsics
 from semstab.data.georeference import Georeference
 from semstab.data.statistics import Interval
 from semstab.errors import ConfigError, DataError

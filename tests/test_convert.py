@@ -19,13 +19,12 @@ from posed_config import configure
 from room_scene import CAMERA, Room, opened, walk, write
 from typer.testing import CliRunner
 
+from semstab import Intrinsics, LabelSpace
 from semstab.backends import create
 from semstab.cli import app
 from semstab.config import Config
 from semstab.configure import load_config, resolve
 from semstab.convert import convert, convert_scene, depth_format, matrix_text, quantised
-from semstab.data.frames import Intrinsics
-from semstab.data.labels import LabelSpace
 from semstab.datasets import GROUND_TRUTH, open_dataset
 from semstab.errors import ConfigError, DataError
 from semstab.testing import assert_same_map

@@ -18,10 +18,9 @@ from posed_config import configure
 from records import record, study, voxels
 
 import semstab
+from semstab import Events, VoxelTable
 from semstab.api import run_study
 from semstab.core.json_form import to_json
-from semstab.data.events import Events
-from semstab.data.voxels import VoxelTable
 from semstab.engine import Observer, load_result
 from semstab.engine.memory import MapMemory
 from semstab.errors import ConfigError

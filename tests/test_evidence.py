@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 from simulated_events import log_of
 
+from semstab import VoxelTable
 from semstab.data.evidence import Evidence, row_chunks
 from semstab.data.measures import Rows, margin
-from semstab.data.voxels import VoxelTable
 from semstab.metrics import dominant, entropy, vss
 from semstab.statistics import describe
 

@@ -14,9 +14,8 @@ from hypothesis import strategies as st
 from posed_config import configure
 
 import semstab
+from semstab import Frame, Intrinsics, LabelSpace
 from semstab.configure import load_config
-from semstab.data.frames import Frame, Intrinsics
-from semstab.data.labels import LabelSpace
 from semstab.data.measures import dominant
 from semstab.engine.units import make_plan
 from semstab.errors import ConfigError, DataError

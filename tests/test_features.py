@@ -16,9 +16,10 @@ from room_scene import CAMERA, CLASSES, Room, opened, render, rigid, turn, walk,
 from simulated_events import grid, spots_at
 
 import semstab
+from semstab import Features
 from semstab.comparison.differences import sums_difference
 from semstab.core.files import write_image
-from semstab.data.features import FeatureColours, Features
+from semstab.data.features import FeatureColours
 from semstab.errors import DataError
 from semstab.online.metric import TemporalStability
 from semstab.statistics import Sampler

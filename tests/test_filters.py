@@ -9,8 +9,7 @@ import numpy as np
 import predicted_scene
 import pytest
 
-from semstab.data.frames import Frame, Intrinsics
-from semstab.data.labels import LabelSpace
+from semstab import Frame, Intrinsics, LabelSpace
 from semstab.errors import ConfigError
 from semstab.models import Model, Prediction
 from semstab.pixels.warp import carry

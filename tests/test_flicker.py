@@ -8,8 +8,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from semstab import datasets
-from semstab.data.frames import Frame, Intrinsics
+from semstab import Frame, Intrinsics, datasets
 from semstab.errors import ConfigError
 from semstab.metrics import CompensatedFlicker, compensated_flicker, flicker_percent
 from semstab.pixels.warp import correspond, warp

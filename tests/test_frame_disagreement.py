@@ -16,8 +16,8 @@ from posed_config import configure
 from posed_writer import write_posed
 from simulated_events import spots_at
 
+from semstab import Frame, Intrinsics
 from semstab.api import run_study
-from semstab.data.frames import Frame, Intrinsics
 from semstab.recording.voxel_maps import agreement_report
 from semstab.report.page import render
 from semstab.report.tables import tables

@@ -5,7 +5,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from semstab.data.frames import Frame, Intrinsics
+from semstab import Frame, Intrinsics
 from semstab.datasets.geometry.cameras import Camera
 from semstab.errors import DataError
 from semstab.testing import checks

@@ -15,14 +15,13 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 import semstab
-from semstab import backends
+from semstab import VoxelTable, backends
 from semstab.backends.from_observations import FromObservations
 from semstab.backends.numpy_reference import NumpySample, in_sample
 from semstab.backends.rules import RULES, Rule
 from semstab.backends.shared.association import observe
 from semstab.configure import load_config
 from semstab.data.information import js_divergence
-from semstab.data.voxels import VoxelTable
 from semstab.engine import load_result
 from semstab.errors import ConfigError, DataError
 from semstab.metrics import dominant, vss

@@ -22,6 +22,7 @@ from simulated_events import grid, log_of
 from typer.testing import CliRunner
 
 import semstab
+from semstab import gate
 from semstab.cli import app
 from semstab.comparison import differences
 from semstab.comparison.entries import open_run, save_summary
@@ -30,7 +31,7 @@ from semstab.data.statistics import Interval, short
 from semstab.errors import ConfigError, DataError
 from semstab.gating import report as gate_report
 from semstab.gating.evaluation import LOST, bounded
-from semstab.gating.gate import gate, gate_config
+from semstab.gating.gate import gate_config
 from semstab.gating.result import GateResult, Judgement, negative, verdict
 from semstab.gating.rules import parse
 from semstab.statistics.accumulate import cluster_sums_of

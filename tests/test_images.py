@@ -31,7 +31,7 @@ from image_files import (
     written,
 )
 
-from semstab.data.labels import LabelSpace
+from semstab import LabelSpace
 from semstab.datasets.formats import images
 from semstab.datasets.formats.images import PNG_SIGNATURE, read_color, read_depth, read_labels, read_scores
 from semstab.errors import ConfigError, DataError

@@ -3,7 +3,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from semstab.data.labels import LabelSpace, moving, shipped_taxonomies
+from semstab import LabelSpace
+from semstab.data.labels import moving, shipped_taxonomies
 from semstab.errors import ConfigError, DataError
 from semstab.testing import checks
 

@@ -9,8 +9,8 @@ from scipy import stats
 from striped_floor import flight
 
 import semstab
+from semstab.report.terminal import screen
 from semstab.report.terminal.many_scenes import over_scenes
-from semstab.report.terminal.summary import screen
 
 MODELS = ("espnetv2-0.5", "espnetv2-1.0", "dicenet-0.75", "dicenet-1.0", "random")
 

@@ -24,22 +24,19 @@ from pyarrow import dataset, parquet
 from scipy.spatial.transform import Rotation
 
 import semstab
-from semstab import backends
+from semstab import Belief, Frame, Intrinsics, VoxelTable, backends, relabel
 from semstab.comparison import voxels as common_voxels
 from semstab.comparison.differences import differences_of
 from semstab.comparison.entries import open_compared
 from semstab.core.json_form import to_json
 from semstab.data import voxels
-from semstab.data.frames import Frame, Intrinsics
 from semstab.data.parquet import Tile
-from semstab.data.voxels import Extent, VoxelTable
+from semstab.data.voxels import Extent
 from semstab.engine import InProcess, LocalProcesses, Observer
 from semstab.engine.memory import Sizing
 from semstab.engine.tiles import tiles_met
 from semstab.errors import ConfigError, DataError, OutgrownError
 from semstab.exports import export, maps
-from semstab.exports.fused_labels import Belief
-from semstab.exports.relabel import relabel
 from semstab.gating.calibration import calibrate_run
 from semstab.statistics.cluster_sums import ClusterSums
 from semstab.testing import EXACT, SUMS, random_frames, sight_line

@@ -16,8 +16,8 @@ from posed_writer import write_posed
 from simulated_events import grid, spots_of
 
 import semstab
+from semstab import LabelSpace
 from semstab.data.distances import distances_of, tree_distances
-from semstab.data.labels import LabelSpace
 from semstab.errors import DataError
 from semstab.statistics.accumulate import sums_of_spots
 from semstab.statistics.cluster_sums import ClusterSums, value

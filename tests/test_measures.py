@@ -17,11 +17,11 @@ from posed_config import configure
 from rich.console import Console
 
 import semstab
+from semstab import VoxelTable
 from semstab.api import run_study
 from semstab.comparison.quantities import quantities
 from semstab.data import records, results, statistics
 from semstab.data.measures import RESERVED, VSS, Measure, MeasureMeans, measures, register, registered
-from semstab.data.voxels import VoxelTable
 from semstab.engine import load_result
 from semstab.errors import ConfigError
 from semstab.recording import Recording, color_modes

@@ -12,11 +12,11 @@ import tiny_scene
 from posed_config import configure
 
 import semstab
+from semstab import Frame, Intrinsics
 from semstab.backends import create, expected_bytes
 from semstab.backends.shared.observations import WorkSpace
 from semstab.config import Config
 from semstab.core.process import available_bytes, resident_bytes
-from semstab.data.frames import Frame, Intrinsics
 from semstab.engine import memory
 from semstab.engine.units import Plan, make_plan
 from semstab.errors import ConfigError

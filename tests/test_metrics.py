@@ -8,11 +8,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from semstab import backends
-from semstab.data.frames import Frame, Intrinsics
+from semstab import Frame, Intrinsics, VoxelTable, backends
 from semstab.data.measures import ENTROPY, SBD, VSS, margin, measures
 from semstab.data.results import Means, MeasureMeans, UnitName
-from semstab.data.voxels import VoxelTable
 from semstab.errors import DataError
 from semstab.metrics import (
     compare,

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import tiny_models
 
-from semstab.data.labels import LabelSpace
+from semstab import LabelSpace
 from semstab.errors import ConfigError
 from semstab.models import Model, Prediction
 from semstab.models.names import InTaxonomy, class_mapping, vocabularies

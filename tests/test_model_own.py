@@ -15,8 +15,8 @@ import pytest
 from pictures import blobs
 from typer.testing import CliRunner
 
+from semstab import LabelSpace
 from semstab.cli import app
-from semstab.data.labels import LabelSpace
 from semstab.errors import ConfigError, DataError, MissingDependencyError
 from semstab.models import Model, Prediction, create
 from semstab.models.validation import Checked

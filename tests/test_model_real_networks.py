@@ -12,9 +12,8 @@ import numpy as np
 import pytest
 import torch
 
+from semstab import Features, LabelSpace
 from semstab.core.code import Code
-from semstab.data.features import Features
-from semstab.data.labels import LabelSpace
 from semstab.datasets import open_dataset
 from semstab.models import create
 from semstab.predict.vocabulary import Vocabulary

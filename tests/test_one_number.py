@@ -16,6 +16,7 @@ import re
 import pytest
 import video_scene
 from command_line import bench
+from corners import corners
 from rich.console import Console
 from street import Street, write_street
 from test_leaderboard import define, write_scene
@@ -49,7 +50,7 @@ KINDS = {
 }
 
 
-@pytest.fixture(scope="module", params=KINDS)
+@pytest.fixture(scope="module", params=corners(KINDS, kept=("scores", "truth", "two scenes", "scans")))
 def run(request, tmp_path_factory):
     """A finished run and its folder."""
     folder = tmp_path_factory.mktemp("numbers") / "run"

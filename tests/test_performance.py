@@ -19,6 +19,7 @@ import cases
 import measuring
 import pytest
 from command_line import bench as bench_command
+from corners import corners
 
 from semstab.core.process import resident_bytes
 
@@ -50,7 +51,11 @@ def run_here(*words: object, **variables: str) -> measuring.Process:
     return measuring.Process(time.perf_counter() - started, time.process_time() - cpu, resident_bytes() / 1e9)
 
 
-@pytest.mark.parametrize("name", SMALL)
+LONG = ("tiles", "end-to-end", "growth", "scores", "recording")
+"""Cases that start processes or runs: each takes seconds at any size."""
+
+
+@pytest.mark.parametrize("name", corners(SMALL, kept=SMALL.keys() - {*LONG}))
 def test_a_case_prints_its_table_and_writes_it(name, tmp_path, capsys, monkeypatch) -> None:
     text, words, *more = SMALL[name]
     monkeypatch.setattr("timed.tiles.SIZE", (160, 120))

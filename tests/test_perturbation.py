@@ -13,9 +13,9 @@ import tiny_scene
 from posed_config import configure
 
 import semstab
+from semstab import Frame, Intrinsics
 from semstab.config import Perturbation
 from semstab.configure import load_config
-from semstab.data.frames import Frame, Intrinsics
 from semstab.engine.units import make_plan
 from semstab.errors import ConfigError
 from semstab.pixels.preparation import perturb

@@ -17,11 +17,10 @@ from posed_config import configure
 from rich.console import Console
 
 import semstab
-from semstab import metrics
+from semstab import Result, metrics
 from semstab.configure import load_config
 from semstab.core.json_form import to_json
 from semstab.data.measures import ENTROPY, SBD, VSS
-from semstab.data.records import Result
 from semstab.data.results import STAGES, UnitName
 from semstab.datasets.files import options
 from semstab.engine import Observer, load_result

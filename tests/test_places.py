@@ -17,10 +17,9 @@ from posed_config import configure, dataset_of
 from posed_scene import fails
 
 import semstab
-from semstab.data.frames import Frame, Intrinsics
+from semstab import Frame, Intrinsics, VoxelTable
 from semstab.data.georeference import IDENTITY, Georeference
 from semstab.data.topdown import level_axes
-from semstab.data.voxels import VoxelTable
 from semstab.engine.place_pictures import EDGE, chosen_frames, cut_out, pictured_views
 from semstab.errors import ConfigError
 from semstab.exports import export
@@ -30,8 +29,7 @@ from semstab.report.figures.maps import Overview, draw_stability
 from semstab.report.figures.topdown import FromAbove
 from semstab.report.html import label_picture
 from semstab.report.page import render
-from semstab.statistics import places
-from semstab.statistics.observations import SpotObservations, Views
+from semstab.statistics import SpotObservations, Views, places
 from semstab.statistics.places import Place, PlaceView, connected, places_of, worst_places
 
 CRS, OFFSET = "EPSG:32615", (576714.0, 5188162.0, 200.0)

@@ -16,12 +16,11 @@ from PIL import Image
 from records import record, study, voxels
 from wall_study import MODELS, drawn_walls, wall_study
 
-from semstab import backends
+from semstab import VoxelTable, backends
 from semstab.data.kernels import put_topmost
 from semstab.data.labels import palette
 from semstab.data.measures import SBD, SBD_MAX, VSS, measures
 from semstab.data.topdown import EMPTY, level_axes, top_down
-from semstab.data.voxels import VoxelTable
 from semstab.errors import DataError
 from semstab.metrics import CATEGORY_COLORS, categories, dominant, op, sbd
 from semstab.report.figures import figures

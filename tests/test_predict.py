@@ -19,11 +19,11 @@ from command_line import bench, error_of
 from PIL import Image
 from posed_config import configure, dataset_of
 
+from semstab import LabelSpace
 from semstab.api import run
 from semstab.config import Config, DatasetConfig, FrameSelection
 from semstab.configure import predicted_config
 from semstab.core.files import FolderLock
-from semstab.data.labels import LabelSpace
 from semstab.data.measures import ENTROPY
 from semstab.data.results import slug
 from semstab.datasets import open_dataset

@@ -11,10 +11,10 @@ import pytest
 from PIL import Image
 from posed_config import dataset_of
 
+from semstab import LabelSpace
 from semstab.api import run
 from semstab.config import Config, FrameSelection
 from semstab.configure import predicted_config, resolve
-from semstab.data.labels import LabelSpace
 from semstab.datasets import open_dataset
 from semstab.datasets.formats.images import read_labels
 from semstab.errors import ConfigError, DataError

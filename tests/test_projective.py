@@ -11,8 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from oracle import Oracle
 
-from semstab import backends
-from semstab.data.frames import Frame, Intrinsics
+from semstab import Frame, Intrinsics, backends
 from semstab.errors import ConfigError, DataError
 from semstab.metrics import entropy, sbd, vss
 from semstab.testing import EXACT, SUMS, assert_same_map, checks, random_frames, voxels

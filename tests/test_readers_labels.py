@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from posed_scene import fails
 from scipy import ndimage
 
-from semstab.data.frames import Intrinsics
+from semstab import Intrinsics
 from semstab.datasets.files.labels import SceneEntry, find_sources
 from semstab.datasets.files.options import FileOptions, Folders, FrameSource
 from semstab.datasets.geometry.cameras import Camera

@@ -13,8 +13,8 @@ import pytest
 from posed_scene import fails
 from scipy.spatial.transform import Rotation
 
+from semstab import Intrinsics
 from semstab.backends import create
-from semstab.data.frames import Intrinsics
 from semstab.datasets import open_dataset
 from semstab.datasets.geometry.lenses import undistorted
 from semstab.errors import DataError, MissingDependencyError

@@ -14,10 +14,10 @@ from dataset_writers import numbers, write_lines
 from posed_scene import fails
 from scan_writers import SCANS
 
+from semstab import Frame
 from semstab.backends import create
 from semstab.check import check_scene
 from semstab.configure import load_config, resolve
-from semstab.data.frames import Frame
 from semstab.datasets import open_dataset, recognise
 from semstab.datasets.semantickitti import LEARNING_MAP, MOVING
 from semstab.errors import ConfigError, DataError

@@ -10,8 +10,8 @@ from posed_scene import fails
 from scan_writers import rigid, save_bytes
 from scipy.spatial import cKDTree
 
+from semstab import Intrinsics
 from semstab.check import display
-from semstab.data.frames import Intrinsics
 from semstab.datasets import open_dataset
 from semstab.datasets.geometry.projection import seen_points
 from semstab.errors import DataError

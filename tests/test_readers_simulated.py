@@ -21,7 +21,7 @@ from dataset_writers import (
 from posed_scene import fails
 from scipy.spatial.transform import Rotation
 
-from semstab.data.labels import LabelSpace
+from semstab import LabelSpace
 from semstab.datasets import recognise
 from semstab.datasets.hypersim import read_lens
 from semstab.errors import DataError

@@ -13,7 +13,7 @@ import pytest
 from dataset_writers import save
 from posed_scene import fails
 
-from semstab.data.labels import LabelSpace
+from semstab import LabelSpace
 from semstab.datasets import open_dataset, recognise
 from semstab.errors import DataError
 

@@ -18,14 +18,11 @@ import tiny_scene
 from posed_config import configure
 
 import semstab
-from semstab import backends, metrics
+from semstab import Frame, Intrinsics, LabelSpace, Result, VoxelTable, backends, metrics
 from semstab.config import Config
-from semstab.data.frames import Frame, Intrinsics
-from semstab.data.labels import LabelSpace
 from semstab.data.measures import measures
-from semstab.data.records import Record, Result, Variation
+from semstab.data.records import Record, Variation
 from semstab.data.results import UnitName, UnitSummary
-from semstab.data.voxels import VoxelTable
 from semstab.engine import Observer
 from semstab.engine.series import FrameRow
 from semstab.engine.units import Plan, Unit, make_plan

@@ -22,10 +22,8 @@ from PIL import Image
 from test_recording import config_of, grid, notes, read, series, verify
 
 import semstab
-from semstab import backends, metrics
+from semstab import Frame, Intrinsics, LabelSpace, backends, metrics
 from semstab.configure import load_config
-from semstab.data.frames import Frame, Intrinsics
-from semstab.data.labels import LabelSpace
 from semstab.data.measures import SBD_MAX
 from semstab.data.results import UnitName
 from semstab.engine.units import make_plan

@@ -17,13 +17,11 @@ from posed_config import configure, dataset_of
 from posed_scene import fails
 
 import semstab
+from semstab import Belief, Frame, Intrinsics, LabelSpace, relabel
 from semstab.core.files import SEAL, write_sealed
-from semstab.data.frames import Frame, Intrinsics
-from semstab.data.labels import LabelSpace
 from semstab.data.tiles import Tiles
 from semstab.errors import ConfigError, DataError
-from semstab.exports.fused_labels import UNSEEN, UNSTABLE, Belief, FusedLabels
-from semstab.exports.relabel import relabel
+from semstab.exports.fused_labels import UNSEEN, UNSTABLE, FusedLabels
 from semstab.metrics import CATEGORIES, categories
 from semstab.statistics import psa
 

@@ -13,9 +13,10 @@ from rich.console import Console
 import semstab
 import semstab.comparison.ranking
 import semstab.report.ranking
+from semstab import gate
 from semstab.configure import predicted_config, resolve
 from semstab.core.palette import KINDS
-from semstab.gating.gate import gate, gate_config
+from semstab.gating.gate import gate_config
 from semstab.predict.predictor import parse_predictors
 from semstab.report.comparison.own_models import own_models
 from semstab.report.page import _card

@@ -8,7 +8,7 @@ import signs
 from posed_writer import write_posed
 
 import semstab
-from semstab.data.frames import Frame, Intrinsics
+from semstab import Frame, Intrinsics
 
 H, W, FOCAL, DEPTH, VOXEL = 24, 40, 40.0, 2.0, 0.05
 

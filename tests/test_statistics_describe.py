@@ -10,11 +10,11 @@ import pytest
 from compare_summaries import differences
 from simulated_events import grid, log_of, spots_of
 
+from semstab import VoxelTable
 from semstab.core.files import read_json, write_json
 from semstab.core.json_form import from_json, to_json
 from semstab.core.types import THESE_FRAMES, THIS_SCENE
 from semstab.data.statistics import UNKNOWN, ClassAlpha, HeadlineStatistics, Interval, MapStatistics, SpotAgreement
-from semstab.data.voxels import VoxelTable
 from semstab.errors import DataError
 from semstab.metrics import sbd
 from semstab.statistics import MapSample, analyse, describe, expected_sbd, krippendorff_alpha, verdict

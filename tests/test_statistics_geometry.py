@@ -8,8 +8,7 @@ import math
 import numpy as np
 import pytest
 
-from semstab import backends
-from semstab.data.frames import Frame, Intrinsics
+from semstab import Frame, Intrinsics, backends
 from semstab.errors import DataError
 from semstab.statistics import ceiling, losses, psa, rendered
 from semstab.testing import sight_line

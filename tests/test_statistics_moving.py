@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 from street import DRIVES, Street
 
-from semstab.data.frames import Frame, Intrinsics
-from semstab.data.statistics.moving import MisplacedFrame, poses_that_do_not_fit
+from semstab import Frame, Intrinsics
+from semstab.data.statistics import MisplacedFrame, poses_that_do_not_fit
 from semstab.statistics import Sampler, SpotObservations
 from semstab.statistics.moving import moving_percent, static_spots
 from semstab.statistics.votes import MOST_KEPT, SpotVotes, next_to_moved

@@ -7,9 +7,8 @@ import pytest
 from compare_summaries import differences
 from simulated_events import grid, log_of, log_of_evidence, soft
 
+from semstab import Events, VoxelTable
 from semstab.core.json_form import to_json
-from semstab.data.events import Events
-from semstab.data.voxels import VoxelTable
 from semstab.errors import DataError
 from semstab.metrics import summarise
 from semstab.statistics import MapSample, analyse, describe

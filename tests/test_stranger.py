@@ -14,11 +14,11 @@ from rich.console import Console
 from simulated_events import log_of
 
 import semstab
+from semstab import Frame, Intrinsics
 from semstab.backends.numba_hash import NumbaHash
 from semstab.check import check
 from semstab.config import read_yaml
 from semstab.configure import load_config, predicted_config, resolve
-from semstab.data.frames import Frame, Intrinsics
 from semstab.errors import DataError
 from semstab.metrics import split_last, summarise
 from semstab.predict.predictor import parse_predictor

@@ -14,6 +14,7 @@ from unittest.mock import patch
 
 import numpy as np
 import pytest
+from corners import combination
 from typer.testing import CliRunner
 
 from semstab.backends.numpy_reference import NumpyReference
@@ -514,7 +515,10 @@ ONCE = [FIRST[case] for case in ("frames_65536", "voxels_65536")]
 """Found by the data alone: these cases are large, and another mutant of each is found by the suite."""
 
 
-@pytest.mark.parametrize(("mutant", "case"), FIRST.values())
+@pytest.mark.parametrize(
+    ("mutant", "case"),
+    [pytest.param(*p.values, id=p.id, marks=combination if p in ONCE else ()) for p in FIRST.values()],
+)
 def test_a_subtle_defect_is_found_by_the_data(mutant, case, tmp_path):
     write_rows(tmp_path / "table.csv", table_of(mutant, case))
     assert "voxel" in compared(case_folder(case), tmp_path / "table.csv")

@@ -25,9 +25,9 @@ from posed_writer import write_posed
 from rich.console import Console
 
 import semstab
+from semstab import Intrinsics
 from semstab.check import check, quick_check
 from semstab.check.display import print_check
-from semstab.data.frames import Intrinsics
 from semstab.data.georeference import Georeference, wkt
 from semstab.datasets import open_dataset
 from semstab.datasets.files import surfaces

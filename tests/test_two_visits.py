@@ -13,12 +13,13 @@ from command_line import bench
 from scipy.spatial.transform import Rotation
 
 import semstab
-from semstab.data.frames import Frame, Intrinsics
+from semstab import Frame, Intrinsics
 from semstab.data.georeference import Georeference
 from semstab.errors import ConfigError, DataError
 from semstab.statistics.visit_agreement import two_visits
 from semstab.statistics.visits import GONE, NEW, STAYED, VisitedSpots, VisitSampler, by_turns
-from semstab.two_visits.alignment import Alignment, between
+from semstab.two_visits import Alignment
+from semstab.two_visits.alignment import between
 
 H, W, FOCAL, HEIGHT, FRAMES = 120, 160, 120.0, 20.0, 16
 CAMERA = Intrinsics(FOCAL, FOCAL, (W - 1) / 2, (H - 1) / 2)

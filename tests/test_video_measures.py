@@ -15,8 +15,7 @@ import pytest
 from command_line import bench
 from PIL import Image
 
-from semstab import datasets
-from semstab.data.labels import LabelSpace
+from semstab import LabelSpace, datasets
 from semstab.data.records import ClipMean, WarpedOverlap
 from semstab.engine import load_result
 from semstab.errors import DataError

@@ -12,9 +12,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
-from semstab import backends
-from semstab.data.events import Events
-from semstab.data.voxels import VoxelTable
+from semstab import Events, VoxelTable, backends
 from semstab.errors import DataError
 from semstab.metrics import entropy, vss
 from semstab.testing import EXACT, SEQUENCES, SUMS, as_frames, assert_same_map, checks, sight_line, voxels

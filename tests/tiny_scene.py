@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 from posed_writer import write_posed
 
-from semstab.data.frames import Frame, Intrinsics
+from semstab import Frame, Intrinsics
 
 WIDTH, HEIGHT, FRAMES = 8, 6, 3
 FOCAL = 8.0

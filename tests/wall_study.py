@@ -12,9 +12,8 @@ import numpy as np
 from posed_config import configure
 from posed_writer import write_posed
 
+from semstab import Frame, Intrinsics, Result
 from semstab.api import run_study
-from semstab.data.frames import Frame, Intrinsics
-from semstab.data.records import Result
 from semstab.engine import load_result
 from semstab.report.figures import write_figures
 

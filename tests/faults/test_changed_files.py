@@ -11,10 +11,9 @@ from command_line import bench, error_of
 from posed_config import configure
 
 import semstab
+from semstab import Events, VoxelTable
 from semstab.core.files import write_sealed
 from semstab.data.digests import DIGESTS, require_unchanged
-from semstab.data.events import Events
-from semstab.data.voxels import VoxelTable
 from semstab.engine import load_result
 from semstab.errors import DataError
 from semstab.report.figures.maps import Overview

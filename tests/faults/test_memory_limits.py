@@ -12,9 +12,9 @@ from posed_config import configure
 from posed_writer import write_posed
 
 import semstab
+from semstab import Frame, Intrinsics
 from semstab.backends.numpy_reference import NumpyReference
 from semstab.core.process import available_bytes, group_bytes
-from semstab.data.frames import Frame, Intrinsics
 from semstab.errors import ConfigError
 from semstab.statistics.agreement import alpha_of
 from semstab.statistics.cluster_sums import ALPHA_SUMS, ClusterSums, Functional, side_by_side

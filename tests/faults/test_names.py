@@ -15,8 +15,8 @@ from posed_config import configure
 from typer.testing import CliRunner
 
 import semstab
+from semstab import LabelSpace
 from semstab.cli import app
-from semstab.data.labels import LabelSpace
 from semstab.data.results import UnitName, slug
 from semstab.engine.folder import require_file_names
 from semstab.errors import ConfigError

@@ -16,10 +16,9 @@ from command_line import bench, error_of
 from posed_config import configure
 
 import semstab
+from semstab import Belief, relabel
 from semstab.comparison.entries import open_run, save_summary
 from semstab.core.files import FolderLock, atomic_path, only_writer
-from semstab.exports.fused_labels import Belief
-from semstab.exports.relabel import relabel
 
 
 @pytest.fixture(scope="module")

@@ -14,12 +14,10 @@ from kind import Kind
 from posed_config import configure
 
 import semstab
+from semstab import Intrinsics, LabelSpace, VoxelTable
 from semstab.compare_runs import compare, load_comparison
 from semstab.configure import load_config, resolve
 from semstab.conformance import case_folder, compared
-from semstab.data.frames import Intrinsics
-from semstab.data.labels import LabelSpace
-from semstab.data.voxels import VoxelTable
 from semstab.datasets import open_dataset
 from semstab.datasets.files.surfaces import CameraView, Casts
 from semstab.engine.series import NUMBERS

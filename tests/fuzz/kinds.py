@@ -24,6 +24,7 @@ from posed_config import configure
 from rich.console import Console
 
 import semstab
+from semstab import AcceptanceThresholds, Events, Frame, Intrinsics, LabelSpace, VoxelTable
 from semstab.comparison.differences import contrasts
 from semstab.comparison.entries import open_run, open_runs, save_summary, shared_scenes
 from semstab.comparison.pairing import pair
@@ -31,12 +32,8 @@ from semstab.configure import load_config, load_study
 from semstab.convert import convert
 from semstab.core.files import read_json
 from semstab.core.json_form import from_json
-from semstab.data.events import Events
-from semstab.data.frames import Frame, Intrinsics
 from semstab.data.georeference import Georeference, wkt
-from semstab.data.labels import LabelSpace
 from semstab.data.records import Record
-from semstab.data.voxels import VoxelTable
 from semstab.datasets import open_dataset
 from semstab.datasets.files.depth import read_depth_map, read_dmap, read_mvei
 from semstab.datasets.files.surfaces import Surface
@@ -61,7 +58,6 @@ from semstab.report.figures.maps import Overview
 from semstab.report.tables import tables
 from semstab.report.terminal import print_summary
 from semstab.statistics import SpotObservations
-from semstab.statistics.acceptance import AcceptanceThresholds
 from semstab.statistics.cluster_sums import ClusterSums
 
 SHAPE = (12, 16)

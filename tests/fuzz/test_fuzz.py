@@ -15,10 +15,10 @@ import pytest
 import yaml
 from image_files import npy_bytes, npz_bytes
 
+from semstab import VoxelTable
 from semstab.configure import load_config, resolve
 from semstab.core.files import parse_json
 from semstab.data.georeference import wkt
-from semstab.data.voxels import VoxelTable
 from semstab.datasets import open_dataset
 from semstab.datasets.files.surfaces import Surface, open_las
 from semstab.datasets.formats.disk import natural

@@ -1,0 +1,26 @@
+"""Combinations: `make test` takes the corners, `make combinations` the parameters that walk the same code again."""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Iterable
+from typing import Any
+
+import pytest
+
+combination = pytest.mark.combination
+
+
+def corners(values: Iterable[Any], kept: Collection[Any]) -> list[Any]:
+    """Return the values of a parameter, or tuples of several: those that are not `kept` are combinations.
+
+    Raises:
+        ValueError: If a kept value is no value: a name that has changed would leave nothing in `make test`.
+    """
+    values = list(values)
+    if unknown := [value for value in kept if value not in values]:
+        raise ValueError(f"no such values: {unknown}")
+    return [value if value in kept else pytest.param(*_several(value), marks=combination) for value in values]
+
+
+def _several(value: Any) -> tuple[Any, ...]:
+    return value if isinstance(value, tuple) else (value,)
