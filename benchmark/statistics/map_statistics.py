@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -36,7 +36,7 @@ from semstab.metrics.agreement import shared_rows
 from semstab.metrics.summary import STRATA, groups_of
 from semstab.statistics.accumulate import Cubes, cluster_sums_of
 from semstab.statistics.agreement import class_agreement_of, class_sums, consistency_posterior, shares_of
-from semstab.statistics.cluster_sums import ClusterSums, Functional
+from semstab.statistics.cluster_sums import ClusterSums
 from semstab.statistics.correctness import (
     MIOU,
     Predictions,
@@ -67,7 +67,7 @@ from semstab.statistics.features import feature_agreement, feature_sums, likenes
 from semstab.statistics.frame_disagreement import LoneDisagreement, by_frame, lone_disagreement, outlying_frames
 from semstab.statistics.geometry import losses
 from semstab.statistics.groupings import groupings
-from semstab.statistics.intervals import confidence_intervals, estimate, headline_specs, scope_of, spec_of
+from semstab.statistics.intervals import estimate, headline_of, scope_of
 from semstab.statistics.moving import moved_spots, moving_percent
 from semstab.statistics.observations import SpotObservations
 from semstab.statistics.ranges import range_agreement
@@ -223,7 +223,7 @@ def analyse(
     map_summary = sample.summary.summary(table.voxel_size, table.classes, edges)
     repeats = map_summary.means.voxels[SBD.key]
     repeated = Repeated(repeats, repeats / map_summary.voxels if map_summary.voxels else math.nan)
-    headline = HeadlineStatistics(*confidence_intervals(headline_specs(sums, scope)))
+    headline = headline_of(sums, scope)
     means = _means(locations, sums, scope)
     flips = FlippingSums.of(table, consistent, cubes).flipping(table.classes)
     lone = None if spots is None else lone_disagreement(spots)
@@ -295,13 +295,8 @@ def _without_classes(summary: MapStatistics) -> MapStatistics:
 
 def _means(locations: ClusterSums, sums: ClusterSums, scope: Scope) -> dict[str, Interval]:
     """Return the means over the voxels with OP >= 2 by name, those of `OF_CLUSTERS` in the scope where they can be."""
-    of_cubes = dict(zip(MEANS, _intervals(locations, MEANS.values()), strict=True))
+    of_cubes = {name: estimate(locations, number) for name, number in MEANS.items()}
     return of_cubes | {name: estimate(sums, key, scope=scope_of(sums, scope, key)) for name, key in OF_CLUSTERS.items()}
-
-
-def _intervals(sums: ClusterSums, numbers: Iterable[Functional]) -> list[Interval]:
-    """Return numbers of the same sums with their intervals."""
-    return confidence_intervals(spec_of(sums, number) for number in numbers)
 
 
 def _agreement(means: Mapping[str, Interval], classes: tuple[ClassAgreement, ...]) -> FrameAgreement:
@@ -315,9 +310,7 @@ def _drift(
     """Return SBD and its null; without a log only for one-hot evidence, and without flips."""
     rates, (sampled, with_null) = None, (locations[name][:, 1].sum() for name in ("psa", "null"))
     if log is not None:
-        (since,) = _intervals(log, OF_CHANGES)
-        rate, null, excess = _intervals(log, OF_FLIPS)
-        rates = FlipRates(rate, null, excess, since)
+        rates = FlipRates(*(estimate(log, number) for number in (*OF_FLIPS, *OF_CHANGES)))
     return DriftStatistics(
         voxels=round(with_null / sampled * repeats) if sampled else 0,
         sbd_op2=means["sbd"],
