@@ -27,7 +27,7 @@ import semstab
 from semstab import backends
 from semstab.comparison import voxels as common_voxels
 from semstab.comparison.differences import differences_of
-from semstab.comparison.entries import open_compared
+from semstab.comparison.opening import open_compared
 from semstab.core.json_form import to_json
 from semstab.data import voxels
 from semstab.data.frames import Frame, Intrinsics

@@ -16,7 +16,8 @@ from command_line import bench, error_of
 from posed_config import configure
 
 import semstab
-from semstab.comparison.entries import open_run, save_summary
+from semstab.comparison.opening import open_run
+from semstab.comparison.small_summary import save_summary
 from semstab.core.files import FolderLock, atomic_path, only_writer
 from semstab.exports.fused_labels import Belief
 from semstab.exports.relabel import relabel
