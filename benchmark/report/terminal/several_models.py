@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator, Sequence
 
+from semstab.core.console import wrapped
 from semstab.data.measures import headlines
 from semstab.data.records import Record, Result
 from semstab.data.statistics import UNDEFINED, short
@@ -14,7 +15,7 @@ from semstab.report.means import ENOUGH
 from semstab.report.ranking import order_of_models
 from semstab.report.terminal.disagreement import class_lines, outlying_lines
 from semstab.report.terminal.head import head_lines
-from semstab.report.terminal.layout import common_beginning, cut, laid_out, legend, number, percent, percents, wrapped
+from semstab.report.terminal.layout import common_beginning, cut, laid_out, legend, number, percent, percents
 from semstab.report.terminal.one_model import share_of_wrong
 from semstab.statistics.verdict import DANGEROUS
 
