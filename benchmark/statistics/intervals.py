@@ -10,7 +10,7 @@ import numpy as np
 import numpy.typing as npt
 
 from semstab.core.types import THESE_FRAMES, THIS_SCENE, Float64, Int64, Scope
-from semstab.data.statistics import CONFIDENCE, UNKNOWN, HeadlineStatistics, Interval
+from semstab.data.statistics import CONFIDENCE, UNKNOWN, Estimate, HeadlineStatistics, Interval
 from semstab.statistics.agreement import ratio_of
 from semstab.statistics.cluster_sums import (
     MOST_GROUPS,
@@ -275,11 +275,17 @@ def unpaired(a: Interval, b: Interval) -> Interval:
 
 def mean_of(result: Sequence[Interval]) -> Interval:
     """Return the mean of numbers with independent errors, such as scenes have, whose intervals have one level."""
-    n = len(result)
-    value = sum(interval.value for interval in result) / n
-    low = value - math.hypot(*(interval.value - interval.low for interval in result)) / n
-    high = value + math.hypot(*(interval.high - interval.value for interval in result)) / n
-    return result[0] if n == 1 else _combined(value, low, high, result, 1 / n)
+    mean = mean_with_ends(result)
+    return result[0] if len(result) == 1 else _combined(mean.value, mean.low, mean.high, result, 1 / len(result))
+
+
+def mean_with_ends(numbers: Sequence[Estimate]) -> Estimate:
+    """Return the mean of numbers with independent errors, and the ends of its interval (Zou and Donner 2008)."""
+    n = len(numbers)
+    value = sum(number.value for number in numbers) / n
+    low = value - math.hypot(*(number.value - number.low for number in numbers)) / n
+    high = value + math.hypot(*(number.high - number.value for number in numbers)) / n
+    return Estimate(value, low, high)
 
 
 def _combined(value: float, low: float, high: float, parts: Sequence[Interval], weight: float) -> Interval:

@@ -31,7 +31,7 @@ JUDGED = ("stable", "usable", "unstable")
 
 def one_model(result: Result, record: Record, width: int) -> Iterator[str]:
     """Yield the verdict, the shares of the map, flicker, the classes that disagree most, and the paper's means."""
-    run, statistics = record.summary, record.summary.statistics
+    run, statistics = record.summary, record.statistics
     yield from head_lines(f"{run.unit.scene} / {run.unit.model}", result, [run], width)
     if statistics is not None and statistics.features is not None and statistics.features.alone:
         yield from features_alone(statistics.features, record)

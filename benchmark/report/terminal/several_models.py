@@ -29,7 +29,7 @@ def columns() -> list[tuple[str, str]]:
 
 def row_of(record: Record, begin: str = "") -> list[str]:
     """Return a model's row under `columns`, its name without a beginning."""
-    run, statistics = record.summary, record.summary.statistics
+    run, statistics = record.summary, record.statistics
     level, alpha, agree = "-", "", math.nan
     if statistics is not None:
         level, alpha = str(statistics.verdict), statistics.headline.alpha.text()
@@ -46,7 +46,7 @@ def row_of(record: Record, begin: str = "") -> list[str]:
 
 def miou(record: Record) -> float:
     """Return the mIoU of the fused labels seen twice or more; NaN without ground truth."""
-    statistics = record.summary.statistics
+    statistics = record.statistics
     return math.nan if statistics is None or statistics.correctness is None else statistics.correctness.miou_op2.value
 
 
@@ -89,7 +89,7 @@ def several_models(result: Result, records: Sequence[Record], width: int) -> Ite
     if len(told) < len(records):
         yield from wrapped("what each change of names does: semstab-bench show RUN prompts")
     for record in told:
-        statistics = record.summary.statistics
+        statistics = record.statistics
         if statistics is None:
             continue
         ranges = "" if statistics.told_ranges is None else statistics.told_ranges.text
