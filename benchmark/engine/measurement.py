@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -14,8 +14,7 @@ import numpy as np
 import numpy.typing as npt
 
 from semstab.config import Config
-from semstab.core.background import Background
-from semstab.core.files import ScratchFolder, atomic_path, file_digest
+from semstab.core.files import atomic_path
 from semstab.core.process import Stopwatch, trim_malloc
 from semstab.core.types import Float64
 from semstab.data.features import OF_FEATURES
@@ -43,8 +42,9 @@ from semstab.engine.place_pictures import PICTURED as PICTURED_PLACES
 from semstab.engine.place_pictures import pictures_of_places
 from semstab.engine.series import Series
 from semstab.engine.tiles import TILE_FEATURES, TILE_OBSERVATIONS, TileResult
+from semstab.engine.unit_files import Files, Savers
 from semstab.engine.units import Unit, unit_key
-from semstab.engine.work import Start, UnitTile, Work
+from semstab.engine.work import UnitTile, Work
 from semstab.errors import DataError
 from semstab.metrics.image_space import PICTURED, ImageSpaceMeter, LonePicture, lone_picture, picture_arrays
 from semstab.metrics.summary import TableSums
@@ -60,9 +60,6 @@ from semstab.task import Task, read
 
 OfFrames = dict[int, dict[str, float]]
 """How often each frame stands alone, by its index; see `semstab.statistics.frame_disagreement.by_frame`."""
-
-Savers = dict[str, Callable[[Path], None]]
-"""A function that writes each file of a unit, by the file's path in the folder."""
 
 
 def finish(live: LiveMap, stream: Stream, watch: Stopwatch) -> Work:
@@ -393,52 +390,6 @@ def pictures_of_outlying(task: Task, config: Config, of_frames: OfFrames) -> dic
         hold = lone_picture if posed else video_picture
         pictures.append(hold(read(task, frame, config.pixel_stride, color=True), neighbour_frames))
     return picture_arrays(pictures)
-
-
-class Files:
-    """The files of a work, written by one thread.
-
-    Attributes:
-        digests: Their digests by their path in the folder.
-        returned: Their bytes, where the folder is not shared.
-    """
-
-    def __init__(self, start: Start) -> None:
-        self._start, self.digests, self.returned = start, dict[str, str](), dict[str, bytes]()
-        self._writer = Background("semstab-files", 1)
-
-    def write_ahead(self, savers: Savers) -> None:
-        """Begin to write some of them; an error is raised by `write`."""
-        self._writer.submit(partial(self._write, savers))
-
-    def write(self, savers: Savers) -> None:
-        """Write some of them, after those that were begun."""
-        self._writer.drain()
-        self._write(savers)
-
-    def _write(self, savers: Savers) -> None:
-        digests, returned = written(self._start, savers)
-        self.digests |= digests
-        self.returned |= returned
-
-    def close(self) -> None:
-        """Finish those that were begun."""
-        self._writer.close()
-
-
-def written(start: Start, savers: Savers) -> tuple[dict[str, str], dict[str, bytes]]:
-    """Write files into a shared folder, and return their digests; without a shared folder, also return their bytes."""
-    if start.marker.exists():
-        for name, save in savers.items():
-            save(start.folder / name)
-        return {name: file_digest(start.folder / name).hex() for name in savers}, {}
-    digests, returned = {}, {}
-    with ScratchFolder() as elsewhere:
-        for name, save in savers.items():
-            path = elsewhere / name
-            save(path)
-            digests[name], returned[name] = file_digest(path).hex(), path.read_bytes()
-    return digests, returned
 
 
 def save_voxels(

@@ -17,7 +17,6 @@ from semstab.data.records import TRUTH, VOXELS, Record
 from semstab.data.voxels import VoxelTable
 from semstab.engine.folder import Folder
 from semstab.engine.measurement import (
-    Savers,
     analyse_sample,
     no_voxels,
     overview_file,
@@ -26,10 +25,10 @@ from semstab.engine.measurement import (
     save_overview,
     save_voxels,
     unit_savers,
-    written,
 )
 from semstab.engine.series import Series
 from semstab.engine.tiles import TILE_FEATURES, TILE_OBSERVATIONS, TileResult, joined_series
+from semstab.engine.unit_files import Savers, written
 from semstab.engine.units import Unit
 from semstab.engine.work import Job, Start, UnitTile, Work
 from semstab.errors import SemstabError
