@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import csv
 import functools
 import math
 from collections.abc import Iterable, Mapping, Sequence
@@ -13,11 +12,11 @@ from typing import Any
 import numpy as np
 
 from semstab.data.contrast import FrameShare
-from semstab.data.digests import require_unchanged
 from semstab.data.georeference import Georeference
 from semstab.data.records import ImageSpace, Record
 from semstab.data.results import UnitSummary
 from semstab.data.statistics import LabelledPairs, MapStatistics
+from semstab.engine.series import read_cells, read_names
 from semstab.errors import ConfigError, DataError, summarize_error
 from semstab.statistics.cluster_sums import ClusterSums
 from semstab.statistics.verdict import ADVICE, LEAST_CLASSES
@@ -95,9 +94,8 @@ class Entry(EntryNumbers):
         """Return frames with the names of their files, where the run stored them."""
         if self.record is None or self.record.series is None:
             return tuple(frames)
-        with self.record.series.open(encoding="utf-8", newline="") as lines:
-            names = {row["frame"]: row.get("name") or "" for row in csv.DictReader(lines)}
-        return tuple(replace(frame, name=names.get(str(frame.frame), "")) for frame in frames)
+        names = read_names(self.record.series)
+        return tuple(replace(frame, name=names.get(frame.frame, "")) for frame in frames)
 
     @property
     def caveat(self) -> str:
@@ -208,15 +206,14 @@ def _require_same_scene(scene: str, one: Entry, other: Entry) -> None:
 def _flicker(file: Path | None) -> Flicker:
     if file is None:
         return {}
-    require_unchanged(file)
+    cells = read_cells(file)
     try:
-        with file.open(encoding="utf-8", newline="") as lines:
-            rows = [(row["frame"], row.get("compensated_flicker_percent")) for row in csv.DictReader(lines)]
+        rows = [(row["frame"], row.get("compensated_flicker_percent")) for row in cells]
         flicker = {int(frame): float(percent) for frame, percent in rows if percent}
         flicker = {frame: percent for frame, percent in flicker.items() if math.isfinite(percent)}
         if not valid_flicker(flicker, flicker.values()):
             raise ValueError("a percentage of flicker, or a frame's index, is out of range")
-    except (OSError, ValueError, KeyError, TypeError, csv.Error) as error:
+    except (ValueError, KeyError, TypeError) as error:
         raise DataError(f"{file}: cannot be read ({summarize_error(error)}); run it again") from error
     return flicker
 
