@@ -14,8 +14,9 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from semstab.comparison.differences import ComparisonData, Progress, differences_of
-from semstab.comparison.entries import RunHandle, open_compared
+from semstab.comparison.entries import RunHandle
 from semstab.comparison.locations import VoxelChanges
+from semstab.comparison.opening import open_compared
 from semstab.comparison.quantities import HEADLINES, IOU, by_name
 from semstab.config.groups import ScopeOption, validated
 from semstab.core.files import TEMPORARY, FolderLock, keep_only, read_json, write_json, write_text

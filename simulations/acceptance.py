@@ -17,7 +17,7 @@ import cases
 import numpy as np
 from flights import Flight, World, fly, log_of, table_of, world
 
-from semstab.comparison.entries import open_run
+from semstab.comparison.opening import open_run
 from semstab.data.measures import dominant
 from semstab.data.voxels import VoxelTable
 from semstab.metrics.agreement import rows_of

@@ -37,7 +37,7 @@ from signs import table as table_of_signs
 
 import semstab
 from semstab import backends
-from semstab.comparison.entries import open_run
+from semstab.comparison.opening import open_run
 from semstab.data.measures import dominant
 from semstab.data.voxels import VoxelTable
 from semstab.statistics.agreement import CONSISTENT, psa

@@ -15,7 +15,7 @@ from scipy.stats import mannwhitneyu
 
 import semstab
 from semstab.backends.shared.association import back_project, voxel_index
-from semstab.comparison.entries import open_run
+from semstab.comparison.opening import open_run
 from semstab.config import Exclusion
 from semstab.data.frames import Frame
 from semstab.data.measures import dominant

@@ -12,7 +12,8 @@ from image_files import refused
 from posed_config import configure
 
 import semstab
-from semstab.comparison.entries import open_run, save_summary
+from semstab.comparison.opening import open_run
+from semstab.comparison.small_summary import save_summary
 from semstab.datasets.formats.images import FrameSize, read_color, read_depth, read_labels, read_mask, read_scores
 
 SETUP = """
@@ -162,7 +163,9 @@ def summary(tmp_path_factory):
     return folder / "small.semstab"
 
 
-LOAD = "from semstab.comparison.entries import load_summary; import pyarrow.parquet, semstab.statistics.cluster_sums"
+LOAD = (
+    "from semstab.comparison.small_summary import load_summary; import pyarrow.parquet, semstab.statistics.cluster_sums"
+)
 
 
 @pytest.mark.parametrize("make", [bombs.semstab, bombs.semstab_of_text])

@@ -20,8 +20,8 @@ import semstab
 from semstab import Frame, Intrinsics
 from semstab.compare_runs import load_comparison, markdown
 from semstab.comparison.differences import corrected, over_scenes
-from semstab.comparison.entries import open_runs
 from semstab.comparison.locations import worse_areas
+from semstab.comparison.opening import open_runs
 from semstab.comparison.pairing import Common, pair
 from semstab.comparison.voxels import Region
 from semstab.core.files import read_sealed, write_sealed

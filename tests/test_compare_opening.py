@@ -18,7 +18,9 @@ from posed_config import configure
 from posed_scene import fails
 
 import semstab
-from semstab.comparison.entries import LARGEST, open_run, open_runs, save_summary, shared_scenes
+from semstab.comparison.entries import shared_scenes
+from semstab.comparison.opening import open_run, open_runs
+from semstab.comparison.small_summary import LARGEST, save_summary
 from semstab.core.json_form import to_json
 from semstab.core.sealed_zip import packed
 from semstab.errors import ConfigError, DataError

@@ -25,7 +25,8 @@ import semstab
 from semstab import gate
 from semstab.cli import app
 from semstab.comparison import differences
-from semstab.comparison.entries import open_run, save_summary
+from semstab.comparison.opening import open_run
+from semstab.comparison.small_summary import save_summary
 from semstab.data.measures import Measure, margin, registered, sbd
 from semstab.data.statistics import Interval, short
 from semstab.errors import ConfigError, DataError

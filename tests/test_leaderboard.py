@@ -22,7 +22,8 @@ from posed_scene import fails
 from posed_writer import write_posed
 
 import semstab
-from semstab.comparison.entries import open_run, save_summary
+from semstab.comparison.opening import open_run
+from semstab.comparison.small_summary import save_summary
 from semstab.configure import shipped_benchmarks
 from semstab.core.sealed_zip import packed, unpacked
 from semstab.datasets import city

@@ -27,13 +27,13 @@ import semstab
 from semstab import Belief, Frame, Intrinsics, VoxelTable, backends, relabel
 from semstab.comparison import voxels as common_voxels
 from semstab.comparison.differences import differences_of
-from semstab.comparison.entries import open_compared
+from semstab.comparison.opening import open_compared
 from semstab.core.json_form import to_json
 from semstab.data import voxels
 from semstab.data.parquet import Tile
 from semstab.data.voxels import Extent
 from semstab.engine import InProcess, LocalProcesses, Observer
-from semstab.engine.memory import Sizing
+from semstab.engine.sizing import Sizing
 from semstab.engine.tiles import tiles_met
 from semstab.errors import ConfigError, DataError, OutgrownError
 from semstab.exports import export, maps
@@ -386,7 +386,7 @@ class Progress(Observer):
 def test_a_map_that_will_not_fit_is_fused_in_tiles_and_a_line_says_so(wall, both, tmp_path, caplog) -> None:
     progress, executor = Progress(), Counting()
     config = configure(wall, **SETTINGS, memory_gb=30e-6)
-    with mock.patch("semstab.engine.memory.resident_bytes", return_value=0):  # the estimates of maps count alone
+    with mock.patch("semstab.engine.memory_budget.resident_bytes", return_value=0):  # the estimates of maps count alone
         semstab.run(config, out=tmp_path / "tiles", observers=[progress], executor=executor, report=False)
     assert len(executor.done) > 2
     assert re.search(
@@ -404,7 +404,7 @@ def test_a_map_that_will_not_fit_is_fused_in_tiles_and_a_line_says_so(wall, both
 def test_a_map_that_outgrows_the_memory_is_given_up_in_one_line(settings, line, wall, tmp_path) -> None:
     config = configure(wall, **SETTINGS, memory_gb=3e-6, **settings)
     with (
-        mock.patch("semstab.engine.memory.resident_bytes", return_value=0),
+        mock.patch("semstab.engine.memory_budget.resident_bytes", return_value=0),
         mock.patch("semstab.engine.execution.planned_sizes", forced_sizes),
         pytest.raises(OutgrownError, match=rf"after \d+ of \d+ frames the map has .* is left of memory_gb; {line}"),
     ):

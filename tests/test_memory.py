@@ -17,7 +17,7 @@ from semstab.backends import create, expected_bytes
 from semstab.backends.shared.observations import WorkSpace
 from semstab.config import Config
 from semstab.core.process import available_bytes, resident_bytes
-from semstab.engine import memory
+from semstab.engine import map_size, memory, sizing
 from semstab.engine.units import Plan, make_plan
 from semstab.errors import ConfigError
 
@@ -39,11 +39,11 @@ def test_the_estimate_holds_for_a_flight_and_saturates_over_one_place(tmp_path) 
     root = tiny_scene.write(tmp_path / "wall", models=("a",), frames=60)
     plan, config = planned(root, voxel_size=0.05, pixel_stride=1)
     table = semstab.run(config, report=False).runs[0].table
-    size = memory.map_size(plan.tasks[0], plan.units[0].config)
+    size = map_size.map_size(plan.tasks[0], plan.units[0].config)
     assert size.voxels == pytest.approx(table.voxels, rel=0.3)
     assert size.observations == pytest.approx(table.observations, rel=0.3)
     still = dataclasses.replace(plan.tasks[0], indices=[0] * 60)
-    size = memory.map_size(still, plan.units[0].config)
+    size = map_size.map_size(still, plan.units[0].config)
     assert size.voxels == pytest.approx(48)
 
 
@@ -56,10 +56,10 @@ def test_the_overlap_of_a_flight_in_legs_is_seen(root, monkeypatch) -> None:
         leg, along = divmod(index, 20)
         return np.stack([x + 12 * leg, y + 10 * along, np.zeros(400, int)], axis=1)
 
-    monkeypatch.setattr(memory, "_geometry", lambda task, settings, index: index)
-    monkeypatch.setattr(memory, "voxels_in", lambda index, voxel_size: seen(index))
+    monkeypatch.setattr(map_size, "geometry", lambda task, settings, index: index)
+    monkeypatch.setattr(map_size, "voxels_in", lambda index, voxel_size: seen(index))
     flight = dataclasses.replace(plan.tasks[0], indices=[*range(240)])
-    size = memory.map_size(flight, plan.units[0].config)
+    size = map_size.map_size(flight, plan.units[0].config)
     true = len(np.unique(np.concatenate([seen(index) for index in range(240)]), axis=0))
     assert size.voxels == pytest.approx(true, rel=0.1)
     assert size.observations == pytest.approx(240 * 400)
@@ -72,9 +72,9 @@ def test_of_large_frames_a_part_is_looked_at(root, monkeypatch) -> None:
     def seen(index: int) -> np.ndarray:
         return np.stack([x + 30 * index, y, z], axis=1)
 
-    monkeypatch.setattr(memory, "_geometry", lambda task, settings, index: index)
-    monkeypatch.setattr(memory, "voxels_in", lambda index, voxel_size: seen(index))
-    size = memory.map_size(dataclasses.replace(plan.tasks[0], indices=[*range(10)]), plan.units[0].config)
+    monkeypatch.setattr(map_size, "geometry", lambda task, settings, index: index)
+    monkeypatch.setattr(map_size, "voxels_in", lambda index, voxel_size: seen(index))
+    size = map_size.map_size(dataclasses.replace(plan.tasks[0], indices=[*range(10)]), plan.units[0].config)
     assert size.voxels == pytest.approx(570 * 300 * 3, rel=0.03)
     assert size.by_column == 3
 
@@ -90,30 +90,30 @@ def test_a_unit_that_will_not_fit_is_refused_before_a_frame_is_fused(root, tmp_p
 def test_a_unit_that_will_not_fit_is_fused_in_tiles(root, monkeypatch) -> None:
     """The limit is the free memory, where none is set; a quarter of it where code and frames take it all."""
     plan, config = planned(root)
-    assert not memory.planned_sizes(config, plan.units, 1).tile_sizes
+    assert not sizing.planned_sizes(config, plan.units, 1).tile_sizes
     monkeypatch.setattr(memory, "available_bytes", lambda: 1000)
-    sizing = memory.planned_sizes(config, plan.units, 1)
-    assert sizing.tile_sizes.keys() == {each.identity for each in plan.units}
-    assert re.search(r"2\.5e-07 GB are free: it is fused in tiles of .* m, which take .* GB$", sizing.lines[0])
+    found = sizing.planned_sizes(config, plan.units, 1)
+    assert found.tile_sizes.keys() == {each.identity for each in plan.units}
+    assert re.search(r"2\.5e-07 GB are free: it is fused in tiles of .* m, which take .* GB$", found.lines[0])
 
 
 def test_tiles_are_as_large_as_the_memory_allows_and_as_many_as_processes_need(root) -> None:
     (unit,) = planned(root, backends=["numba"], check=None)[0].units
-    size = memory.MapSize(voxels=1e8, observations=3e8, by_column=2.0)
-    kind = memory._kind(unit, soft=False)
-    edges = [memory._tile_edge(kind, size, budget, 1) for budget in (1e8, 4e8, 16e8)]
+    size = map_size.MapSize(voxels=1e8, observations=3e8, by_column=2.0)
+    kind = sizing._map_memory(unit, soft=False)
+    edges = [sizing._tile_edge(kind, size, budget, 1) for budget in (1e8, 4e8, 16e8)]
     assert edges[1] == 2 * edges[0]
     assert edges[2] == 4 * edges[0]
     assert memory.MapMemory("numba", 3).tile(2 * edges[0] ** 2, 6 * edges[0] ** 2) < 1e8
-    assert memory._tile_edge(kind, memory.MapSize(1e6, 3e6, 2.0), 1e12, 8) ** 2 * 2 * 2 * 8 <= 1e6
+    assert sizing._tile_edge(kind, map_size.MapSize(1e6, 3e6, 2.0), 1e12, 8) ** 2 * 2 * 2 * 8 <= 1e6
 
 
 def test_one_frame_is_enough_where_there_is_ample_room(root, monkeypatch) -> None:
     plan, config = planned(root)
-    monkeypatch.setattr(memory, "map_size", lambda *_: pytest.fail("frames were read"))
-    sizing = memory.planned_sizes(config, plan.units, 1)
-    assert not sizing.tile_sizes
-    assert not sizing.refused
+    monkeypatch.setattr(sizing, "map_size", lambda *_: pytest.fail("frames were read"))
+    found = sizing.planned_sizes(config, plan.units, 1)
+    assert not found.tile_sizes
+    assert not found.refused
 
 
 def test_the_limit_is_not_kept(root) -> None:

@@ -14,7 +14,8 @@ from posed_config import configure
 
 import semstab
 from semstab.cli import _Once
-from semstab.comparison.entries import open_run, save_summary
+from semstab.comparison.opening import open_run
+from semstab.comparison.small_summary import save_summary
 from semstab.core.console import Console
 from semstab.core.sealed_zip import packed
 from semstab.errors import ConfigError

@@ -21,12 +21,10 @@ from semstab.statistics.intervals import (
     NO_LOCATIONS,
     RESOLUTION,
     _ends,
-    confidence_intervals,
     difference,
     estimate,
     mean_of,
     probability_above,
-    spec_of,
     standard_error,
     unpaired,
 )  # fmt: skip
@@ -173,7 +171,7 @@ def test_every_number_has_an_interval_and_few_frames_say_so():
         assert found.value == value(sums, key, k)
 
 
-def test_numbers_asked_together_have_the_intervals_that_each_has_alone():
+def test_numbers_asked_of_one_map_have_the_intervals_that_each_has_alone():
     """Spots of one are those of another without some; the same map elsewhere has nothing from before at hand."""
     labels = np.random.default_rng(0).integers(0, 2, (24 * 24, 4))
     labels[: 24 * 16] = 0
@@ -181,7 +179,7 @@ def test_numbers_asked_together_have_the_intervals_that_each_has_alone():
     sums = sums_from(labels, 24)
     elsewhere = moved(sums, [5, -3, 2])
     numbers = [("psa", None), ("alpha", None), ("vss", None), ("alpha", 1)]
-    together = confidence_intervals(spec_of(sums, key, k) for key, k in numbers)
+    together = [estimate(sums, key, k) for key, k in numbers]
     assert len({found.locations for found in together}) > 1
     for (key, k), found in zip(numbers, together, strict=True):
         alone = estimate(elsewhere, key, k)

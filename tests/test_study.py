@@ -138,14 +138,14 @@ def test_frames_are_decoded_once_for_all_units_of_a_model(root, tmp_path, decode
 def test_maps_that_exceed_the_memory_bound_are_put_off_and_the_numbers_are_the_same(
     root, tmp_path, finished, decoded, monkeypatch
 ) -> None:
-    monkeypatch.setattr("semstab.engine.memory.resident_bytes", lambda: 0)  # what is estimated counts alone
+    monkeypatch.setattr("semstab.engine.memory_budget.resident_bytes", lambda: 0)  # what is estimated counts alone
     run_study(configure(root, memory_gb=0.0002), tmp_path / "tight", report=False)
     assert len(decoded) > 25
     assert summary(tmp_path / "tight") == summary(finished[0])
 
 
 def test_a_unit_that_would_not_fit_into_memory_fails_before_it_is_fused(root, tmp_path, monkeypatch) -> None:
-    monkeypatch.setattr("semstab.engine.memory.resident_bytes", lambda: 0)  # what is estimated counts alone
+    monkeypatch.setattr("semstab.engine.memory_budget.resident_bytes", lambda: 0)  # what is estimated counts alone
     small = {"memory_gb": 0.00003, "tile_size": "off"}
     config = configure(root, backends=["numpy"], sweeps={"pixel_stride": [8]}, **small)
     result = run_study(config, tmp_path / "out", report=False)

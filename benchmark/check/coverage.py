@@ -17,6 +17,7 @@ from semstab.check.reprojection import Pair, Sample, Shared, View
 from semstab.core.types import Float64, Int64, Mask
 from semstab.data.frames import Frame
 from semstab.data.labels import IGNORE_8BIT
+from semstab.data.measures import mean
 from semstab.errors import DataError
 
 FUSED_FRAMES = 24
@@ -198,7 +199,7 @@ class Coverage:
 
     def stays(self, voxel_size: float) -> float:
         """Return the share of the points that fall into the same voxel when another frame sees them, or NaN."""
-        return _mean(np.all(self._same_along(voxel_size, np.zeros(3)), axis=1))
+        return mean(np.all(self._same_along(voxel_size, np.zeros(3)), axis=1))
 
     def faces(self, voxel_size: float) -> Faces | None:
         """Return the axes along which faces of voxels lie in a surface, or None without an axis or if most points stay.
@@ -214,7 +215,7 @@ class Coverage:
             return None
         off = self._same_along(voxel_size, np.where(axes, 0.5, 0.0))
         names = tuple(name for name, is_one in zip("xyz", axes.tolist(), strict=True) if is_one)
-        return Faces(voxel_size, names, self.stays(voxel_size), _mean(np.all(off, axis=1)))
+        return Faces(voxel_size, names, self.stays(voxel_size), mean(np.all(off, axis=1)))
 
     def pixel_stride(self, voxel_size: float | None) -> tuple[int | None, str]:
         """Return the pixel stride that leaves some pixels along a voxel's edge, and the reason."""
@@ -241,10 +242,10 @@ class Coverage:
         return Overlap(
             apart=distances,
             pairs=len(pairs),
-            in_view=_mean(np.concatenate([match.inside[0] for match in matches])),
-            covisible=_mean(np.isfinite(errors)),
+            in_view=mean(np.concatenate([match.inside[0] for match in matches])),
+            covisible=mean(np.isfinite(errors)),
             error=_median(errors[np.isfinite(errors)]),
-            agreement=_mean(agree),
+            agreement=mean(agree),
         )
 
     def _same_surface(self, pair: Pair) -> SharedPoints:
@@ -293,8 +294,8 @@ def persistence(frames: Iterable[Frame], coverage: Covers, voxel_size: float) ->
         for frame in frames:
             backend.integrate(frame)
         op, edges = backend.table().op, [0, 1, 2, 5, np.inf]
-        shares = tuple(_mean((low < op) & (op <= high)) for low, high in itertools.pairwise(edges))
-        return Persistence(voxel_size, len(op), _mean(op), shares, coverage.stays(voxel_size))
+        shares = tuple(mean((low < op) & (op <= high)) for low, high in itertools.pairwise(edges))
+        return Persistence(voxel_size, len(op), mean(op), shares, coverage.stays(voxel_size))
     return None
 
 
@@ -367,10 +368,6 @@ def suggest(coverage: Covers, overlaps: Sequence[Overlap], frames: int, stride: 
 
 def _few(share: float) -> str:
     return f", less than {SHARED:.0%}: more frames help" if share < SHARED else ""
-
-
-def _mean(values: npt.NDArray[Any]) -> float:
-    return float(np.mean(values)) if len(values) else math.nan
 
 
 def _median(values: npt.NDArray[Any]) -> float:

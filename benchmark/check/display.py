@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import textwrap
 from collections.abc import Iterator, Sequence
 
 from rich.box import SIMPLE_HEAD
@@ -13,7 +12,7 @@ from rich.table import Table
 
 from semstab.check.coverage import FUSED_FRAMES, said
 from semstab.check.scene_check import SceneCheck
-from semstab.core.console import Console
+from semstab.core.console import Console, wrapped
 from semstab.data.labels import IGNORE_16BIT
 
 STATES = {"sound": "green", "imprecise": "yellow", "unsound": "bold red", "unclear": "yellow"}
@@ -36,7 +35,7 @@ def print_check(checked: SceneCheck, console: Console, *, verbose: bool = False)
     """Print the verdict, then what explains it; verbose: every table."""
 
     def say(text: str, indent: int, style: str = "") -> None:
-        lines = textwrap.wrap(text, min(console.width, MOST_COLUMNS), subsequent_indent=" " * indent)
+        lines = wrapped(text, min(console.width, MOST_COLUMNS), begin="", hanging=indent)
         console.print("\n".join(lines), style=style, highlight=False, markup=False, soft_wrap=True)
 
     say(_heading(checked), 4, "bold")

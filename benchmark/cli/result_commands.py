@@ -41,7 +41,7 @@ def compare(
         raise ConfigError("--align and --code belong to two visits of one place: add --same-place")
     from semstab.compare_runs import compare_opened
     from semstab.compare_runs import markdown as as_markdown
-    from semstab.comparison.entries import open_compared
+    from semstab.comparison.opening import open_compared
     from semstab.core.console import Console
     from semstab.core.types import THIS_SCENE
     from semstab.report.comparison.screen import print_comparison
@@ -136,7 +136,8 @@ def gate(
     quiet: Quiet = False,
 ) -> None:  # fmt: skip
     """Fail if a new model is significantly worse: exit code 4 if a rule fails, 5 if one is undecided."""
-    from semstab.comparison.entries import open_run, save_summary
+    from semstab.comparison.opening import open_run
+    from semstab.comparison.small_summary import save_summary
     from semstab.core.console import Console
     from semstab.engine.folder import require_output
     from semstab.gating import report as gate_report

@@ -42,7 +42,7 @@ def show(
     figures: Annotated[FigureFormat | None, typer.Option(help="Draw the figures for a paper into RUN/figures.")] = None,
 ) -> None:  # fmt: skip
     """Print the answer of a finished run, or its tables, without computing; of several runs one table of all."""
-    from semstab.core.console import Console
+    from semstab.core.console import Console, wrapped
     from semstab.data.records import is_run
     from semstab.engine.folder import load_result
     from semstab.report.comparison.own_models import own_models
@@ -70,7 +70,7 @@ def show(
         print_answer(result, Console(), out=run)
         names = [*by_name, COMPARISON] if len(result.models) > 1 else [*by_name]
         listed = f"tables  semstab-bench show {run} TABLE, of {', '.join(names)}"
-        print_lines(textwrap.wrap(listed, 80, initial_indent="  ", subsequent_indent=" " * 10))
+        print_lines(wrapped(listed, hanging=10))
     chosen: dict[str, Table] = {}
     for name in what or ():
         matching = {key: table for key, table in by_name.items() if key.startswith(name)}

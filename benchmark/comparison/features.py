@@ -7,7 +7,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 from semstab.comparison.differences import sums_difference
-from semstab.comparison.entries import Entry, RunHandle, open_compared, shared_scenes
+from semstab.comparison.entries import Entry, RunHandle, shared_scenes
+from semstab.comparison.opening import open_compared
 from semstab.comparison.pairing import other_frame_of_reference
 from semstab.core.types import THIS_SCENE, Scope
 from semstab.data.measures import Quantity

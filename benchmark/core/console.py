@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import textwrap
 from collections.abc import Iterable
 from typing import Any
 
@@ -9,6 +10,9 @@ import rich.console
 from rich.segment import Segment
 
 from semstab.errors import shown
+
+WIDTH = 80
+"""Columns that a text takes at most, unless the caller says otherwise."""
 
 
 class Console(rich.console.Console):
@@ -24,3 +28,15 @@ class Console(rich.console.Console):
                 yield segment
             else:
                 yield Segment(shown(segment.text, keep="\n"), segment.style)
+
+
+def wrapped(text: str, width: int = WIDTH, *, begin: str = "  ", hanging: int = 4) -> list[str]:
+    """Return a text as lines that are broken between words, never at the hyphen of a name.
+
+    Args:
+        text: The text.
+        width: Columns of a line.
+        begin: Begins the first line.
+        hanging: Columns by which the other lines are indented.
+    """
+    return textwrap.wrap(text, width, initial_indent=begin, subsequent_indent=" " * hanging, break_on_hyphens=False)

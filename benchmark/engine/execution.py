@@ -29,9 +29,9 @@ from semstab.data.records import Record, Result
 from semstab.engine.executors import Executor, InProcess
 from semstab.engine.folder import Folder, require_file_names
 from semstab.engine.frame_loop import share_open_scenes
-from semstab.engine.memory import planned_sizes
 from semstab.engine.observer import Observer, Observers
 from semstab.engine.run_result import UnitResults, advice_of, manifest, result_of
+from semstab.engine.sizing import planned_sizes
 from semstab.engine.tiled_units import TiledUnit
 from semstab.engine.units import Plan, Unit, fitting, make_plan
 from semstab.engine.work import Job, Start, Work, jobs_of

@@ -18,7 +18,7 @@ from semstab.data.records import RegionFlicker
 from semstab.datasets import GROUND_TRUTH, Dataset, Scene, open_dataset
 from semstab.engine.live_maps import Decoded, Decodings, LiveMap, Stream, frame_order, streams_of
 from semstab.engine.measurement import finish
-from semstab.engine.memory import MemoryBudget
+from semstab.engine.memory_budget import MemoryBudget
 from semstab.engine.observer import Observers
 from semstab.engine.work import Job, Work
 from semstab.errors import DataError

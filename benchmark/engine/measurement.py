@@ -4,27 +4,22 @@ from __future__ import annotations
 
 import contextlib
 import math
-from collections.abc import Callable, Mapping
-from concurrent.futures import Future
+from collections.abc import Mapping
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
-from semstab.backends.numpy_reference import NumpySample, in_sample
 from semstab.config import Config
-from semstab.core.background import Background
-from semstab.core.files import ScratchFolder, atomic_path, file_digest
+from semstab.core.files import atomic_path
 from semstab.core.process import Stopwatch, trim_malloc
 from semstab.core.types import Float64
-from semstab.data.events import Events
-from semstab.data.evidence import stretches
 from semstab.data.features import OF_FEATURES
 from semstab.data.frames import LeftOut
-from semstab.data.measures import RECURRENT, dominant, mean, measures, vss
+from semstab.data.measures import dominant, mean, measures
 from semstab.data.parquet import Tile
 from semstab.data.records import (
     EVENTS,
@@ -38,78 +33,86 @@ from semstab.data.records import (
     PixelStatistics,
     Record,
 )
-from semstab.data.results import STAGES, Agreement, ReducedScores, UnitName, UnitSummary, slug
+from semstab.data.results import STAGES, ReducedScores, UnitSummary, slug
 from semstab.data.voxels import VoxelTable
 from semstab.datasets import Scene
+from semstab.engine.fused_map import SMALL, FusedMap, fused_map
 from semstab.engine.live_maps import LiveMap, Stream
 from semstab.engine.place_pictures import PICTURED as PICTURED_PLACES
 from semstab.engine.place_pictures import pictures_of_places
 from semstab.engine.series import Series
 from semstab.engine.tiles import TILE_FEATURES, TILE_OBSERVATIONS, TileResult
+from semstab.engine.unit_files import Files, Savers
 from semstab.engine.units import Unit, unit_key
-from semstab.engine.work import Start, Work
+from semstab.engine.work import UnitTile, Work
 from semstab.errors import DataError
-from semstab.metrics import compare
-from semstab.metrics.agreement import rows_of
 from semstab.metrics.image_space import PICTURED, ImageSpaceMeter, LonePicture, lone_picture, picture_arrays
 from semstab.metrics.summary import TableSums
 from semstab.metrics.up_axis import estimate_up
 from semstab.metrics.video_flicker import VideoFlickerMeter, video_picture
 from semstab.statistics import Analysis, MapSample, SpotObservations, analyse
-from semstab.statistics.agreement import alpha_of, alpha_sums, ratio_of
+from semstab.statistics.agreement import alpha_of, ratio_of
 from semstab.statistics.feature_spots import FeatureObservations
 from semstab.statistics.frame_disagreement import LoneDisagreement, by_frame, outlying_frames
 from semstab.statistics.places import worst_places
 from semstab.statistics.verdict import Limits
 from semstab.task import Task, read
 
-SMALL = 1 << 30
-"""A process with fewer bytes keeps freed memory for the next table, but between tiles: there memory is short."""
-
 OfFrames = dict[int, dict[str, float]]
 """How often each frame stands alone, by its index; see `semstab.statistics.frame_disagreement.by_frame`."""
 
-Savers = dict[str, Callable[[Path], None]]
-"""A function that writes each file of a unit, by the file's path in the folder."""
-
 
 def finish(live: LiveMap, stream: Stream, watch: Stopwatch) -> Work:
-    """Measure a map, a tile of one or the pass over the frames of tiles, and write its files.
+    """Measure what a work has fused, and write its files: a unit, a tile of one, or the pass over the frames of tiles.
 
     Raises:
-        DataError: If no pixel of a whole map was valid.
+        DataError: If no pixel of a unit was valid.
     """
-    work, config, tile, files = live.work, live.config, live.work.tile, Files(live.work.start)
+    finished = _finished_unit if live.work.tile is None else _finished_tile
     live.drain()
-    fused = _fused_map(live, watch) if work.fuses else None
+    with live.threads(), contextlib.closing(Files(live.work.start)) as files:
+        return finished(live, stream, files, watch)
+
+
+def _finished_unit(live: LiveMap, stream: Stream, files: Files, watch: Stopwatch) -> Work:
+    """Return the work of a unit with its record."""
+    work, config = live.work, live.config
+    fused = fused_map(live, watch) if work.fuses else None
+    if fused is not None and not len(fused.table):
+        raise no_voxels(live.task, config)
     observations, features = live.sampled_observations(), live.sampled_features()
-    with contextlib.closing(Background("semstab-files", 1)) as writer, live.threads():
-        if fused is not None and tile is None and not len(fused.table):
-            raise no_voxels(live.task, config)
-        if fused is not None and not config.statistics:  # else columns of the statistics go along
-            writer.submit(partial(files.write, _map_savers(live, fused, None)))
-        with watch("statistics"):
-            sample = _sample(live, fused)
-            analysis = None
-            if sample is not None and tile is None:
-                analysis = analyse_sample(live.task, config, sample, observations, features)
-            trim_malloc(least=SMALL if tile is None else 0)
-        result = _result(live, stream, fused, sample)
-        record, of_frames = None, OfFrames()
-        if tile is None:
-            with watch("measure"):
-                record, of_frames = _record(live, stream, fused, result, analysis)
-        with watch("write"):
-            writer.drain()
-            files.write(_savers(live, stream, fused, observations, features, sample, analysis, of_frames))
-            if fused is not None and config.statistics:
-                files.write(_map_savers(live, fused, analysis))
-            if tile is not None:
-                files.write({f"{tile.folder}/{tile.name}.npz": replace(result, files={**files.digests}).save})
-    if record is None:
-        return replace(work, files=files.returned)
+    if not config.statistics:
+        files.write_ahead(_map_savers(live, fused))
+    with watch("statistics"):
+        sample, analysis = _sample(live, fused), None
+        if sample is not None:
+            analysis = analyse_sample(live.task, config, sample, observations, features)
+        trim_malloc(least=SMALL)
+    result = _result(live, stream, fused, sample)
+    with watch("measure"):
+        record, of_frames = _record(live, stream, fused, result, analysis)
+    with watch("write"):
+        files.write(_unit_savers(live, stream, fused, observations, analysis, of_frames))
+        if config.statistics:
+            files.write(_map_savers(live, fused, analysis))
     table = fused.table if fused is not None and work.watched else None
     return replace(work, record=replace(record, files=files.digests), files=files.returned, table=table)
+
+
+def _finished_tile(live: LiveMap, stream: Stream, files: Files, watch: Stopwatch) -> Work:
+    """Return the work of a tile, or of the pass over the frames of tiles; its result is one of the files."""
+    work, tile = live.work, live.work.tile
+    assert tile is not None
+    fused = fused_map(live, watch) if work.fuses else None
+    observations, features = live.sampled_observations(), live.sampled_features()
+    with watch("statistics"):
+        sample = _sample(live, fused)
+        trim_malloc(least=0)
+    result = _result(live, stream, fused, sample)
+    with watch("write"):
+        files.write(_map_savers(live, fused) | _tile_savers(tile, stream, observations, features, sample))
+        files.write({f"{tile.folder}/{tile.name}.npz": replace(result, files={**files.digests}).save})
+    return replace(work, files=files.returned)
 
 
 def _sample(live: LiveMap, fused: FusedMap | None) -> MapSample | None:
@@ -146,80 +149,12 @@ def _record(
     live: LiveMap, stream: Stream, fused: FusedMap | None, result: TileResult, analysis: Analysis | None
 ) -> tuple[Record, OfFrames]:
     """Return the record of a unit, and how often each of its frames stands alone."""
-    unit = live.work.unit
-    record = record_of(unit, live.task, live.rows, result, analysis)
-    of_frames = OfFrames({} if analysis is None else analysis.of_frames())
-    if unit.image_space:
-        points = np.zeros((0, 3)) if fused is None else fused.table
-        record = in_image_space(record, live.task, result, points)
-    if stream.pixels is not None:
-        pixels, of_frames = pixel_statistics(live.task, stream.pixels)
-        record = replace(record, pixels=pixels)
-    return record, of_frames
-
-
-class FusedMap(NamedTuple):
-    """A map at its end, without the locations whose fused class is left out; reduced: `reduced_sums`, or empty.
-
-    It is checked against the reference in parallel with the statistics.
-    """
-
-    table: VoxelTable
-    events: Events | None
-    truth: VoxelTable | None
-    reduced: Float64
-    checked: Future[Agreement] | None
-
-
-def _fused_map(live: LiveMap, watch: Stopwatch) -> FusedMap:
-    """Return the tables of a map, whose backend is let go: the statistics have its memory."""
-    assert live.backend is not None
-    config, classes = live.config, live.task.mapping.target.classes
-    with watch("table"):
-        table = replace(live.backend.table(), classes=classes)
-        _check_evidence(table, live.name)
-        events = live.backend.events() if config.statistics or config.events else None
-        truth = None if live.truth is None else replace(live.truth.table(), classes=classes)
-        reduced = np.zeros(0) if live.hard is None else reduced_sums(_left(live, live.hard.table())[0])
-        live.backend = live.truth = live.hard = None
-    checked = None
-    if live.reference is not None:
-        checked = live.background.submit(partial(_checked, live, table, live.reference, watch))
-    trim_malloc(least=SMALL if live.work.tile is None else 0)
-    events = None if events is None else replace(events, classes=classes)
-    return FusedMap(*_left(live, table, events), truth, reduced, checked)
-
-
-OF_OP = 1e-6
-"""Largest difference of a voxel's summed evidence from its OP or weight, divided by that."""
-
-
-def _check_evidence(table: VoxelTable, name: UnitName) -> None:
-    """Raise DataError where a backend's evidence of a voxel does not sum to its OP, or to the weight that it states."""
-    stated, what = (table.op, "OP") if table.weight is None else (table.weight, "weight")
-    starts, _, weight = table.evidence.entries
-    for rows in stretches(len(table)):
-        first, op = starts[rows], stated[rows]
-        total, filled = np.zeros(len(op)), starts[rows.start + 1 : rows.stop + 1] > first
-        total[filled] = np.add.reduceat(weight[: starts[rows.stop]], first[filled]) if filled.any() else 0.0
-        wrong = np.flatnonzero(~((np.abs(total - op) <= OF_OP * op) & (op > 0)))
-        if len(wrong):
-            row = rows.start + wrong[0]
-            voxel = ", ".join(str(axis[row]) for axis in (table.ix, table.iy, table.iz))
-            raise DataError(
-                f"{name.scene}, {name.model}: backend '{name.backend}': the evidence of voxel ({voxel}) sums to"
-                f" {total[wrong[0]]:g}, and its {what} is {op[wrong[0]]:g}; add one distribution over the classes for"
-                " each frame that sees a voxel, or state in the column `weight` what a row sums to"
-                " (semstab.testing.BackendConformance finds the mistake)"
-            )
-
-
-def _left(live: LiveMap, table: VoxelTable, events: Events | None = None) -> tuple[VoxelTable, Events | None]:
-    """Return the map and its log without the locations whose fused class is left out."""
-    if not live.left_out:
-        return table, events
-    keep = np.flatnonzero(~np.isin(dominant(table), live.left_out))
-    return table.rows(keep), None if events is None else events.rows(keep)
+    points = np.zeros((0, 3)) if fused is None else fused.table
+    record = record_of(live.work.unit, live.task, live.rows, result, analysis, points)
+    if stream.pixels is None:
+        return record, OfFrames({} if analysis is None else analysis.of_frames())
+    pixels, of_frames = pixel_statistics(live.task, stream.pixels)
+    return replace(record, pixels=pixels), of_frames
 
 
 CAST = "what moved cannot be told: depth is cast at a surface, which has no movers in it"
@@ -284,23 +219,40 @@ def no_voxels(task: Task, config: Config) -> DataError:
     )
 
 
-def _checked(live: LiveMap, table: VoxelTable, reference: NumpySample, watch: Stopwatch) -> Agreement:
-    with watch("reference"):
-        expected, one_in = replace(reference.table(), classes=table.classes), reference.one_in
-        some_in = [in_sample(np.stack([table.ix[s], table.iy[s], table.iz[s]]), one_in) for s in stretches(len(table))]
-        sampled_table = rows_of(table, np.concatenate(some_in))
-        units = (live.name, replace(live.name, backend="numpy"))
-        return replace(compare(sampled_table, expected, units, tolerance=live.config.tolerance), one_in=one_in)
+def record_of(
+    unit: Unit,
+    task: Task,
+    rows: Series,
+    result: TileResult,
+    analysis: Analysis | None,
+    points: VoxelTable | Float64,
+) -> Record:
+    """Return the record of a unit from its time series, its result, the statistics of its map and its points (n, 3)."""
+    record = Record(
+        unit_key(unit.identity, task.digest),
+        unit.variation,
+        _summary(unit, task, rows, result, analysis),
+        input=task.digest,
+        files=result.files,
+        checked=result.checked,
+    )
+    if not unit.image_space:
+        return record
+    image_space = ImageSpaceMeter(result.image).result(record.summary.flicker_percent)
+    if task.mapping.target == OF_FEATURES:
+        image_space = image_space.without_classes()
+    up = up_axis(task.scene, points, result.poses) if task.scene.posed else None
+    return replace(record, image_space=image_space, up=up, quality=result.quality, video_measures=result.video_measures)
 
 
-def record_of(unit: Unit, task: Task, rows: Series, result: TileResult, analysis: Analysis | None) -> Record:
-    """Return the record of a unit from its time series, its result and the statistics of its map."""
+def _summary(unit: Unit, task: Task, rows: Series, result: TileResult, analysis: Analysis | None) -> UnitSummary:
+    """Return the numbers of a unit's map, series and statistics."""
     config = unit.config
     sums = TableSums.read(result.sums)
     table = sums.summary(config.voxel_size if unit.fuses else math.nan, task.mapping.target.classes, config.strata)
     of_features = task.mapping.target == OF_FEATURES
     cut, most = rows.column("scores_left_out"), rows.column("most_scores_left_out")
-    summary = UnitSummary(
+    return UnitSummary(
         unit=unit.name,
         taxonomy=task.mapping.target.name,
         frames=len(task.indices),
@@ -315,30 +267,6 @@ def record_of(unit: Unit, task: Task, rows: Series, result: TileResult, analysis
         statistics=None if analysis is None else analysis.summary,
         reduced=_reduced(result.reduced) if len(result.reduced) else None,
     )
-    return Record(
-        unit_key(unit.identity, task.digest),
-        unit.variation,
-        summary,
-        input=task.digest,
-        files=result.files,
-        checked=result.checked,
-    )
-
-
-def in_image_space(record: Record, task: Task, result: TileResult, points: VoxelTable | Float64) -> Record:
-    """Return the record with what is measured in image coordinates, and the scene's up axis."""
-    image_space = ImageSpaceMeter(result.image).result(record.summary.flicker_percent)
-    if task.mapping.target == OF_FEATURES:
-        image_space = image_space.without_classes()
-    up = up_axis(task.scene, points, result.poses) if task.scene.posed else None
-    return replace(record, image_space=image_space, up=up, quality=result.quality, video_measures=result.video_measures)
-
-
-def reduced_sums(table: VoxelTable) -> Float64:
-    """Return the sums over voxels of a map of labels that soft scores were reduced to."""
-    values, recurrent = vss(table), table.op >= RECURRENT
-    means = [values.sum(), len(values), values[recurrent].sum(), np.count_nonzero(recurrent)]
-    return np.concatenate([means, alpha_sums(table)])
 
 
 def _reduced(sums: Float64) -> ReducedScores:
@@ -357,59 +285,69 @@ def up_axis(scene: Scene, points: VoxelTable | Float64, poses: Float64) -> tuple
 # --- Files ------------------------------------------------------------------------------------------------------------
 
 
-def _savers(
+def _unit_savers(
     live: LiveMap,
     stream: Stream,
     fused: FusedMap | None,
     observations: SpotObservations | None,
-    features: FeatureObservations | None,
-    sample: MapSample | None,
     analysis: Analysis | None,
     of_frames: OfFrames,
 ) -> Savers:
-    """Return the files of a unit, of a tile, or of the pass over the frames of tiles, but for those of its map."""
-    work, config, tile, savers = live.work, live.config, live.work.tile, Savers()
-    unit = work.unit
+    """Return the files of a unit except those of its map."""
+    task, unit, savers = live.task, live.work.unit, Savers()
     if unit.image_space and stream.overview:
-        pictures = pictures_of_outlying(live.task, config, of_frames)
-        if fused is not None and tile is None and observations is not None and not live.task.scene.of_scans:
+        pictures = pictures_of_outlying(task, live.config, of_frames)
+        if fused is not None and observations is not None and not task.scene.of_scans:
             places = worst_places((fused.table,), observations, PICTURED_PLACES)
-            pictures |= pictures_of_places(live.task, places, config.pixel_stride)
-        savers[overview_file(live.task)] = partial(save_overview, stream.overview | pictures)
-    if tile is not None and observations is not None:
+            pictures |= pictures_of_places(task, places, live.config.pixel_stride)
+        savers[overview_file(task)] = partial(save_overview, stream.overview | pictures)
+    return savers | unit_savers(task, live.rows, observations, analysis, of_frames) if unit.stored else savers
+
+
+def _tile_savers(
+    tile: UnitTile,
+    stream: Stream,
+    observations: SpotObservations | None,
+    features: FeatureObservations | None,
+    sample: MapSample | None,
+) -> Savers:
+    """Return what the whole unit is made of: of a tile its sample, of the pass over the frames all others."""
+    savers = Savers()
+    if stream.overview:
+        savers[overview_file(stream.task)] = partial(save_overview, stream.overview)
+    if observations is not None:
         savers[f"{tile.folder}/{tile.size}_{TILE_OBSERVATIONS}"] = observations.save
-    if tile is not None and features is not None:
+    if features is not None:
         savers[f"{tile.folder}/{tile.size}_{TILE_FEATURES}"] = features.save
-    if tile is None and unit.stored:
-        savers |= unit_savers(live.task, live.rows, observations, analysis, of_frames)
-    if fused is not None and len(fused.table) and tile is not None and sample is not None:
+    if sample is not None and len(sample.table):
         savers[f"{tile.folder}/{tile.name}.sample"] = sample.below(tile.bound).save
     return savers
 
 
-def _map_savers(live: LiveMap, fused: FusedMap, analysis: Analysis | None) -> Savers:
-    """Return the files of a map: its voxels, with the columns of the statistics where they are wanted, log and truth.
+def _map_savers(live: LiveMap, fused: FusedMap | None, analysis: Analysis | None = None) -> Savers:
+    """Return the files of a map: its voxels, with the columns of its statistics, log and truth; none without voxels.
 
     A tile's voxels to which statistics add columns wait in its folder until the whole map is there.
     """
-    config, tile, unit, of_unit, savers = live.config, live.work.tile, live.work.unit, live.name.slug, Savers()
-    if not unit.stored or not len(fused.table):
+    config, unit, tile, savers = live.config, live.work.unit, live.work.map_tile, Savers()
+    if fused is None or not unit.stored or not len(fused.table):
         return savers
-    map_tile = None if tile is None or tile.index is None else Tile(*tile.index, tile.size, tile.key)
-
-    def path(folder: str, *, waits: bool) -> str:
-        if tile is None or map_tile is None:
-            return f"{folder}/{of_unit}.parquet"
-        return f"{tile.folder}/{folder}/{map_tile.name}" if waits else f"{folder}/{of_unit}/{map_tile.name}"
-
-    columns = analysis.columns(fused.table, fused.truth) if config.statistics and analysis is not None else {}
-    voxels = path(VOXELS, waits=config.statistics and unit.assessed)
-    savers[voxels] = partial(save_voxels, fused.table, columns=columns, tile=map_tile)
+    columns = {} if analysis is None or not config.statistics else analysis.columns(fused.table, fused.truth)
+    voxels = _map_file(live.work, VOXELS, waits=config.statistics and unit.assessed)
+    savers[voxels] = partial(save_voxels, fused.table, columns=columns, tile=tile)
     if fused.events is not None and config.events:
-        savers[path(EVENTS, waits=False)] = partial(fused.events.save, tile=map_tile)
-    if fused.truth is not None and (unit.image_space if map_tile is None else len(fused.truth)):
-        savers[path(TRUTH, waits=not unit.image_space)] = partial(fused.truth.save, tile=map_tile)
+        savers[_map_file(live.work, EVENTS, waits=False)] = partial(fused.events.save, tile=tile)
+    if fused.truth is not None and (unit.image_space if tile is None else len(fused.truth)):
+        savers[_map_file(live.work, TRUTH, waits=not unit.image_space)] = partial(fused.truth.save, tile=tile)
     return savers
+
+
+def _map_file(work: Work, folder: str, *, waits: bool) -> str:
+    """Return the path of a file of a map; a tile's file `waits` for the whole map in the tile's own folder."""
+    tile, slug = work.map_tile, work.unit.name.slug
+    if work.tile is None or tile is None:
+        return f"{folder}/{slug}.parquet"
+    return f"{work.tile.folder}/{folder}/{tile.name}" if waits else f"{folder}/{slug}/{tile.name}"
 
 
 def unit_savers(
@@ -453,39 +391,6 @@ def pictures_of_outlying(task: Task, config: Config, of_frames: OfFrames) -> dic
         hold = lone_picture if posed else video_picture
         pictures.append(hold(read(task, frame, config.pixel_stride, color=True), neighbour_frames))
     return picture_arrays(pictures)
-
-
-class Files:
-    """The files of a work.
-
-    Attributes:
-        digests: Their digests by their path in the folder.
-        returned: Their bytes, where the folder is not shared.
-    """
-
-    def __init__(self, start: Start) -> None:
-        self._start, self.digests, self.returned = start, dict[str, str](), dict[str, bytes]()
-
-    def write(self, savers: Savers) -> None:
-        """Write some of them."""
-        digests, returned = written(self._start, savers)
-        self.digests |= digests
-        self.returned |= returned
-
-
-def written(start: Start, savers: Savers) -> tuple[dict[str, str], dict[str, bytes]]:
-    """Write files into a shared folder, and return their digests; without a shared folder, also return their bytes."""
-    if start.marker.exists():
-        for name, save in savers.items():
-            save(start.folder / name)
-        return {name: file_digest(start.folder / name).hex() for name in savers}, {}
-    digests, returned = {}, {}
-    with ScratchFolder() as elsewhere:
-        for name, save in savers.items():
-            path = elsewhere / name
-            save(path)
-            digests[name], returned[name] = file_digest(path).hex(), path.read_bytes()
-    return digests, returned
 
 
 def save_voxels(

@@ -16,8 +16,10 @@ import numpy.typing as npt
 from semstab.core.arrays import GrowingRows
 from semstab.core.files import atomic_path
 from semstab.core.types import Float64
+from semstab.data.digests import require_unchanged
 from semstab.data.measures import ENTROPY, RECURRENT, VSS
 from semstab.data.results import STAGES, FrameReport
+from semstab.errors import DataError, summarize_error
 
 
 @dataclasses.dataclass(frozen=True)
@@ -174,3 +176,34 @@ class Series:
         values["timestamp"] = None if math.isnan(values["timestamp"]) else values["timestamp"]
         report = FrameReport(**{name: values.pop(name) for name in REPORT})
         return FrameRow(report, **values)
+
+
+def read_cells(file: Path) -> list[dict[str, str]]:
+    """Return the cells of each row of a file that `Series.save_csv` wrote, by column.
+
+    Raises:
+        DataError: If the file cannot be read, or has changed since the run wrote it.
+    """
+    require_unchanged(file)
+    try:
+        with file.open(encoding="utf-8", newline="") as lines:
+            return [*csv.DictReader(lines)]
+    except (OSError, ValueError, csv.Error) as error:
+        raise _damaged(file, error) from error
+
+
+def read_names(file: Path) -> dict[int, str]:
+    """Return the names of frames by their index, as a time series has them.
+
+    Raises:
+        DataError: As `read_cells` does.
+    """
+    cells = read_cells(file)
+    try:
+        return {int(row["frame"]): row.get("name") or row["frame"] for row in cells}
+    except (LookupError, TypeError, ValueError) as error:
+        raise _damaged(file, error) from error
+
+
+def _damaged(file: Path, error: Exception) -> DataError:
+    return DataError(f"{file}: cannot be read ({summarize_error(error)}); run it again")

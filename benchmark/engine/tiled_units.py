@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import dataclasses
-import functools
-import operator
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 import numpy as np
+import numpy.typing as npt
 
 from semstab.core.types import Float64
 from semstab.data.parquet import tile_of
@@ -17,9 +17,7 @@ from semstab.data.records import TRUTH, VOXELS, Record
 from semstab.data.voxels import VoxelTable
 from semstab.engine.folder import Folder
 from semstab.engine.measurement import (
-    Savers,
     analyse_sample,
-    in_image_space,
     no_voxels,
     overview_file,
     pictures_of_outlying,
@@ -27,13 +25,13 @@ from semstab.engine.measurement import (
     save_overview,
     save_voxels,
     unit_savers,
-    written,
 )
+from semstab.engine.series import Series
 from semstab.engine.tiles import TILE_FEATURES, TILE_OBSERVATIONS, TileResult, joined_series
+from semstab.engine.unit_files import Savers, written
 from semstab.engine.units import Unit
 from semstab.engine.work import Job, Start, UnitTile, Work
 from semstab.errors import SemstabError
-from semstab.metrics.agreement import together
 from semstab.metrics.summary import TableSums
 from semstab.statistics import Analysis, MapSample, SpotObservations
 from semstab.statistics.feature_spots import FeatureObservations
@@ -141,48 +139,65 @@ def assembled(
     Raises:
         DataError: If no pixel was valid.
     """
-    tasks, tiles, start, folder = [*results], [*results.values()], work.start, work.start.folder
-    unit, task, config = work.unit, work.unit.task, work.unit.config
-    sums = functools.reduce(operator.add, (TableSums.read(tile.sums) for tile in tiles)) if tiles else None
+    unit, task, folder, tiles = work.unit, work.unit.task, work.start.folder, [*results]
+    whole = frames.with_tiles([*results.values()])
+    sums = TableSums.read(whole.sums) if tiles else None
     if sums is None or not sums.total[2]:
-        raise no_voxels(task, config)
-    rows = joined_series(frames.series, [tile.series for tile in tiles])
-    observations_file = folder / tasks[0].folder / f"{tasks[0].size}_{TILE_OBSERVATIONS}"
-    observations = SpotObservations.load(observations_file) if observations_file.exists() else None
+        raise no_voxels(task, unit.config)
+    rows = joined_series(frames.series, [result.series for result in results.values()])
+    observations, features = _of_frames(folder, tiles[0])
     analysis = None
     if sample is not None:  # sums in the order of the tiles, not in that of their ends
         sample = dataclasses.replace(sample, summary=sums)
-        vectors = folder / tasks[0].folder / f"{tasks[0].size}_{TILE_FEATURES}"
-        features = FeatureObservations.load(vectors, observations) if vectors.exists() and observations else None
-        analysis = analyse_sample(task, config, sample, observations, features)
-    files = {name: digest for part in (frames, *tiles) for name, digest in part.files.items()}
-    files = {name: digest for name, digest in files.items() if not name.startswith(tasks[0].folder)}
+        analysis = analyse_sample(task, unit.config, sample, observations, features)
+    savers = _savers(work, tiles, rows, observations, analysis, pictured=overview_file(task) in whole.files)
+    files = {name: digest for name, digest in whole.files.items() if not name.startswith(tiles[0].folder)}
+    files |= written(work.start, savers)[0]
+    points = np.zeros((0, 3))
+    if unit.image_space:
+        points = _centers(folder, files, unit.config.voxel_size, int(sums.total[2]))
+    return record_of(unit, task, rows, dataclasses.replace(whole, files=files), analysis, points)
+
+
+def _savers(
+    work: Work,
+    tiles: Sequence[UnitTile],
+    rows: Series,
+    observations: SpotObservations | None,
+    analysis: Analysis | None,
+    *,
+    pictured: bool,
+) -> Savers:
+    """Return the files of a unit that need all of its tiles: pictures are added to the overview if there is one."""
+    unit, task, folder, savers = work.unit, work.unit.task, work.start.folder, Savers()
     of_frames = {} if analysis is None else analysis.of_frames()
-    if (pictures := pictures_of_outlying(task, config, of_frames)) and overview_file(task) in files:
-        with np.load(folder / overview_file(task)) as content:
-            arrays = {name: content[name] for name in content.files}
-        files |= written(start, {overview_file(task): partial(save_overview, arrays | pictures)})[0]
-    if unit.stored:
-        savers = unit_savers(task, rows, observations, analysis, of_frames)
-        if config.statistics and analysis is not None:
-            for tile_task in tasks:
-                savers |= _with_columns(tile_task, unit.name.slug, analysis, folder)
-        files |= written(start, savers)[0]
-    reduced = [tile.reduced for tile in tiles if len(tile.reduced)]
-    checked = [tile.checked for tile in tiles if tile.checked is not None]
-    result = dataclasses.replace(
-        frames,
-        files=files,
-        sums=sums.arrays(),
-        reduced=np.sum(reduced, axis=0) if reduced else np.zeros(0),
-        checked=together(checked) if checked and len(checked) == len(tiles) else None,
+    if pictured and (pictures := pictures_of_outlying(task, unit.config, of_frames)):
+        savers[overview_file(task)] = partial(_save_with_pictures, folder / overview_file(task), pictures)
+    if not unit.stored:
+        return savers
+    savers |= unit_savers(task, rows, observations, analysis, of_frames)
+    if unit.config.statistics and analysis is not None:
+        for tile in tiles:
+            savers |= _with_columns(tile, unit.name.slug, analysis, folder)
+    return savers
+
+
+def _of_frames(folder: Path, tile: UnitTile) -> tuple[SpotObservations | None, FeatureObservations | None]:
+    """Return what the pass over the frames sampled: observations, and features if the model has some."""
+    observations, features = (
+        folder / tile.folder / f"{tile.size}_{name}" for name in (TILE_OBSERVATIONS, TILE_FEATURES)
     )
-    record = record_of(unit, task, rows, result, analysis)
-    if not unit.image_space:
-        return record
-    voxels = [folder / name for name in files if name.startswith(f"{VOXELS}/")]
-    centers = _centers(voxels, config.voxel_size, -(-int(sums.total[2]) // UP_VOXELS))
-    return in_image_space(record, task, result, centers)
+    if not observations.exists():
+        return None, None
+    spots = SpotObservations.load(observations)
+    return spots, FeatureObservations.load(features, spots) if features.exists() else None
+
+
+def _save_with_pictures(overview: Path, pictures: dict[str, npt.NDArray[Any]], path: Path) -> None:
+    """Save the pictures that are there, and further ones."""
+    with np.load(overview) as content:
+        arrays = {name: content[name] for name in content.files}
+    save_overview(arrays | pictures, path)
 
 
 def _with_columns(task: UnitTile, slug: str, analysis: Analysis, folder: Path) -> Savers:
@@ -199,10 +214,12 @@ def _with_columns(task: UnitTile, slug: str, analysis: Analysis, folder: Path) -
     return {f"{VOXELS}/{slug}/{waiting.name}": save} if waiting.exists() else {}
 
 
-def _centers(files: Sequence[Path], voxel_size: float, step: int) -> Float64:
-    """Return (n, 3) of every n-th voxel, metres, in the order of a whole table."""
-    if not files:
+def _centers(folder: Path, files: Iterable[str], voxel_size: float, voxels: int) -> Float64:
+    """Return (n, 3) of at most UP_VOXELS of a map's voxels, evenly drawn, metres, in the order of a whole table."""
+    step = -(-voxels // UP_VOXELS)
+    tables = [folder / name for name in files if name.startswith(f"{VOXELS}/")]
+    if not tables:
         return np.zeros((0, 3))
-    parts = [VoxelTable.columns(file, ("ix", "iy", "iz")) for file in files]
+    parts = [VoxelTable.columns(file, ("ix", "iy", "iz")) for file in tables]
     index = np.concatenate([np.stack([*part.values()], axis=1)[::step] for part in parts])
     return (index[np.lexsort(index.T[::-1])] + 0.5) * voxel_size

@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import dataclasses
+import functools
 import json
 import math
+import operator
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -20,6 +22,8 @@ from semstab.data.records import FrameQuality, VideoMeasures
 from semstab.data.results import Agreement
 from semstab.engine.series import NUMBERS, Series
 from semstab.errors import DataError
+from semstab.metrics.agreement import together
+from semstab.metrics.summary import TableSums
 
 TILE_OBSERVATIONS, TILE_FEATURES = "observations.parquet", "features.npz"
 """Files of the sample of observations of all frames, and of their features."""
@@ -128,6 +132,19 @@ class TileResult(TileMeta):
         sums = {name[5:]: array for name, array in arrays.items() if name.startswith("sums ")}
         contents: dict[str, Any] = {name: arrays[name] for name in ARRAYS}
         return cls(**vars(meta), **contents, sums=sums)
+
+    def with_tiles(self, tiles: Sequence[TileResult]) -> TileResult:
+        """Return the result of a unit: of this pass over its frames with all of its tiles."""
+        sums = functools.reduce(operator.add, (TableSums.read(tile.sums) for tile in tiles)).arrays() if tiles else {}
+        reduced = [tile.reduced for tile in tiles if len(tile.reduced)]
+        checked = [tile.checked for tile in tiles if tile.checked is not None]
+        return dataclasses.replace(
+            self,
+            files={name: digest for part in (self, *tiles) for name, digest in part.files.items()},
+            sums=sums,
+            reduced=np.sum(reduced, axis=0) if reduced else np.zeros(0),
+            checked=together(checked) if checked and len(checked) == len(tiles) else None,
+        )
 
     def tiles(self) -> dict[tuple[int, int], list[int]]:
         """Return the frames that meet each tile, in order, by its index."""

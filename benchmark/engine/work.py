@@ -9,6 +9,7 @@ from pathlib import Path
 
 from semstab.config import as_range
 from semstab.core.files import TEMPORARY
+from semstab.data.parquet import Tile
 from semstab.data.records import Record, RegionFlicker
 from semstab.data.voxels import Extent, VoxelTable
 from semstab.engine.units import Unit
@@ -148,6 +149,12 @@ class Work:
     def measures_images(self) -> bool:
         """Return whether it takes the frames in sequence, to measure them in image coordinates."""
         return self.tile is None or self.tile.index is None
+
+    @property
+    def map_tile(self) -> Tile | None:
+        """The tile of its map, as files of voxels name it; None for a whole map."""
+        tile = self.tile
+        return None if tile is None or tile.index is None else Tile(*tile.index, tile.size, tile.key)
 
     @property
     def within(self) -> Extent | None:

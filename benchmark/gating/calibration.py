@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
-from semstab.comparison.entries import open_run
+from semstab.comparison.opening import open_run
 from semstab.comparison.voxels import in_share, share_of
 from semstab.data.records import Record
 from semstab.data.tiles import Tiles, side_by_side

@@ -11,8 +11,9 @@ from pathlib import Path
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field
 
-from semstab.comparison.entries import RunHandle, open_run, shared_scenes
+from semstab.comparison.entries import RunHandle, shared_scenes
 from semstab.comparison.features import FEATURE_ALPHA
+from semstab.comparison.opening import open_run
 from semstab.comparison.quantities import COVERAGE, FLICKER
 from semstab.config import read_yaml, validated
 from semstab.config.groups import ScopeSetting

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import json
 import re
-import textwrap
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from xml.etree import ElementTree
 
+from semstab.core.console import wrapped
 from semstab.core.files import write_text
 from semstab.core.json_form import to_json
 from semstab.core.types import SCOPE_WORDS
@@ -68,17 +68,17 @@ def _named(result: GateResult, verdict: Verdict, last: str = " and ") -> str:
 
 def lines(result: GateResult, width: int = 80) -> Iterator[str]:
     """Yield lines for the terminal: the outcome, a line per rule, and why rules are undecided or fail."""
-    yield from _wrapped(headline(result), width, 2)
+    width = max(width, 40)
+    yield from wrapped(headline(result), width, begin="", hanging=2)
     against = f" against {result.against}" if result.against else ""
-    yield from _wrapped(f"  {result.new}{against}, {_scenes(result)}; {_ends(result)}", width, 2)
+    yield from wrapped(f"{result.new}{against}, {_scenes(result)}; {_ends(result)}", width, hanging=2)
     for note in result.notes:
-        yield from _wrapped(f"  {note}", width, 2)
+        yield from wrapped(note, width, hanging=2)
     yield ""
     longest = max((len(judgement.rule.text) for judgement in result.judgements), default=0)
     for judgement in result.judgements:
-        yield from _wrapped(
-            f"  {judgement.verdict.upper():<9}  {judgement.rule.text:<{longest}}  {judgement.values}", width, 13
-        )
+        text = f"{judgement.verdict.upper():<9}  {judgement.rule.text:<{longest}}  {judgement.values}"
+        yield from wrapped(text, width, hanging=13)
     yield ""
     reasons: dict[str, list[str]] = {}
     for judgement in result.judgements:
@@ -87,7 +87,7 @@ def lines(result: GateResult, width: int = 80) -> Iterator[str]:
         )
     for why, rules in reasons.items():
         rules_text = f": {', '.join(rules)}" if len(reasons) > 1 else ""
-        yield from _wrapped(f"  {why}{rules_text}", width, 4)
+        yield from wrapped(f"{why}{rules_text}", width)
     if result.count("undecided"):
         yield "  more     --plan: how many frames each rule needs; --out gate.md"
 
@@ -105,10 +105,6 @@ def plan(result: GateResult) -> Iterator[str]:
             else "no number of frames decides it"
         )
         yield f"  {judgement.rule.text}: {text}"
-
-
-def _wrapped(line: str, width: int, indent: int) -> list[str]:
-    return textwrap.wrap(line, max(width, 40), subsequent_indent=" " * indent, break_on_hyphens=False)
 
 
 def _ends(result: GateResult) -> str:

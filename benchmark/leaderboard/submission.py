@@ -17,7 +17,9 @@ from typing import Annotated, Any
 import numpy as np
 from pydantic import AfterValidator, Field
 
-from semstab.comparison.entries import Entry, RunHandle, open_run, save_summary
+from semstab.comparison.entries import Entry, RunHandle
+from semstab.comparison.opening import open_run
+from semstab.comparison.small_summary import save_summary
 from semstab.config import Config, Settings, read_yaml, validated
 from semstab.core.code import only_named
 from semstab.core.json_form import from_json, to_json

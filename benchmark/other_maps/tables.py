@@ -3,13 +3,11 @@
 from __future__ import annotations
 
 import dataclasses
-import textwrap
 from collections.abc import Iterator
 
-from semstab.core.console import Console
+from semstab.core.console import WIDTH, Console, wrapped
 from semstab.other_maps.agreement import DifferingPlace, MapAgreement
 from semstab.report.tables.table import Column, Group, Row, Table, to_terminal
-from semstab.report.terminal import WIDTH
 
 MOST_PLACES = 20
 """The most places of a table."""
@@ -134,5 +132,4 @@ def print_maps(agreements: tuple[MapAgreement, ...], run: str, console: Console,
             console.print(f"{text.rstrip()}\n", highlight=False, markup=False, soft_wrap=True)
     for agreement in agreements:
         for line in lines(agreement):
-            wrapped = textwrap.wrap(f"  {line}", console.width, subsequent_indent="    ")
-            console.print("\n".join(wrapped), highlight=False, markup=False)
+            console.print("\n".join(wrapped(line, console.width)), highlight=False, markup=False)

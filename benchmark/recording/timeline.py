@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import csv
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -11,9 +10,8 @@ import rerun as rr
 
 from semstab.core.background import Background
 from semstab.core.palette import model_color
-from semstab.data.digests import require_unchanged
 from semstab.data.results import UnitName
-from semstab.engine.series import COLUMNS, FrameColumn
+from semstab.engine.series import COLUMNS, FrameColumn, read_cells
 from semstab.engine.units import Plan
 from semstab.errors import DataError, summarize_error
 from semstab.task import Task
@@ -120,14 +118,10 @@ def read_rows(file: Path) -> list[tuple[int, float | None, dict[str, str]]]:
     Raises:
         DataError: If it is damaged.
     """
-    require_unchanged(file)
+    cells = read_cells(file)
     try:
-        with file.open(encoding="utf-8", newline="") as lines:
-            return [
-                (int(row["frame"]), float(row["timestamp"]) if row["timestamp"] else None, row)
-                for row in csv.DictReader(lines)
-            ]
-    except (OSError, LookupError, TypeError, ValueError, csv.Error) as error:
+        return [(int(row["frame"]), float(row["timestamp"]) if row["timestamp"] else None, row) for row in cells]
+    except (LookupError, TypeError, ValueError) as error:
         raise _damaged(file, error) from error
 
 

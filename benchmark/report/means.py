@@ -13,6 +13,7 @@ from semstab.data.records import Record, Result, Variation
 from semstab.data.results import Means
 from semstab.data.statistics import UNDEFINED, Estimate, MapStatistics
 from semstab.metrics import macro_mean, pool, split_last
+from semstab.statistics.intervals import mean_with_ends
 
 ENOUGH = 1000
 """The least number of voxels for a mean. With fewer, chance alone changes the second digit of a mean VSS: its
@@ -100,14 +101,7 @@ def _together(records: Sequence[Record], take: Callable[[MapStatistics], Estimat
     """Return the macro mean of an estimate with its interval, the units being independent."""
     estimates = [take(record.statistics) for record in records if record.statistics is not None]
     estimates = [estimate for estimate in estimates if not math.isnan(estimate.low)]
-    if not estimates:
-        return UNDEFINED
-    value = macro_mean([estimate.value for estimate in estimates])
-    below, above = (
-        math.hypot(*(end - estimate.value for end, estimate in zip(ends, estimates, strict=True))) / len(estimates)
-        for ends in ([e.low for e in estimates], [e.high for e in estimates])
-    )
-    return Estimate(value, value - below, value + above)
+    return mean_with_ends(estimates) if estimates else UNDEFINED
 
 
 def _estimate(records: Sequence[Record], take: Callable[[MapStatistics], Estimate]) -> Estimate:

@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import csv
 from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
 import numpy as np
 
-from semstab.data.digests import require_unchanged
 from semstab.data.records import Record
+from semstab.engine.series import read_names
 from semstab.report.figures.located import Located, metres
 from semstab.report.figures.maps import Overview, PlacePictures, scale_length, scale_text
 from semstab.report.html import jpeg, label_picture
@@ -25,12 +24,7 @@ END = 0.04
 
 def frame_names(record: Record) -> dict[int, str]:
     """Return the names of a unit's frames by their index, as its time series has them; no names without a file."""
-    file = record.series
-    if file is None or not file.exists():
-        return {}
-    require_unchanged(file)
-    with file.open(newline="", encoding="utf-8") as rows:
-        return {int(row["frame"]): row.get("name") or row["frame"] for row in csv.DictReader(rows)}
+    return {} if record.series is None or not record.series.exists() else read_names(record.series)
 
 
 def map_frame(located: Located) -> dict[str, Any]:

@@ -18,7 +18,7 @@ from semstab.data.events import Events
 from semstab.data.statistics import UNKNOWN, Correlogram, LagBin
 from semstab.statistics.agreement import alpha_of
 from semstab.statistics.cluster_sums import ALPHA_SUMS, MOST_GROUPS, ClusterSums, Functional, cubes_of, side_by_side
-from semstab.statistics.intervals import confidence_intervals, scope_of, spec_of
+from semstab.statistics.intervals import estimate, scope_of
 from semstab.statistics.observations import SpotObservations
 
 STANDARD = (5.0, 15.0)
@@ -96,7 +96,7 @@ def in_bins(
         by_lag.append((first, second, bins))
     sums = sums_of(by_lag, cluster, len(keys))
     columns = side_by_side(dict(zip((*ALPHA_SUMS, "square"), (1, 1, 1, K, 1), strict=True)))
-    rows, specs = [], []
+    of_axis: dict[str, tuple[LagBin, ...]] = dict.fromkeys(AXES, ())
     for k in np.flatnonzero(pairs[:-1] >= LEAST_PAIRS):
         occupied = np.flatnonzero(sums[0][k, :, 1])
         if len(np.unique(cube[occupied])) < LEAST_CUBES:
@@ -104,12 +104,9 @@ def in_bins(
         where = cubes[cube[occupied]], frames[group[occupied]]
         answers = tuple(ClusterSums(*where, of_answer[k, occupied], columns, edge, step) for of_answer in sums)
         of_bin = dataclasses.replace(answers[0], answers=answers)
-        specs.append(spec_of(of_bin, number, scope=scope_of(of_bin, key=number)))
-        rows.append((k, float(distance[k] / pairs[k]), int(pairs[k])))
-    of_axis: dict[str, tuple[LagBin, ...]] = dict.fromkeys(AXES, ())
-    for (k, lag, count), alpha in zip(rows, confidence_intervals(specs), strict=True):
+        alpha = estimate(of_bin, number, scope=scope_of(of_bin, key=number))
         axis, low, high = BINS[k]
-        of_axis[axis] += (LagBin(low, high, lag, count, alpha),)
+        of_axis[axis] += (LagBin(low, high, float(distance[k] / pairs[k]), int(pairs[k]), alpha),)
     (standard,) = of_axis.pop("standard") or (LagBin(*STANDARD, math.nan, 0, UNKNOWN),)
     return Correlogram(**of_axis, standard=standard)
 

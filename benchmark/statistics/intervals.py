@@ -4,14 +4,13 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 import numpy.typing as npt
 
 from semstab.core.types import THESE_FRAMES, THIS_SCENE, Float64, Int64, Scope
-from semstab.data.statistics import CONFIDENCE, UNKNOWN, Interval
+from semstab.data.statistics import CONFIDENCE, UNKNOWN, Estimate, HeadlineStatistics, Interval
 from semstab.statistics.agreement import ratio_of
 from semstab.statistics.cluster_sums import (
     MOST_GROUPS,
@@ -44,35 +43,6 @@ TOO_FEW = "too few frames to tell how frames differ: take {least} or more"
 NO_LOCATIONS = "no two locations were seen twice: more overlap between frames is needed"
 
 
-@dataclass(frozen=True, eq=False)
-class EstimateSpec:
-    """A number, the influences on it (None if it is undefined or all is in one cube), and its kind of interval."""
-
-    value: float
-    grid: Influences | None
-    scope: Scope
-    scale: Scale
-    bounds: tuple[float, float]
-    level: float = CONFIDENCE
-
-    @property
-    def answered(self) -> Scope:
-        """The scope of the interval: one group of frames does not show how frames differ."""
-        notes = self.grid is not None and self.grid.per_group and len(self.grid.frames) > 1
-        return self.scope if notes else THESE_FRAMES
-
-
-def confidence_intervals(specs: Iterable[EstimateSpec]) -> list[Interval]:
-    """Return the numbers with their confidence intervals."""
-    with one_thread():
-        return [
-            Interval(spec.value, math.nan, math.nan, undecided=NO_LOCATIONS, level=spec.level)
-            if spec.grid is None
-            else _answer(spec, spec.grid)
-            for spec in specs
-        ]
-
-
 def estimate(
     sums: ClusterSums,
     key: str | Functional,
@@ -82,22 +52,15 @@ def estimate(
 ) -> Interval:
     """Return a number with its interval: any functional of the sums, or one of `FUNCTIONALS` by its key; k is a class.
 
-    The scope is explained at `Interval`; where frames are unknown it is 'these frames'.
+    The scope is explained at `Interval`; if frames are unknown, or all are in one group, it is 'these frames'.
     """
-    return confidence_intervals([spec_of(sums, key, k, scope, level)])[0]
-
-
-def spec_of(
-    sums: ClusterSums,
-    key: str | Functional,
-    k: int | None = None,
-    scope: Scope = THIS_SCENE,
-    level: float = CONFIDENCE,
-) -> EstimateSpec:
-    """Return the spec of a number, see `estimate`."""
     number = functional(key, k)
-    bounds = number.low, number.high
-    return EstimateSpec(value(sums, number), influences_of(sums, number), scope, number.scale, bounds, level)
+    with one_thread():
+        result, grid = value(sums, number), influences_of(sums, number)
+        if grid is None:
+            return Interval(result, math.nan, math.nan, undecided=NO_LOCATIONS, level=level)
+        tells_frames = grid.per_group and len(grid.frames) > 1
+        return _with_interval(result, number, grid, scope if tells_frames else THESE_FRAMES, level)
 
 
 def difference(
@@ -126,17 +89,17 @@ def difference(
     one, other = influences_of(a, number), influences_of(b, number)
     if one is None or other is None:
         return Interval(result, math.nan, math.nan, undecided=NO_LOCATIONS)
-    first, second = (parts_of(sums, number)[0][0] for sums in (a, b))
-    scope = scope if first.step else THESE_FRAMES
-    paired = (not first.step or same_flight(first, second)) if same_frames is None else same_frames
+    part, of_other = (parts_of(sums, number)[0][0] for sums in (a, b))
+    scope = scope if part.step else THESE_FRAMES
+    paired = (not part.step or same_flight(part, of_other)) if same_frames is None else same_frames
     between = one.minus(other)
     with one_thread():
         spread = spread_of(between, scope) if paired else spread_of_flights(one, other, between, scope)
     half = spread.half(level)
     low, high = result - half, result + half
     if spread.variance <= TINY:
-        ends = confidence_intervals(spec_of(sums, number, scope=scope, level=level) for sums in (a, b))
-        low, high = ends[0].low - ends[1].high, ends[0].high - ends[1].low
+        first, second = (estimate(sums, number, scope=scope, level=level) for sums in (a, b))
+        low, high = first.low - second.high, first.high - second.low
     change = _interval(result, low, high, between, spread, scope, level)
     return dataclasses.replace(change, p_value=spread.p_value(result))
 
@@ -172,22 +135,22 @@ def scope_of(
     return wanted if has_enough_frames else THESE_FRAMES
 
 
-def headline_specs(sums: ClusterSums, wanted: Scope = THIS_SCENE) -> Iterator[EstimateSpec]:
-    """Yield the specs of the numbers that a verdict on a map rests on, in the order of `HeadlineStatistics`."""
-    for key in ("alpha", "psa", "vss", "accuracy", "wrong_of_consistent"):
-        yield spec_of(sums, key, scope=scope_of(sums, wanted, key))
+def headline_of(sums: ClusterSums, wanted: Scope = THIS_SCENE) -> HeadlineStatistics:
+    """Return the numbers that a verdict on a map rests on."""
+    keys = ("alpha", "psa", "vss", "accuracy", "wrong_of_consistent")
+    return HeadlineStatistics(*(estimate(sums, key, scope=scope_of(sums, wanted, key)) for key in keys))
 
 
-def _answer(spec: EstimateSpec, grid: Influences) -> Interval:
-    result, scope, level = spec.value, spec.answered, spec.level
+def _with_interval(result: float, number: Functional, grid: Influences, scope: Scope, level: float) -> Interval:
+    """Return a number with its interval in a scope, from the influences on it."""
     spread = spread_of(grid, scope)
     if math.isnan(result):
         low, high = math.nan, math.nan
-    elif spec.scale == "share":
+    elif number.scale == "share":
         low, high = _share_ends(result, spread, len(grid.cubes), level)
     else:
-        low, high = _ends(result, spread, grid.unseen(level), spec.scale, level)
-    return _interval(result, max(low, spec.bounds[0]), min(high, spec.bounds[1]), grid, spread, scope, level)
+        low, high = _ends(result, spread, grid.unseen(level), number.scale, level)
+    return _interval(result, max(low, number.low), min(high, number.high), grid, spread, scope, level)
 
 
 def influences_of(sums: ClusterSums, number: Functional) -> Influences | None:
@@ -312,11 +275,17 @@ def unpaired(a: Interval, b: Interval) -> Interval:
 
 def mean_of(result: Sequence[Interval]) -> Interval:
     """Return the mean of numbers with independent errors, such as scenes have, whose intervals have one level."""
-    n = len(result)
-    value = sum(interval.value for interval in result) / n
-    low = value - math.hypot(*(interval.value - interval.low for interval in result)) / n
-    high = value + math.hypot(*(interval.high - interval.value for interval in result)) / n
-    return result[0] if n == 1 else _combined(value, low, high, result, 1 / n)
+    mean = mean_with_ends(result)
+    return result[0] if len(result) == 1 else _combined(mean.value, mean.low, mean.high, result, 1 / len(result))
+
+
+def mean_with_ends(numbers: Sequence[Estimate]) -> Estimate:
+    """Return the mean of numbers with independent errors, and the ends of its interval (Zou and Donner 2008)."""
+    n = len(numbers)
+    value = sum(number.value for number in numbers) / n
+    low = value - math.hypot(*(number.value - number.low for number in numbers)) / n
+    high = value + math.hypot(*(number.high - number.value for number in numbers)) / n
+    return Estimate(value, low, high)
 
 
 def _combined(value: float, low: float, high: float, parts: Sequence[Interval], weight: float) -> Interval:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -36,7 +36,7 @@ from semstab.metrics.agreement import shared_rows
 from semstab.metrics.summary import STRATA, groups_of
 from semstab.statistics.accumulate import Cubes, cluster_sums_of
 from semstab.statistics.agreement import class_agreement_of, class_sums, consistency_posterior, shares_of
-from semstab.statistics.cluster_sums import ClusterSums, Functional
+from semstab.statistics.cluster_sums import ClusterSums
 from semstab.statistics.correctness import (
     MIOU,
     Predictions,
@@ -67,7 +67,7 @@ from semstab.statistics.features import feature_agreement, feature_sums, likenes
 from semstab.statistics.frame_disagreement import LoneDisagreement, by_frame, lone_disagreement, outlying_frames
 from semstab.statistics.geometry import losses
 from semstab.statistics.groupings import groupings
-from semstab.statistics.intervals import confidence_intervals, estimate, headline_specs, scope_of, spec_of
+from semstab.statistics.intervals import estimate, headline_of, scope_of
 from semstab.statistics.moving import moved_spots, moving_percent
 from semstab.statistics.observations import SpotObservations
 from semstab.statistics.ranges import range_agreement
@@ -201,38 +201,35 @@ def analyse(
     alone = spots is not None and spots.classes == OF_FEATURES.classes
     truth = None if sample.truth is None else join_truth(table, sample.truth)
     limit = sample.truth if limit is None else limit
+    true_label = None if truth is None else truth.label
 
     shares = shares_of(table)
     consistent = consistency_posterior(table, shares)
     null = expected_sbd(table, events, seed=seed)
     columns, cubes = row_columns(table, null), Cubes.of(table)
-    locations = location_sums(table, columns, cubes)
-    true_label = None if truth is None else truth.label
     sums = cluster_sums_of(
         table, events, true_label, spots=spots, sbd_excess=columns["sbd_excess"], cubes=cubes, consistent=consistent
     )
     agreement_of_features = None
     if features is not None:
         sums, agreement_of_features = _with_features(sums, features, scope, alone=alone, frame_name=frame_name)
+    locations = location_sums(table, columns, cubes)
     sample_columns, log = log_sums(sample, cubes)
-    if log is not None:
-        sample_columns["sbd_null"] = null
-    if true_label is not None:
-        sample_columns["true_label"] = true_label
+    sample_columns |= {} if log is None else {"sbd_null": null}
+    sample_columns |= {} if true_label is None else {"true_label": true_label}
 
     map_summary = sample.summary.summary(table.voxel_size, table.classes, edges)
     repeats = map_summary.means.voxels[SBD.key]
     repeated = Repeated(repeats, repeats / map_summary.voxels if map_summary.voxels else math.nan)
-    headline = HeadlineStatistics(*confidence_intervals(headline_specs(sums, scope)))
-    means = _means(locations, sums, scope)
+    headline, means = headline_of(sums, scope), _means(locations, sums, scope)
     flips = FlippingSums.of(table, consistent, cubes).flipping(table.classes)
     lone = None if spots is None else lone_disagreement(spots)
-    outlying = None if spots is None or lone is None else outlying_frames(lone, len(spots.views), name=frame_name)
-    agreement_of_spots = None if spots is None else spot_agreement(spots, sums, table, scope, critical, limits)
-    moved = None if spots is None else moved_spots(spots, sums, headline.alpha, scope, frame_name)
+    of_spots: dict[str, Any] = dict.fromkeys(OF_SPOTS)
+    if spots is not None:
+        of_spots = _of_spots(spots, sums, table, headline.alpha, lone, scope, critical, limits, frame_name)
     stability = verdict(
-        name or "model", headline=headline, spots=agreement_of_spots, flips=flips, voxels=repeats, share=repeated.share,
-        limits=limits, moved=moved, labels=not alone,
+        name or "model", headline=headline, spots=of_spots["spots"], flips=flips, voxels=repeats, share=repeated.share,
+        limits=limits, moved=of_spots["moved"], labels=not alone,
     )  # fmt: skip
     summary = MapStatistics(
         schema=SCHEMA, name=name, seed=seed, K=table.K, voxel_size=table.voxel_size,
@@ -241,24 +238,46 @@ def analyse(
         agreement=_agreement(means, class_agreement_of(class_sums(table, events), table.classes)),
         flipping=flips,
         headline=headline,
-        spots=agreement_of_spots,
-        correlogram=None if spots is None else correlogram(spots),
         drift=_drift(repeats, means, locations, log),
         uncertainty=EntropyParts(means["entropy"], means["entropy_within"], means["entropy_between"]),
         geometry=None if limit is None else losses(table, limit),
         correctness=None if truth is None else _correctness(table, truth, consistent, sums, edges, headline),
         strata=_strata(map_summary, table, columns, edges),
-        outlying_frames=outlying,
-        ranges=None if spots is None else range_agreement(spots, scope, limits),
-        groupings=None if spots is None else groupings(spots, sums, scope, limits),
-        moved=moved,
         moving_untold=moving_untold,
         features=agreement_of_features,
+        **of_spots,
     )  # fmt: skip
     if alone:
         summary, lone = _without_classes(summary), None
     moving = {} if spots is None else moving_percent(spots)
     return Analysis(summary, map_summary, sums, sample, shares, sample_columns, lone, moving)
+
+
+OF_SPOTS = ("spots", "correlogram", "outlying_frames", "ranges", "groupings", "moved")
+"""The sections of `MapStatistics` that need labels at spots."""
+
+
+def _of_spots(
+    spots: SpotObservations,
+    sums: ClusterSums,
+    table: VoxelTable,
+    alpha: Interval,
+    lone: LoneDisagreement | None,
+    scope: Scope,
+    critical: Sequence[str],
+    limits: Limits,
+    frame_name: Callable[[int], str],
+) -> dict[str, Any]:
+    """Return the sections `OF_SPOTS` by name."""
+    outlying = None if lone is None else outlying_frames(lone, len(spots.views), name=frame_name)
+    return {
+        "spots": spot_agreement(spots, sums, table, scope, critical, limits),
+        "correlogram": correlogram(spots),
+        "outlying_frames": outlying,
+        "ranges": range_agreement(spots, scope, limits),
+        "groupings": groupings(spots, sums, scope, limits),
+        "moved": moved_spots(spots, sums, alpha, scope, frame_name),
+    }
 
 
 def _with_features(
@@ -295,13 +314,8 @@ def _without_classes(summary: MapStatistics) -> MapStatistics:
 
 def _means(locations: ClusterSums, sums: ClusterSums, scope: Scope) -> dict[str, Interval]:
     """Return the means over the voxels with OP >= 2 by name, those of `OF_CLUSTERS` in the scope where they can be."""
-    of_cubes = dict(zip(MEANS, _intervals(locations, MEANS.values()), strict=True))
+    of_cubes = {name: estimate(locations, number) for name, number in MEANS.items()}
     return of_cubes | {name: estimate(sums, key, scope=scope_of(sums, scope, key)) for name, key in OF_CLUSTERS.items()}
-
-
-def _intervals(sums: ClusterSums, numbers: Iterable[Functional]) -> list[Interval]:
-    """Return numbers of the same sums with their intervals."""
-    return confidence_intervals(spec_of(sums, number) for number in numbers)
 
 
 def _agreement(means: Mapping[str, Interval], classes: tuple[ClassAgreement, ...]) -> FrameAgreement:
@@ -315,9 +329,7 @@ def _drift(
     """Return SBD and its null; without a log only for one-hot evidence, and without flips."""
     rates, (sampled, with_null) = None, (locations[name][:, 1].sum() for name in ("psa", "null"))
     if log is not None:
-        (since,) = _intervals(log, OF_CHANGES)
-        rate, null, excess = _intervals(log, OF_FLIPS)
-        rates = FlipRates(rate, null, excess, since)
+        rates = FlipRates(*(estimate(log, number) for number in (*OF_FLIPS, *OF_CHANGES)))
     return DriftStatistics(
         voxels=round(with_null / sampled * repeats) if sampled else 0,
         sbd_op2=means["sbd"],

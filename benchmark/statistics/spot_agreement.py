@@ -15,7 +15,7 @@ from semstab.data.voxels import VoxelTable
 from semstab.statistics.accumulate import sums_of_spots
 from semstab.statistics.cluster_sums import MOST_CLASSES, ClusterSums, chance_of, value
 from semstab.statistics.groupings import halves_of
-from semstab.statistics.intervals import confidence_intervals, estimate, probability_above, scope_of, spec_of
+from semstab.statistics.intervals import estimate, probability_above, scope_of
 from semstab.statistics.meaning import share_near
 from semstab.statistics.observations import SpotObservations
 from semstab.statistics.silence import silence
@@ -47,9 +47,7 @@ def spot_agreement(
     names, critical_names = sums.classes or tuple(str(k) for k in range(table.K)), set(critical) & set(sums.classes)
     locations = np.bincount(dominant(table)[table.op >= 2], minlength=table.K).tolist()
     scope_of_spots, evidence = scope_of(sums, scope), first["evidence"].sum(axis=0)
-    alphas = confidence_intervals(
-        spec_of(sums, "alpha", k, scope_of_spots) for k in range(table.K) if table.K <= MOST_CLASSES
-    )
+    alphas = [estimate(sums, "alpha", k, scope_of_spots) for k in range(table.K) if table.K <= MOST_CLASSES]
     silent = silence(spots)
     n, largest = float(first["observations"].sum()), int(evidence.argmax())
     disagreement = _disagreement(evidence / n if n else evidence, np.array([alpha.value for alpha in alphas]))

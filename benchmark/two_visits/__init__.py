@@ -10,7 +10,8 @@ from pathlib import Path
 
 import numpy as np
 
-from semstab.comparison.entries import RunHandle, open_runs
+from semstab.comparison.entries import RunHandle
+from semstab.comparison.opening import open_runs
 from semstab.core.files import only_writer
 from semstab.core.prefetch import prefetch
 from semstab.core.types import Float64

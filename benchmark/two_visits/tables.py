@@ -4,15 +4,13 @@ from __future__ import annotations
 
 import dataclasses
 import math
-import textwrap
 from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from semstab.core.console import Console
+from semstab.core.console import WIDTH, Console, wrapped
 from semstab.data.statistics import TwoVisits
 from semstab.report.tables.table import Column, Group, Row, Table, to_terminal
-from semstab.report.terminal import WIDTH
 
 if TYPE_CHECKING:
     from semstab.two_visits import VisitComparison, VisitedScene
@@ -219,8 +217,7 @@ def print_visits(
             continue
         console.print(f"\n{text.rstrip()}", highlight=False, markup=False, soft_wrap=True)
     for note in notes(comparison):
-        wrapped = textwrap.wrap(f"  {note}", console.width, subsequent_indent="    ")
-        console.print("\n".join(wrapped), highlight=False, markup=False)
+        console.print("\n".join(wrapped(note, console.width)), highlight=False, markup=False)
     more = [*([] if verbose else ["-v: all tables"]), *([] if out else ["--out DIR: report.html, tables, map"])]
     if more:
         console.print(f"  more     {'; '.join(more)}", highlight=False)

@@ -17,7 +17,8 @@ from posed_config import configure
 
 import semstab
 from semstab import Belief, relabel
-from semstab.comparison.entries import open_run, save_summary
+from semstab.comparison.opening import open_run
+from semstab.comparison.small_summary import save_summary
 from semstab.core.files import FolderLock, atomic_path, only_writer
 
 

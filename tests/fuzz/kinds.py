@@ -26,8 +26,10 @@ from rich.console import Console
 import semstab
 from semstab import AcceptanceThresholds, Events, Frame, Intrinsics, LabelSpace, VoxelTable
 from semstab.comparison.differences import contrasts
-from semstab.comparison.entries import open_run, open_runs, save_summary, shared_scenes
+from semstab.comparison.entries import shared_scenes
+from semstab.comparison.opening import open_run, open_runs
 from semstab.comparison.pairing import pair
+from semstab.comparison.small_summary import save_summary
 from semstab.configure import load_config, load_study
 from semstab.convert import convert
 from semstab.core.files import read_json

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from semstab.comparison.differences import differences_of
-from semstab.comparison.entries import models_of
+from semstab.comparison.opening import models_of
 from semstab.data.records import Result
 from semstab.report.comparison import tables as comparison_tables
 from semstab.report.tables.table import Table

@@ -3,15 +3,13 @@
 from __future__ import annotations
 
 import dataclasses
-import textwrap
 from pathlib import Path
 
-from semstab.core.console import Console
+from semstab.core.console import WIDTH, Console, wrapped
 from semstab.data.contrast import RunComparison
 from semstab.report.comparison.sentences import differences, notes
 from semstab.report.comparison.tables import ALL_SCENES, heading, tables
 from semstab.report.tables.table import Table, to_terminal
-from semstab.report.terminal import WIDTH
 from semstab.statistics.agreement import ALPHA
 
 SHOWN = {
@@ -53,11 +51,9 @@ def print_comparison(
             text = to_terminal(dataclasses.replace(fitting, caption=""), WIDTH)
             console.print(f"\n{text}", highlight=False, markup=False, soft_wrap=True)
         if table.name == "comparison":
-            legend = textwrap.wrap(f"  {LEGEND}", WIDTH, subsequent_indent="    ", break_on_hyphens=False)
-            console.print("\n".join([*legend, ""]), highlight=False, markup=False)
+            console.print("\n".join([*wrapped(LEGEND, WIDTH), ""]), highlight=False, markup=False)
     for sentence in notes(comparison):
-        wrapped = textwrap.wrap(f"  {sentence}", console.width, subsequent_indent="    ")
-        console.print("\n".join(wrapped), highlight=False, markup=False)
+        console.print("\n".join(wrapped(sentence, console.width)), highlight=False, markup=False)
     more = [
         *([] if verbose else [f"-v: {'scenes, ' if briefly else ''}classes and areas"]),
         *([] if out else ["--out DIR: report.html, tables, maps"]),

@@ -119,7 +119,7 @@ def reduced(result: Result) -> list[Table]:
 
 
 def _reduced_row(record: Record) -> Row:
-    reduced, table, statistics = record.summary.reduced, record.summary.table, record.summary.statistics
+    reduced, table, statistics = record.summary.reduced, record.summary.table, record.statistics
     if reduced is not None:
         return record.unit.scene, reduced.vss_all, reduced.vss_op3, reduced.voxel_alpha_op2
     alpha = math.nan if statistics is None else statistics.agreement.voxel_alpha_op2.value

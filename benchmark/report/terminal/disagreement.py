@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 import math
-import textwrap
 from collections.abc import Iterator, Sequence
 
+from semstab.core.console import wrapped
 from semstab.data.records import Record
 from semstab.data.statistics import short
 from semstab.metrics import macro_mean
 from semstab.report.narrative import outlying_line
-from semstab.report.terminal.layout import WIDTH, cut
+from semstab.report.terminal.layout import cut
 
 MAJORITY = 0.5
 """A class with this share of the map or more is not listed for several models: all other classes disagree with it."""
@@ -93,10 +93,4 @@ def outlying_lines(records: Sequence[Record]) -> Iterator[str]:
             continue
         scene = record.unit.scene if len({other.unit.scene for other in records}) > 1 else ""
         subject = ", ".join(name for name in (scene, record.unit.model) if name) if len(records) > 1 else ""
-        yield from textwrap.wrap(
-            outlying_line(outlying, subject),
-            WIDTH,
-            initial_indent="  ",
-            subsequent_indent="    ",
-            break_on_hyphens=False,
-        )
+        yield from wrapped(outlying_line(outlying, subject))

@@ -5,9 +5,10 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator, Sequence
 
+from semstab.core.console import wrapped
 from semstab.data.records import Record
 from semstab.data.statistics import FeatureAgreement, LagBin, metres, short
-from semstab.report.terminal.layout import percent, wrapped
+from semstab.report.terminal.layout import percent
 
 MOST_PLACES = 3
 """Most places that are told."""

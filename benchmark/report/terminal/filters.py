@@ -2,16 +2,15 @@
 
 from __future__ import annotations
 
-import textwrap
-
 from rich.console import Console
 
+from semstab.core.console import WIDTH, wrapped
 from semstab.data.records import Result
 from semstab.data.statistics import short
 from semstab.report.filter_study import advice, filter_studies
 from semstab.report.tables.filters import row as filter_row
 from semstab.report.tables.table import Cell
-from semstab.report.terminal.layout import WIDTH, number
+from semstab.report.terminal.layout import number
 
 ALPHA_DIGITS = 3
 
@@ -49,4 +48,4 @@ def print_filter_study(result: Result, console: Console) -> None:
         "Alpha rises with any memory: it recommends nothing here. 'worse': less flicker, at the pixel or"
         " the location, and labels that are right less often."
     )
-    console.print("\n".join(["", *textwrap.wrap(text, WIDTH)]), highlight=False, markup=False)
+    console.print("\n".join(["", *wrapped(text, WIDTH, begin="", hanging=0)]), highlight=False, markup=False)

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
 
+from semstab.core.console import wrapped
 from semstab.core.types import THESE_FRAMES
 from semstab.data.features import OF_FEATURES
 from semstab.data.records import Result
 from semstab.data.results import UnitSummary
 from semstab.report.narrative import noted
-from semstab.report.terminal.layout import wrapped
 from semstab.statistics.intervals import LEAST_FRAMES
 
 

@@ -5,13 +5,11 @@ from __future__ import annotations
 import itertools
 import math
 import re
-import textwrap
 from collections.abc import Iterator, Sequence
 
+from semstab.core.console import wrapped
 from semstab.data.statistics import short
 from semstab.statistics.verdict import LIMITS
-
-WIDTH = 80
 
 STABLE, USABLE = short(LIMITS.stable), short(LIMITS.usable)
 ALPHA = f"alpha: agreement of two views of a spot beyond chance; {STABLE} stable, {USABLE} usable"
@@ -94,8 +92,3 @@ def legend(*, has_truth: bool) -> Iterator[str]:
     *texts, last = (ALPHA, *COLUMNS)
     for text in (*texts, f"{last}{OVERLAP if has_truth else ''}"):
         yield from wrapped(text)
-
-
-def wrapped(text: str) -> list[str]:
-    """Return a sentence as lines of at most 80 columns, indented by two, the lines after the first by four."""
-    return textwrap.wrap(text, WIDTH, initial_indent="  ", subsequent_indent="    ", break_on_hyphens=False)

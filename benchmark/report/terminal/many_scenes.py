@@ -8,6 +8,7 @@ from collections.abc import Iterator, Sequence
 
 from scipy import special
 
+from semstab.core.console import wrapped
 from semstab.data.measures import headlines
 from semstab.data.records import Record, Result
 from semstab.data.statistics import CONFIDENCE, Estimate, short
@@ -16,7 +17,7 @@ from semstab.report.means import ENOUGH, by_model, pooled
 from semstab.report.ranking import order_of_models
 from semstab.report.terminal.disagreement import class_lines
 from semstab.report.terminal.head import head_lines
-from semstab.report.terminal.layout import common_beginning, cut, laid_out, legend, number, percent, wrapped
+from semstab.report.terminal.layout import common_beginning, cut, laid_out, legend, number, percent
 from semstab.report.terminal.several_models import miou
 
 LEAST_SCENES = 3

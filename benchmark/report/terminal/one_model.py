@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import math
-import textwrap
 from collections.abc import Iterator
 
+from semstab.core.console import wrapped
 from semstab.data.measures import measures
 from semstab.data.records import Record, Result
 from semstab.data.results import UnitSummary
@@ -16,7 +16,7 @@ from semstab.report.narrative import nearly_all
 from semstab.report.terminal.disagreement import class_lines, outlying_lines
 from semstab.report.terminal.features import features_alone
 from semstab.report.terminal.head import head_lines
-from semstab.report.terminal.layout import ALPHA, WIDTH, percent, percents, wrapped
+from semstab.report.terminal.layout import ALPHA, percent, percents
 from semstab.statistics.verdict import ADVICE, DANGEROUS, LIMITS, why_undecided
 
 MEANS = (
@@ -31,7 +31,7 @@ JUDGED = ("stable", "usable", "unstable")
 
 def one_model(result: Result, record: Record, width: int) -> Iterator[str]:
     """Yield the verdict, the shares of the map, flicker, the classes that disagree most, and the paper's means."""
-    run, statistics = record.summary, record.summary.statistics
+    run, statistics = record.summary, record.statistics
     yield from head_lines(f"{run.unit.scene} / {run.unit.model}", result, [run], width)
     if statistics is not None and statistics.features is not None and statistics.features.alone:
         yield from features_alone(statistics.features, record)
@@ -69,7 +69,7 @@ def _verdict(run: UnitSummary) -> Iterator[str]:
     yield f"  {level} {statistics.verdict.in_words}".rstrip() + f"    {name} {short(alpha.value)}{_interval(alpha)}"
     wrong = wrong_text(statistics)
     if statistics.verdict.level == "misleading":
-        yield from textwrap.wrap(wrong, WIDTH, initial_indent="  ", subsequent_indent="  ")
+        yield from wrapped(wrong, hanging=2)
     elif statistics.verdict.level == "uninformative" and statistics.spots is not None:
         share, name = nearly_all(statistics.spots.largest_share), statistics.spots.largest_class
         yield f"  {share} of the observations are {name}: agreement does not assess such a map"

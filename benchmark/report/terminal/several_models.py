@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator, Sequence
 
+from semstab.core.console import wrapped
 from semstab.data.measures import headlines
 from semstab.data.records import Record, Result
 from semstab.data.statistics import UNDEFINED, short
@@ -14,7 +15,7 @@ from semstab.report.means import ENOUGH
 from semstab.report.ranking import order_of_models
 from semstab.report.terminal.disagreement import class_lines, outlying_lines
 from semstab.report.terminal.head import head_lines
-from semstab.report.terminal.layout import common_beginning, cut, laid_out, legend, number, percent, percents, wrapped
+from semstab.report.terminal.layout import common_beginning, cut, laid_out, legend, number, percent, percents
 from semstab.report.terminal.one_model import share_of_wrong
 from semstab.statistics.verdict import DANGEROUS
 
@@ -28,7 +29,7 @@ def columns() -> list[tuple[str, str]]:
 
 def row_of(record: Record, begin: str = "") -> list[str]:
     """Return a model's row under `columns`, its name without a beginning."""
-    run, statistics = record.summary, record.summary.statistics
+    run, statistics = record.summary, record.statistics
     level, alpha, agree = "-", "", math.nan
     if statistics is not None:
         level, alpha = str(statistics.verdict), statistics.headline.alpha.text()
@@ -45,7 +46,7 @@ def row_of(record: Record, begin: str = "") -> list[str]:
 
 def miou(record: Record) -> float:
     """Return the mIoU of the fused labels seen twice or more; NaN without ground truth."""
-    statistics = record.summary.statistics
+    statistics = record.statistics
     return math.nan if statistics is None or statistics.correctness is None else statistics.correctness.miou_op2.value
 
 
@@ -88,7 +89,7 @@ def several_models(result: Result, records: Sequence[Record], width: int) -> Ite
     if len(told) < len(records):
         yield from wrapped("what each change of names does: semstab-bench show RUN prompts")
     for record in told:
-        statistics = record.summary.statistics
+        statistics = record.statistics
         if statistics is None:
             continue
         ranges = "" if statistics.told_ranges is None else statistics.told_ranges.text

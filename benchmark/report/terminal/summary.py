@@ -9,6 +9,7 @@ from pathlib import Path
 from rich.console import Console
 
 from semstab.backends import is_builtin
+from semstab.core.console import WIDTH, wrapped
 from semstab.data.records import Result
 from semstab.data.results import Agreement
 from semstab.data.statistics import CONFIDENCE
@@ -20,7 +21,6 @@ from semstab.report.tables import tables
 from semstab.report.tables.backends import largest_share, one_in
 from semstab.report.tables.table import to_terminal
 from semstab.report.terminal.filters import print_filter_study
-from semstab.report.terminal.layout import WIDTH, wrapped
 from semstab.report.terminal.many_scenes import many_scenes
 from semstab.report.terminal.one_model import one_model
 from semstab.report.terminal.several_models import several_models

@@ -4,12 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 
+from semstab.core.console import wrapped
 from semstab.data.records import Record, Result
 from semstab.metrics.image_space import mean_over_scenes
 from semstab.report.means import by_model
 from semstab.report.ranking import least_flicker_first, order_of_models
 from semstab.report.terminal.disagreement import outlying_lines
-from semstab.report.terminal.layout import laid_out, number, wrapped
+from semstab.report.terminal.layout import laid_out, number
 
 HEADS = ("", "flicker %", "pixel flicker %", "co-visible %", "VC8", "VC16")
 
