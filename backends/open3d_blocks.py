@@ -24,7 +24,7 @@ from semstab.core.types import Int64
 from semstab.data.evidence import Evidence
 from semstab.data.frames import Frame
 from semstab.data.results import Changes, FrameReport
-from semstab.data.voxels import Extent, VoxelTable, index_columns
+from semstab.data.voxels import Extent, VoxelTable, in_order, index_columns
 from semstab.errors import ConfigError
 
 INITIAL_BYTES = 32 * 2**20
@@ -132,7 +132,7 @@ class Open3DBlocks(FusionBackend):
         rows = (blocks[:, None] * voxels_a_block + np.arange(voxels_a_block)).ravel()
         rows = rows[self._read("op", rows) > 0]
         index = self._index_of(rows)
-        order = np.lexsort(index.T[::-1])
+        order = in_order(index_columns(index))
         rows = rows[order]
         columns = [name for name in self.attributes if name not in DENSE]
         values: dict[str, Any] = {name: self._read(name, rows) for name in columns}
@@ -208,7 +208,11 @@ class Open3DBlocks(FusionBackend):
         return values.reshape((-1, values.shape[-1]))
 
     def _read(self, name: str, rows: Int64) -> npt.NDArray[Any]:
-        values: npt.NDArray[Any] = self._attribute(name)[self._tensor(rows)].cpu().numpy()
+        attribute = self._attribute(name)
+        # numpy takes a tenth of the time of Open3D's indices
+        values: npt.NDArray[Any] = (
+            attribute.numpy()[rows] if self.in_place else attribute[self._tensor(rows)].cpu().numpy()
+        )
         return values if name in DENSE else values[:, 0]
 
     def _write(self, name: str, rows: Int64, values: npt.NDArray[Any]) -> None:

@@ -112,8 +112,15 @@ def index_columns(index: npt.NDArray[np.integer[Any]]) -> dict[str, Any]:
 
 def in_order(index: Mapping[str, npt.NDArray[Any]]) -> Int64:
     """Return the order of voxels by ix, iy, iz."""
-    order: Int64 = np.lexsort([index[name] for name in reversed(INDEX)])
-    return order
+    columns = [index[name].astype(np.int64) for name in INDEX]
+    if not len(columns[0]):
+        return np.zeros(0, np.int64)
+    x, y, z = (column - column.min() for column in columns)
+    width, height = int(y.max()) + 1, int(z.max()) + 1
+    if (int(x.max()) + 1) * width * height >= 2**63:
+        order: Int64 = np.lexsort(columns[::-1])
+        return order
+    return np.argsort((x * width + y) * height + z, kind="stable")
 
 
 def require_memory(path: Path, files: Sequence[Path]) -> None:

@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 
-from semstab.backends import FusionBackend, create, is_builtin, takes_option
+from semstab.backends import FusionBackend, create, is_builtin, takes_option, truth_backend
 from semstab.backends.numpy_reference import NumpySample
 from semstab.config import Config
 from semstab.core.arrays import GrowingRows
@@ -92,7 +92,7 @@ class LiveMap:
         if work.fuses:
             live.backend = live.new_map()
             if unit.compares_truth and truth_task(task) is not None:
-                live.truth = live.new_map(log=False, by_rule=False)
+                live.truth = live.new_truth_map()
             if unit.sampled:
                 all_voxels = not is_builtin(config.backends[0].name)
                 ruled = config.backends[0].ruled
@@ -121,6 +121,14 @@ class LiveMap:
         keeps_history = log and (config.events or config.statistics) and takes_option(backend.name, "history")
         options = ({"history": True} if keeps_history else {}) | backend.options
         return create(backend.name, voxel_size=config.voxel_size, num_classes=K, within=self.work.within, **options)
+
+    def new_truth_map(self) -> FusionBackend:
+        """Return an empty map for the ground truth: of `numba`, the fastest, where it has the backend's voxels."""
+        name = truth_backend(self.config.backends[0].name)
+        if name != self.config.backends[0].name:
+            size, K = self.config.voxel_size, len(self.task.mapping.target)
+            return create(name, voxel_size=size, num_classes=K, within=self.work.within)
+        return self.new_map(log=False, by_rule=False)
 
     def warm_up(self, frame: Frame) -> None:
         """Let the backend load and compile what it needs for such frames, once a process: no frame is timed with it."""

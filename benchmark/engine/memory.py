@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
-from semstab.backends import expected_bytes, is_builtin
+from semstab.backends import expected_bytes, is_builtin, truth_backend
 from semstab.backends.numpy_reference import MOST_OF_ALL, ONE_IN
 from semstab.config import Config
 from semstab.core.prefetch import default_threads
@@ -50,7 +50,8 @@ class MapMemory:
         """Return the bytes of a map, of that of the ground truth or of reduced scores, and of the reference."""
         n, num_observations = int(voxels), int(observations)
         total = expected_bytes(self.backend, n, num_observations, self.K, soft=self.soft)
-        total += (self.compared + self.soft) * expected_bytes(self.backend, n, num_observations, self.K)
+        total += self.compared * expected_bytes(truth_backend(self.backend), n, num_observations, self.K)
+        total += self.soft * expected_bytes(self.backend, n, num_observations, self.K)
         if is_builtin(self.backend):
             return total + self.sampled * expected_bytes("numpy", n // ONE_IN, 0, self.K)
         reference_voxels = min(n, MOST_OF_ALL)

@@ -28,19 +28,16 @@ def voxel_keys(*indices: npt.NDArray[np.integer]) -> list[Int64]:
     Raises:
         DataError: If the voxels span more than 2^63 cells together.
     """
-    filled = [index for index in indices if len(index)]
+    columns = [np.ascontiguousarray(index.T, dtype=np.int64) for index in indices]
+    filled = [column for column in columns if column.size]
     if not filled:
         return [np.zeros(0, dtype=np.int64) for _ in indices]
-    low = np.min([index.min(axis=0) for index in filled], axis=0).astype(np.int64)
-    high = np.max([index.max(axis=0) for index in filled], axis=0).astype(np.int64)
+    low = np.min([column.min(axis=1) for column in filled], axis=0)
+    high = np.max([column.max(axis=1) for column in filled], axis=0)
     size = [int(n) for n in high - low + 1]
     if math.prod(size) >= 2**63:
         raise DataError(f"the maps span {' x '.join(map(str, size))} voxels; leave out far depth, or use larger voxels")
-    keys = []
-    for index in indices:
-        x, y, z = (index.astype(np.int64) - low).T
-        keys.append((x * size[1] + y) * size[2] + z)
-    return keys
+    return [((x - low[0]) * size[1] + (y - low[1])) * size[2] + (z - low[2]) for x, y, z in columns]
 
 
 def shared_rows(*tables: VoxelTable) -> list[Int64]:

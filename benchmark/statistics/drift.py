@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from semstab.core.types import Float64, Int64, UInt64
+from semstab.core.types import Float64, UInt64
 from semstab.data.events import Events
 from semstab.data.measures import Quantity
 from semstab.data.voxels import VoxelTable
@@ -84,12 +84,6 @@ def flips(events: Events) -> Flips:
     with np.errstate(invalid="ignore", divide="ignore"):
         pairs = T * (T - 1) / 2
         return Flips(np.where(T > 1, changes / (T - 1), np.nan), np.where(T > 1, (pairs - same) / pairs, np.nan), since)
-
-
-def lowest(numbers: UInt64, count: int) -> Int64:
-    """Return the rows of the lowest `count` of numbers (n,), ascending."""
-    few = np.argpartition(numbers, count)[:count] if count < len(numbers) else np.arange(len(numbers))
-    return few[np.argsort(numbers[few])]
 
 
 def streams(table: VoxelTable, rows: Any, seed: int) -> UInt64:
