@@ -120,7 +120,7 @@ def png(image: UInt8, palette: UInt8 | None = None) -> str:
     if palette is not None:
         made = made.convert("P")
         made.putpalette(np.ascontiguousarray(palette[:256]).tobytes())
-    made.save(data, "PNG", optimize=palette is not None)
+    made.save(data, "PNG")
     return _url(data.getvalue(), "png")
 
 
