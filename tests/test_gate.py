@@ -538,9 +538,8 @@ def test_a_change_of_alpha_is_what_a_comparison_says_of_the_same_runs(run, quiet
     assert re.fullmatch(r"wall: the run gives no label to 1\d\.\d% of the pixels .* disagree", text)
     said = " ".join(cli("compare", base, new).output.split())
     assert f"alpha {short(found.other, digits=3)} against {short(found.base, digits=3)}" in said
-    assert (
-        f"{found.base:.3f} to {found.other:.3f}, drop" in cli("gate", new, "--against", base, "--rule", rules[0]).output
-    )
+    change = f"{short(found.base, digits=3)} to {short(found.other, digits=3)}, drop"
+    assert change in cli("gate", new, "--against", base, "--rule", rules[0]).output
     cli("gate", base, "--save-baseline", str(small := tmp_path / "base.semstab"))
     (own,) = gate(new, small, gate_config(rules=rules[:1])).judgements  # a small summary has no observations
     assert (own.base, own.new) == (kept["base"].headline.alpha.value, kept["new"].headline.alpha.value)

@@ -19,6 +19,7 @@ from semstab.config import nearest
 from semstab.core.types import OTHER_SCENES, THESE_FRAMES, THIS_SCENE, Scope
 from semstab.data.measures import Measure
 from semstab.data.statistics import ORDER_KNOWN, Interval
+from semstab.data.statistics.intervals import short
 from semstab.errors import ConfigError, DataError
 from semstab.gating.result import Judgement, negative, verdict
 from semstab.gating.rules import Rule
@@ -263,8 +264,8 @@ def silence_notes(rule: Rule, pairs: Sequence[Pair]) -> list[str]:
         return []
     return [
         f"{new.summary.unit.scene}: the run gives no label in {1 - new.pairs.share:.1%} of the pairs of views, which"
-        f" count as disagreeing: alpha is {value_of(rule, new):.3f}, and {value(new.sums, ALPHA.key):.3f} of what it"
-        " labels"
+        f" count as disagreeing: alpha is {short(value_of(rule, new), digits=3)}, and"
+        f" {short(value(new.sums, ALPHA.key), digits=3)} of what it labels"
         for new, _ in pairs
         if 1 - new.pairs.share >= LEAST_LEFT_OUT
     ]

@@ -11,6 +11,7 @@ from typing import Literal
 from semstab.comparison.quantities import COVERAGE
 from semstab.core.types import THESE_FRAMES, Scope
 from semstab.data.statistics import Interval
+from semstab.data.statistics.intervals import without_zero
 from semstab.gating.rules import GateMeasure, Rule
 from semstab.statistics.intervals import LEAST_FRAMES, standard_error
 
@@ -124,11 +125,11 @@ class Judgement:
     def digits(self, value: float) -> str:
         """Return a number of the rule's measure."""
         measure: GateMeasure = self.rule.measure
-        return "-" if math.isnan(value) else f"{value:z.{measure.quantity.digits[0]}f}"
+        return "-" if math.isnan(value) else without_zero(f"{value:z.{measure.quantity.digits[0]}f}")
 
     @property
     def values(self) -> str:
-        """The numbers with their population: 'OP>=3: 0.481 to 0.462, drop 0.019 [0.012, 0.026]'."""
+        """The numbers with their population: 'OP>=3: .481 to .462, drop .019 [.012, .026]'."""
         population = self.rule.measure.quantity.population
         return f"{population}: {self._numbers}" if population else self._numbers
 
