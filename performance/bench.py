@@ -19,6 +19,7 @@ CASES = {
     "fusion": "timed.fusion",
     "random-scenes": "timed.random_scenes",
     "scores": "timed.scores",
+    "by-hand": "timed.by_hand",
     "scans": "timed.scans",
     "rivals": "timed.rivals",
     "gpu": "timed.gpu",

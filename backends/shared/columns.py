@@ -6,14 +6,11 @@ from typing import Any
 
 import numba as nb
 import numpy as np
-from llvmlite import ir
-from numba.core import types
-from numba.extending import intrinsic
 
 from semstab.backends.shared.beliefs import observe_few
 from semstab.backends.shared.keys import PARTITIONS, mix
 from semstab.backends.shared.observations import BeliefChange, Change, Observed
-from semstab.backends.shared.pixel_keys import AHEAD, touch
+from semstab.backends.shared.pixel_keys import AHEAD, bits_of, touch
 from semstab.backends.shared.score_loops import LANES
 from semstab.core.compiled import compiled, parallel, serial
 from semstab.core.types import Int32, Int64
@@ -28,11 +25,10 @@ def mask_words(num_classes: int) -> int:
     return -(-num_classes // WORD)
 
 
-@intrinsic
-def _lowest(_typing: Any, _mask: Any) -> Any:
-    """Return the position of the lowest bit of an int64 that is not 0."""
-    signature = types.int64(types.int64)
-    return signature, lambda _, builder, __, arguments: builder.cttz(arguments[0], ir.Constant(ir.IntType(1), 1))
+@compiled(forceinline=True)
+def lowest_bit(mask):
+    """Return the position of the lowest bit of an int64 that is not 0: the exponent of that bit as a double."""
+    return ((bits_of(np.float64(mask & -mask)) >> 52) & 0x7FF) - 1023
 
 
 def update_rows(rows: Int64, seen: Observed, frame: int, **columns: Any) -> tuple[Change, BeliefChange]:
@@ -64,7 +60,7 @@ def _touch_evidence(flat, masks, r, K, words, label, first, end):
     for word in range(words):
         left = masks[r * words + word]
         while left != 0:
-            touch(flat, r * K + word * WORD + _lowest(left))
+            touch(flat, r * K + word * WORD + lowest_bit(left))
             left &= left - 1
 
 
@@ -81,7 +77,7 @@ def _observe_classes(evidence, classes, s, few, of, op, out):
     for word in range(classes.shape[0]):
         left = classes[word]
         while left != 0:
-            k = word * WORD + _lowest(left)
+            k = word * WORD + lowest_bit(left)
             left &= left - 1
             some[n], shares[n], of[n] = evidence[k], s[k], k
             s[k] = 0.0

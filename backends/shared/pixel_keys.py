@@ -10,7 +10,7 @@ from numba.core import cgutils, types
 from numba.extending import intrinsic
 
 from semstab.backends.shared.keys import HALF
-from semstab.core.compiled import serial
+from semstab.core.compiled import compiled, serial
 from semstab.core.types import Int64, Mask
 from semstab.data.frames import Frame
 
@@ -189,7 +189,7 @@ def ask_for(builder: Any, pointer: Any) -> None:
 # Doubles as the integers of the same bits, in compiled loops.
 
 
-@intrinsic
-def bits_of(_typing: Any, _value: Any) -> Any:
+@compiled(forceinline=True)
+def bits_of(value):
     """Return the bits of a double as int64; the bits of non-negative numbers sort like the numbers."""
-    return types.int64(types.float64), lambda _, builder, __, arguments: builder.bitcast(arguments[0], ir.IntType(64))
+    return np.float64(value).view(np.int64)
