@@ -123,7 +123,7 @@ class LiveMap:
         return create(backend.name, voxel_size=config.voxel_size, num_classes=K, within=self.work.within, **options)
 
     def new_truth_map(self) -> FusionBackend:
-        """Return an empty map for the ground truth: of `numba`, the fastest, where it has the backend's voxels."""
+        """Return an empty map for the ground truth: of the fastest backend with the same voxels."""
         name = truth_backend(self.config.backends[0].name)
         if name != self.config.backends[0].name:
             size, K = self.config.voxel_size, len(self.task.mapping.target)

@@ -71,7 +71,7 @@ def measured(
 def main(
     scenes_: int = 20,
     seed: int = 0,
-    percent: tuple[float, ...] = (0.0, 0.05, 0.3, 1.0),
+    percent: tuple[float, ...] = (0.0, 0.3, 1.0),
     voxels: tuple[float, ...] = (0.25, 0.75, 2.0),
     sizes: tuple[str, ...] = tuple(f"{w}x{h}" for w, h in scenes.SIZES),
     backends: tuple[str, ...] = ("numba", "open3d"),
