@@ -221,14 +221,6 @@ def is_pointwise(name: str) -> bool:
     return bool(getattr(_load(name), "pointwise", True))
 
 
-def truth_backend(name: str) -> str:
-    """Return the backend that fuses the ground truth for maps of a backend.
-
-    That is the fastest of the built-in ones with the same voxels, which the reference holds to be equal.
-    """
-    return "numba" if is_builtin(name) and is_pointwise(name) else name
-
-
 def takes_option(name: str, option: str) -> bool:
     """Return whether the backend of that name has such an option, for example 'device'."""
     return option in _options(_load(name))

@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 
-from semstab.backends import FusionBackend, create, is_builtin, takes_option, truth_backend
+from semstab.backends import FusionBackend, create, is_builtin, takes_option
 from semstab.backends.numpy_reference import NumpySample
 from semstab.config import Config
 from semstab.core.arrays import GrowingRows
@@ -26,6 +26,7 @@ from semstab.data.features import OF_FEATURES
 from semstab.data.frames import Frame
 from semstab.data.results import FrameReport, UnitName
 from semstab.datasets import Scene
+from semstab.engine.memory import truth_backend
 from semstab.engine.observer import Observers
 from semstab.engine.series import FrameRow, Series
 from semstab.engine.tiles import tiles_met
