@@ -20,6 +20,7 @@ from semstab import Features
 from semstab.comparison.differences import sums_difference
 from semstab.core.files import write_image
 from semstab.data.features import FeatureColours
+from semstab.data.statistics.intervals import short
 from semstab.errors import DataError
 from semstab.online.metric import TemporalStability
 from semstab.statistics import Sampler
@@ -516,7 +517,7 @@ def test_a_gate_judges_alpha_of_features(runs_of_features):
     alpha = semstab.load_result(runs_of_features / "base").record().statistics.features.alpha
     passed = bench("gate", "base", "--rule", f"alpha of features > {alpha.low - 0.02:.3f}", cwd=runs_of_features)
     assert "the gate passes" in passed.stdout
-    assert f"{alpha.value:.3f} [" in passed.stdout
+    assert f"{short(alpha.value, digits=3)} [" in passed.stdout
     failed = bench("gate", "base", "--rule", f"feature_alpha > {alpha.high + 0.02:.3f}", cwd=runs_of_features, code=4)
     assert "the gate fails" in failed.stdout
     rule = "alpha of features drop < .02"

@@ -102,7 +102,7 @@ def gate(new: str | os.PathLike[str], against: str | os.PathLike[str] | None, co
     Examples:
         >>> semstab.gate("run:sim-steady", None, semstab.GateConfig(rules=("alpha > 0.6",)))
         <GateResult: passes; sim-steady (run) on scene0>
-          passes: alpha > 0.6: 0.8...
+          passes: alpha > 0.6: .8...
     """
     parsed = [parse(text) for text in config.rules]
     of_features = all(rule.measure.quantity is FEATURE_ALPHA for rule in parsed)

@@ -78,7 +78,7 @@ class Judgement:
 
     @property
     def stated(self) -> str:
-        """The verdict, the rule and its numbers: 'passes: alpha > .6: 0.933 [0.920, 0.944]'."""
+        """The verdict, the rule and its numbers: 'passes: alpha > 0.6: .933 [.920, .944]'."""
         return f"{self.verdict}: {self.rule.text}: {self.values}"
 
     @property
