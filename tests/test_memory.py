@@ -170,3 +170,11 @@ def test_room_that_is_not_written_to_takes_no_memory() -> None:
     room[:: 1 << 18] = 1  # every 2 MB
     assert room[1 << 18] == 1
     assert resident_bytes() - before < 32e6
+
+
+@pytest.mark.parametrize(
+    ("backend", "of_truth"),
+    [("open3d", "numba"), ("numba+bayes", "numba"), ("numpy", "numpy"), ("open3d-projective", "open3d-projective")],
+)
+def test_ground_truth_is_fused_by_the_fastest_backend_with_the_same_voxels_and_reach(backend, of_truth):
+    assert memory.truth_backend(backend) == of_truth

@@ -187,7 +187,8 @@ class LiveMap:
         with watch("reference"):
             reference.integrate(frame, self._seconds)
 
-    def _add_to_sample(self, sampler: Sampler, frame: Frame, watch: Stopwatch) -> None:
+    @staticmethod
+    def _add_to_sample(sampler: Sampler, frame: Frame, watch: Stopwatch) -> None:
         with watch("sample"):
             sampler.add(frame)
 

@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
-from semstab.backends import expected_bytes, is_builtin, is_pointwise
+from semstab.backends import by_own_rule, expected_bytes, is_builtin, is_pointwise
 from semstab.backends.numpy_reference import MOST_OF_ALL, ONE_IN
 from semstab.config import Config
 from semstab.core.prefetch import default_threads
@@ -13,9 +12,6 @@ from semstab.core.process import available_bytes
 from semstab.data.evidence import STRETCH_ENTRIES
 from semstab.data.frames import Frame
 from semstab.statistics.sample import MOST_VOXELS
-
-if TYPE_CHECKING:
-    pass
 
 GB = 1e9
 
@@ -29,9 +25,11 @@ FRAMES_AT_WORK = 3
 def truth_backend(name: str) -> str:
     """Return the backend that fuses the ground truth for maps of a backend.
 
-    That is the fastest of the built-in ones with the same voxels, which the reference holds to be equal.
+    That is the fastest of the built-in ones with the same voxels, which the reference holds to be equal; but maps of
+    `numpy` reach farther than those of the others.
     """
-    return "numba" if is_builtin(name) and is_pointwise(name) else name
+    same_voxels = is_builtin(name) and is_pointwise(name) and by_own_rule(name) != "numpy"
+    return "numba" if same_voxels else name
 
 
 @dataclass(frozen=True)
