@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from semstab.statistics.loops.spots import MOST_PLACES, number_of
+from semstab.statistics.loops.new_spots import MOST_PLACES, number_of
 
 
 def test_the_number_of_places_in_a_block_is_bounded():

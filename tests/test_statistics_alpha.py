@@ -27,7 +27,7 @@ from semstab.statistics import Sampler, SpotObservations, Views, describe, disag
 from semstab.statistics.accumulate import sums_of_spots
 from semstab.statistics.cluster_sums import lever_of, value
 from semstab.statistics.intervals import estimate
-from semstab.statistics.loops.spots import hash_cell
+from semstab.statistics.loops.cells import hash_cell
 from semstab.statistics.observations import COLUMNS
 
 DATA = Path(os.environ.get("SEMSTAB_DATA", Path(__file__).parents[2] / "shared/data"))

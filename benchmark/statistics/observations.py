@@ -249,7 +249,7 @@ class SpotObservations:
 
     def _log(self, label: UInt16, square: Float32 | None = None) -> tuple[Events, Float64]:
         """Return a log of these labels, and (m,) squared distances."""
-        from semstab.statistics.loops.spots import observe
+        from semstab.statistics.loops.answers import observe
 
         index, _, rows, number = self._by_voxel
         view, n = self.view[rows], len(rows)
@@ -348,7 +348,7 @@ class SpotObservations:
 
 def cells_of(point: Float64, edge: float) -> Int64:
     """Return the coarse cells (n, 3) of points (n, 3)."""
-    from semstab.statistics.loops.spots import PHASE
+    from semstab.statistics.loops.cells import PHASE
 
     return np.floor(point / edge + PHASE).astype(np.int64)
 

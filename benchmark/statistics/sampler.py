@@ -231,7 +231,7 @@ class Sampler:
 
     def _find(self, frame: Frame, T: Float64, seed: int) -> None:
         """Add spots in an image with dense depth."""
-        from semstab.statistics.loops.spots import new_in_image
+        from semstab.statistics.loops.new_spots import new_in_image
 
         (H, W), stride = frame.shape, _stride(frame.shape)
         blocks = -(-H // stride) * -(-W // stride)
@@ -286,7 +286,7 @@ class Sampler:
 
     def _rebuilt(self, size: int) -> Int64:
         """Return a table of the coarse cells of all spots."""
-        from semstab.statistics.loops.spots import fill
+        from semstab.statistics.loops.cells import fill
 
         table = np.full(size, -1, np.int64)
         fill(self._point[: self._spots], self._edge, self._low, table)
@@ -310,7 +310,7 @@ class Sampler:
             self._errors.append(float(np.median(deviations)) / 0.6745)
 
     def _answers_of_image(self, frame: Frame, T: Float64, seed: int) -> tuple[Any, ...]:
-        from semstab.statistics.loops.spots import answer, project
+        from semstab.statistics.loops.answers import answer, project
 
         n, camera = self._spots, _camera(frame)
         spot, pixel, (x, y, error, room) = np.empty(n, np.int32), np.empty(n, np.int64), np.empty((4, n))
@@ -472,7 +472,7 @@ def _stride(shape: tuple[int, int]) -> int:
 def _width(frame: Frame, sparse: Sparse | None, allowed: float) -> float:
     """Return the edge, metres, of a square as large as the mean area that a block of pixels, or a point, shows."""
     from semstab.statistics.loops.sparse import mean_area_of_points
-    from semstab.statistics.loops.spots import mean_area
+    from semstab.statistics.loops.surface import mean_area
 
     if sparse is not None:
         place = sparse.camera, sparse.around, sparse.reach, sparse.apart(min(len(sparse.w), LOOKED_AT))
@@ -483,7 +483,7 @@ def _width(frame: Frame, sparse: Sparse | None, allowed: float) -> float:
 
 def _noise(frame: Frame) -> float:
     """Return the noise of a frame's depth, relative, by which one pixel differs from the next ones."""
-    from semstab.statistics.loops.spots import second_differences
+    from semstab.statistics.loops.surface import second_differences
 
     stride = 2 * _stride(frame.shape)
     differences = np.empty((frame.shape[0] // stride + 1) * (frame.shape[1] // stride + 1))

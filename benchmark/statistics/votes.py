@@ -111,8 +111,7 @@ class KeptDepth:
 
         stride = max(1, round(math.sqrt(depth.size / BLOCKS)))
         near, far = np.empty((2, depth.shape[0] // stride, depth.shape[1] // stride), np.uint16)
-        low, high = np.empty((2, depth.shape[1]), depth.dtype)
-        blocks_of_image(depth, stride, low, high, np.empty(depth.shape[1], np.bool_), near, far)
+        blocks_of_image(depth, stride, *np.empty((3, depth.shape[1]), depth.dtype), near, far)
         return cls(view, T_wc, camera, False, float(stride), AROUND, near, far)
 
     @classmethod

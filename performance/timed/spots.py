@@ -27,7 +27,7 @@ from semstab.backends import create
 from semstab.data.frames import Frame
 from semstab.statistics import Sampler
 from semstab.statistics import sampler as sampling
-from semstab.statistics.loops import spots as loops
+from semstab.statistics.loops import answers as loops
 
 PARTS: dict[str, tuple[Any, str]] = {
     "is depth sparse": (sampling, "_sparse"),

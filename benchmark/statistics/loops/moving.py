@@ -8,7 +8,7 @@ from __future__ import annotations
 import numpy as np
 
 from semstab.core.compiled import serial
-from semstab.statistics.loops.spots import in_sensor, inverse
+from semstab.statistics.loops.surface import in_sensor, inverse
 
 STEP, LOWEST = 0.0006, -7.0
 """Step of a code in the logarithm of depth, and the logarithm, of metres, of code 1: from a millimetre to 300 km."""
@@ -30,30 +30,46 @@ def code_of(depth):
 
 
 @serial
-def blocks_of_image(depth, stride, low, high, hole, near, far):
+def take_extremes(rows, nearest, farthest, most):
+    """Take the nearest and the farthest depth of each column of four rows, and `most`: the same, endless at a hole."""
+    first, second, third, fourth = rows
+    endless, none = nearest.dtype.type(np.inf), nearest.dtype.type(0.0)
+    for a in range(len(nearest)):
+        p = first[a] if first[a] > none else endless
+        q = second[a] if second[a] > none else endless
+        r = third[a] if third[a] > none else endless
+        s = fourth[a] if fourth[a] > none else endless
+        nearest[a] = min(nearest[a], p, q, r, s)
+        most[a] = max(most[a], p, q, r, s)
+        p, q = p if p < endless else none, q if q < endless else none
+        r, s = r if r < endless else none, s if s < endless else none
+        farthest[a] = max(farthest[a], p, q, r, s)
+
+
+@serial
+def blocks_of_image(depth, stride, low, high, most, near, far):
     """Write the codes of the nearest and the farthest depth in blocks of stride x stride pixels.
 
-    Blocks that the image's edge cuts are left out; a pixel without valid depth makes a hole. low, high, hole (W,) are
-    room for the extremes of columns, so that rows are read one after the other.
+    Blocks that the image's edge cuts are left out; a pixel without valid depth makes a hole. low, high, most (W,) are
+    room for the extremes of columns, so that rows are read one after the other, four at once.
     """
     none, endless = depth.dtype.type(0.0), depth.dtype.type(np.inf)
+    width = near.shape[1] * stride
     for row in range(near.shape[0]):
-        low[:], high[:], hole[:] = endless, none, False
-        for b in range(row * stride, (row + 1) * stride):
-            for a in range(near.shape[1] * stride):
-                d = depth[b, a]
-                low[a] = min(low[a], d if d > none else endless)
-                high[a] = max(high[a], d if d < endless else none)
-                hole[a] |= not (none < d < endless)
+        low[:], high[:], most[:] = endless, none, none
+        top, last = row * stride, (row + 1) * stride - 1
+        for b in range(top, last + 1, 4):
+            rows = depth[b], depth[min(b + 1, last)], depth[min(b + 2, last)], depth[min(b + 3, last)]
+            take_extremes(rows, low[:width], high[:width], most[:width])
         for column in range(near.shape[1]):
-            nearest, farthest, holes = endless, none, False
+            nearest, farthest, farthest_or_hole = endless, none, none
             for a in range(column * stride, (column + 1) * stride):
                 nearest, farthest = min(nearest, low[a]), max(farthest, high[a])
-                holes |= hole[a]
+                farthest_or_hole = max(farthest_or_hole, most[a])
             near[row, column] = far[row, column] = 0
             if none < farthest and nearest < endless:
                 near[row, column], far[row, column] = code_of(np.float64(nearest)), code_of(np.float64(farthest))
-            if holes:
+            if farthest_or_hole == endless:
                 near[row, column] |= HOLE
 
 

@@ -5,21 +5,10 @@ from __future__ import annotations
 import numpy as np
 
 from semstab.core.compiled import serial
-from semstab.statistics.loops.spots import (
-    STEEPEST,
-    add_spot,
-    area,
-    aside,
-    first_side,
-    fraction,
-    in_sensor,
-    in_world,
-    mixed,
-    number_of,
-    own_label,
-    squared,
-    two_labels,
-)
+from semstab.statistics.loops.answers import aside, first_side, own_label, squared, two_labels
+from semstab.statistics.loops.cells import add_spot, fraction, mixed
+from semstab.statistics.loops.new_spots import number_of
+from semstab.statistics.loops.surface import STEEPEST, area, in_sensor, in_world
 
 ON_A_PLANE = 0.03
 """Sparse points lie on a plane if it leaves at most this over of their inverse depth, relative."""
