@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any, TypeVar, Union, cast, get_args, get_origi
 import numpy as np
 import numpy.typing as npt
 
-from semstab.core.types import Float64
+from semstab.core.types import Float64, Int64
 
 if TYPE_CHECKING:
     import pyarrow as pa
@@ -21,6 +21,9 @@ if TYPE_CHECKING:
 T = TypeVar("T")
 A = TypeVar("A", bound="npt.NDArray[Any]")
 Arrays = dict[str, npt.NDArray[Any]]
+
+COUNTED = 2
+"""See `distinct_keys`."""
 
 
 def to_arrays(value: Any, name: str = "") -> Arrays:
@@ -156,3 +159,16 @@ def values_of(column: pa.ChunkedArray) -> npt.NDArray[Any]:
 def evenly(length: int, count: int) -> list[int]:
     """Return at most `count` positions of a sequence, evenly spaced, the first and the last among them."""
     return sorted({round(position) for position in np.linspace(0, length - 1, min(length, count)).tolist()})
+
+
+def distinct_keys(key: Int64) -> tuple[Int64, Int64]:
+    """Return each of the numbers (n,), none below 0, once, ascending, and which of them each is: np.unique.
+
+    Numbers below COUNTED * n are counted, which takes a tenth of the time of putting them in order.
+    """
+    if not len(key) or (most := int(key.max())) >= COUNTED * len(key):
+        keys, of = np.unique(key, return_inverse=True)
+        return keys, of
+    is_there = np.zeros(most + 1, np.bool_)
+    is_there[key] = True
+    return np.flatnonzero(is_there), (np.cumsum(is_there) - 1)[key]

@@ -96,11 +96,18 @@ class Events:
         index = {name: getattr(self, name) for name in INDEX}
         return VoxelTable(**index, **columns, evidence=evidence, voxel_size=self.voxel_size, classes=self.classes)
 
+    def accumulated(self) -> Evidence:
+        """Return the evidence (n, K) of each voxel."""
+        return Evidence.joined([log._accumulated() for log in self._few_at_a_time()])
+
+    def _accumulated(self) -> Evidence:
+        return Evidence.of(_sum_by_voxel(self.evidence[:], self.starts))
+
     def _columns(self) -> dict[str, Any]:
         starts, s_bar = self.starts, self.evidence[:]
         return {
             "op": np.diff(np.append(starts, len(self))).astype(np.int32),
-            "evidence": Evidence.of(_sum_by_voxel(s_bar, starts)),
+            "evidence": self._accumulated(),
             "drift_sum": _sum_by_voxel(self.drift(), starts),
             "pixels": _sum_by_voxel(self.pixels.astype(np.int64), starts),
             "first_frame": np.minimum.reduceat(self.frame, starts) if len(self) else self.frame,

@@ -14,6 +14,7 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
+from semstab.core.arrays import distinct_keys
 from semstab.core.types import Float64, Int64, Mask
 from semstab.data.events import Events
 from semstab.data.measures import Quantity, entropy, vss
@@ -372,6 +373,6 @@ def _votes(table: VoxelTable) -> tuple[Int64, Int64, Int64]:
     again = table.op >= 2
     T = table.op[again].astype(np.int64)
     longest = int(T.max(initial=0)) + 1
-    pairs, of = np.unique(np.rint(vss(table)[again] * T).astype(np.int64) + T * longest, return_inverse=True)
+    pairs, of = distinct_keys(np.rint(vss(table)[again] * T).astype(np.int64) + T * longest)
     num_frames, most = np.divmod(pairs, longest)
     return num_frames, most, of

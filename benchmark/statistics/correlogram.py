@@ -13,6 +13,7 @@ from typing import Any
 
 import numpy as np
 
+from semstab.core.arrays import distinct_keys
 from semstab.core.types import Float64, Int64, UInt16
 from semstab.data.events import Events
 from semstab.data.statistics import UNKNOWN, Correlogram, LagBin
@@ -85,7 +86,7 @@ def in_bins(
     while len(frames := np.unique(log.frame // step)) > most:
         step *= 2
     group = np.searchsorted(frames, log.frame // step)
-    keys, cluster = np.unique(of[log.voxel].astype(np.int64) * len(frames) + group, return_inverse=True)
+    keys, cluster = distinct_keys(of[log.voxel].astype(np.int64) * len(frames) + group)
     cube, group = np.divmod(keys, max(len(frames), 1))
     pairs, distance = np.zeros((2, len(BINS) + 1))
     by_lag = []

@@ -12,6 +12,7 @@ from typing import Any
 
 import numpy as np
 
+from semstab.core.arrays import distinct_keys
 from semstab.core.types import Float64, UInt64
 from semstab.data.events import Events
 from semstab.data.measures import Quantity
@@ -51,7 +52,7 @@ def expected_sbd(table: VoxelTable, events: Events | None = None, *, seed: int =
     entries = np.flatnonzero(np.repeat(is_exact, number))
     of = np.repeat(np.flatnonzero(is_exact), number[is_exact])
     times = np.rint(evidence.weight[entries]).astype(np.int64)
-    pairs, which = np.unique(times * (LONGEST_TABLE + 1) + T[of], return_inverse=True)
+    pairs, which = distinct_keys(times * (LONGEST_TABLE + 1) + T[of])
     part, drifts = np.zeros(len(pairs)), one_hot_drifts(int(T.max(initial=2, where=is_exact)))
     log_factorials = np.concatenate([[0.0], np.cumsum(np.log(np.arange(1, LONGEST_TABLE + 1)))])
     in_chunks(expected_one_hot, *np.divmod(pairs, LONGEST_TABLE + 1), log_factorials, drifts, part)

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
+from semstab.core.arrays import distinct_keys
 from semstab.core.types import Float64, Int32, Int64, Mask
 
 MOST_CELLS, MOST_GROUPS = 256, 64
@@ -70,7 +71,9 @@ def distinct_rows(rows: npt.NDArray[np.integer]) -> tuple[Int64, Int64]:
     if key is None:
         distinct, of = np.unique(rows, axis=0, return_inverse=True)
         return distinct.astype(np.int64), of.ravel()
-    _, first, of = np.unique(key, return_index=True, return_inverse=True)
+    keys, of = distinct_keys(key)
+    first = np.empty(len(keys), np.int64)
+    first[of] = np.arange(len(rows))
     return rows[first].astype(np.int64), of
 
 
