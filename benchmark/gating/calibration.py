@@ -11,6 +11,7 @@ from semstab.comparison.opening import open_run
 from semstab.comparison.voxels import in_share, share_of
 from semstab.data.records import Record
 from semstab.data.tiles import Tiles, side_by_side
+from semstab.data.voxel_keys import in_order
 from semstab.data.voxels import VoxelTable
 from semstab.errors import ConfigError, DataError
 from semstab.statistics.acceptance import AcceptanceThresholds, calibrate
@@ -53,7 +54,7 @@ def _with_truth(record: Record, truth_file: Path) -> tuple[VoxelTable, Truth]:
     for table, truth in side_by_side([Tiles.open(file, VoxelTable) for file in files]):
         sample = table.rows(in_share(table, share))
         parts.append((sample, join_truth(sample, truth).label))
-    order = np.lexsort(np.concatenate([table.index for table, _ in parts]).T[::-1])
+    order = in_order(np.concatenate([table.index for table, _ in parts]))
     label = np.concatenate([labels for _, labels in parts])[order]
     return VoxelTable.joined([table for table, _ in parts]), Truth(label >= 0, label)
 
