@@ -206,7 +206,7 @@ class ExportedUnit:
             {name: replace(column, values=column.values[keep]) for name, column in columns.items()},
             names,
             _colors(record.voxels_file.parents[1] / OVERVIEW / f"{slug(scene, model)}.npz", table.K),
-            record.summary.taxonomy,
+            record.taxonomy,
             self._result.up.get(scene) if georeference is None else (0.0, 0.0, 1.0),
             georeference,
             self._result.benchmark,

@@ -37,7 +37,7 @@ def calibrate_run(run: str | Path, *, precision: float = 0.95, confidence: float
                 " run it on a scene that has it, without --no-truth"
             )
         maps.append(_with_truth(record, record.truth_file))
-        sampled = min(sampled, share_of(record.summary.table.voxels))
+        sampled = min(sampled, share_of(record.map_summary.voxels))
     first = maps[0][0]
     for table, _ in maps[1:]:
         if (table.classes, table.voxel_size) != (first.classes, first.voxel_size):
@@ -49,7 +49,7 @@ def calibrate_run(run: str | Path, *, precision: float = 0.95, confidence: float
 
 def _with_truth(record: Record, truth_file: Path) -> tuple[VoxelTable, Truth]:
     """Return a map with its true classes, or a sample of a very large map by a hash of the location."""
-    share, parts = share_of(record.summary.table.voxels), []
+    share, parts = share_of(record.map_summary.voxels), []
     files = [file for file in (record.voxels_file, truth_file) if file is not None]
     for table, truth in side_by_side([Tiles.open(file, VoxelTable) for file in files]):
         sample = table.rows(in_share(table, share))
