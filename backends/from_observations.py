@@ -31,6 +31,7 @@ from semstab.data.evidence import Evidence, row_chunks
 from semstab.data.frames import Frame
 from semstab.data.information import entropy_bits, js_divergence, normalise
 from semstab.data.results import Changes, FrameReport
+from semstab.data.voxel_keys import in_order
 from semstab.data.voxels import Extent, VoxelTable, index_columns
 from semstab.errors import DataError
 
@@ -143,7 +144,7 @@ class FromObservations(ABC):
     def table(self) -> VoxelTable:
         """Return the map so far; by another rule than the mean its evidence sums to a `weight` of its own."""
         index = np.frombuffer(b"".join(self._row), dtype=np.int64).reshape(-1, 3)
-        order = np.lexsort(index.T[::-1])
+        order = in_order(index)
         columns: dict[str, Any] = {name: column[order] for name, column in self._columns.items()}
         state = self._state
         evidence = Evidence.read(len(order), self.num_classes, lambda part: self._rule.reads(state[order[part]]))

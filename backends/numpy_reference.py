@@ -26,6 +26,7 @@ from semstab.data.events import Events
 from semstab.data.evidence import Evidence
 from semstab.data.frames import Frame
 from semstab.data.results import Changes, FrameReport
+from semstab.data.voxel_keys import in_order
 from semstab.data.voxels import Extent, VoxelTable, index_columns
 
 ONE_IN, MOST = 16, 10_000
@@ -78,7 +79,7 @@ class NumpyHistory:
     def events(self) -> Events:
         """Return the history: every observation of every voxel."""
         voxels = np.frombuffer(b"".join(self._row), dtype=np.int64).reshape(-1, 3)
-        order = np.lexsort(voxels.T[::-1])
+        order = in_order(voxels)
         rank = np.empty_like(order)
         rank[order] = np.arange(len(order))
         nothing = np.zeros(0, dtype=np.int64)

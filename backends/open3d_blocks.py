@@ -24,7 +24,8 @@ from semstab.core.types import Int64
 from semstab.data.evidence import Evidence
 from semstab.data.frames import Frame
 from semstab.data.results import Changes, FrameReport
-from semstab.data.voxels import Extent, VoxelTable, in_order, index_columns
+from semstab.data.voxel_keys import in_order
+from semstab.data.voxels import Extent, VoxelTable, index_columns
 from semstab.errors import ConfigError
 
 INITIAL_BYTES = 32 * 2**20
@@ -132,7 +133,7 @@ class Open3DBlocks(FusionBackend):
         rows = (blocks[:, None] * voxels_a_block + np.arange(voxels_a_block)).ravel()
         rows = rows[self._read("op", rows) > 0]
         index = self._index_of(rows)
-        order = in_order(index_columns(index))
+        order = in_order(index)
         rows = rows[order]
         columns = [name for name in self.attributes if name not in DENSE]
         values: dict[str, Any] = {name: self._read(name, rows) for name in columns}

@@ -1,6 +1,5 @@
 """`semstab-bench` and `python -m semstab`: the command line, where Ctrl-C is one line from the first import on."""
 
-import gc
 import os
 import signal
 import sys
@@ -16,7 +15,6 @@ def main() -> None:
     """Run the command line; the entry point of the console script."""
     if signal.getsignal(signal.SIGINT) is signal.default_int_handler:
         signal.signal(signal.SIGINT, _end)
-    gc.set_threshold(50_000)  # modules are no garbage, and looking for some takes a tenth of all imports
     from semstab.cli import main as command_line
 
     command_line()

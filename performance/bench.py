@@ -16,6 +16,7 @@ CASES = {
     "end-to-end": "timed.end_to_end",
     "recording": "timed.recording",
     "start": "timed.start",
+    "tricks": "timed.tricks",
     "fusion": "timed.fusion",
     "random-scenes": "timed.random_scenes",
     "scores": "timed.scores",

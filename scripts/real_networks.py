@@ -321,24 +321,24 @@ def rows_of(condition: Condition, nets: Sequence[Network], folder: Path) -> list
 
 
 def _row(condition: Condition, network: Network, record: Record) -> Row:
-    summary, statistics = record.summary, record.statistics
+    statistics, of_map = record.statistics, record.map_summary
     assert statistics is not None
     assert statistics.spots is not None
     headline, spots = statistics.headline, statistics.spots
     return Row(
         condition=condition.name, scene=condition.scene, kind=condition.kind, stride=condition.stride,
-        voxel_size=condition.voxel_size, frames=summary.frames,
+        voxel_size=condition.voxel_size, frames=record.frames,
         network=network.name, trained_on=network.trained_on, published_miou=network.miou,
         alpha=headline.alpha.value, alpha_low=headline.alpha.low, alpha_high=headline.alpha.high,
         verdict=statistics.verdict.level, probability=statistics.verdict.probability,
         vss=headline.vss_op3.value, vss_low=headline.vss_op3.low, vss_high=headline.vss_op3.high,
-        vss_all=summary.table[VSS],
+        vss_all=of_map[VSS],
         agree=headline.psa_op2.value, agree_low=headline.psa_op2.low, agree_high=headline.psa_op2.high,
         within=statistics.agreement.within.value, between=statistics.agreement.between.value,
-        flicker=summary.flicker_percent, compensated=record.image_space.compensated_flicker_percent,
+        flicker=record.flicker_percent, compensated=record.image_space.compensated_flicker_percent,
         effective_classes=spots.effective_classes, largest_class=spots.largest_class,
-        largest_share=spots.largest_share, voxels=summary.table.voxels, mean_op=summary.table.mean_op,
-        recurrent_share=summary.table.recurrent.share, spots=spots.spots, views=spots.views,
+        largest_share=spots.largest_share, voxels=of_map.voxels, mean_op=of_map.mean_op,
+        recurrent_share=of_map.recurrent.share, spots=spots.spots, views=spots.views,
     )  # fmt: skip
 
 

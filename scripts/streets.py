@@ -251,7 +251,7 @@ def _about(work: Path) -> dict[str, dict[str, Any]]:
 
 
 def _row(record: Record, about: dict[str, Any]) -> dict[str, Any]:
-    summary, statistics, image = record.summary, record.statistics, record.image_space
+    statistics, image = record.statistics, record.image_space
     assert statistics is not None
     assert statistics.spots is not None
     alpha, video = statistics.headline.alpha, record.video_measures
@@ -263,7 +263,7 @@ def _row(record: Record, about: dict[str, Any]) -> dict[str, Any]:
         "verdict": statistics.verdict.level, "probability": statistics.verdict.probability,
         "vss": op3["vss"], "sbd": op3["sbd"], "entropy": op3["entropy"], "vss2": op2["vss"],
         "agree": statistics.headline.psa_op2.value,
-        "flicker": summary.flicker_percent, "compensated": image.compensated_flicker_percent,
+        "flicker": record.flicker_percent, "compensated": image.compensated_flicker_percent,
         "vc": video.self_vc8.value if video else math.nan, "tc": video.tc.etc if video else math.nan,
         **about[record.unit.scene],
     }  # fmt: skip

@@ -7,7 +7,7 @@ import numpy as np
 from semstab import Result, VoxelTable
 from semstab.config import BASE
 from semstab.data.records import Record, Variation
-from semstab.data.results import UnitName, UnitSummary
+from semstab.data.results import UnitName
 from semstab.metrics import summarise
 
 CLASSES = ("a", "b", "c")
@@ -29,8 +29,8 @@ def voxels(*groups, r=0.2):
 def record(table, sweep=BASE, value=None, repeat=0, scene="s", model="m", backend="numpy", **more):
     """The record of a unit that left this map."""
     unit = UnitName(scene, model, backend)
-    summary = UnitSummary(unit, "abc", 4, summarise(table), 10.0, fuse_ms_per_frame=5.0)
-    return Record(unit.slug, Variation(sweep, value, repeat), summary, **more)
+    varied = Variation(sweep, value, repeat)
+    return Record(unit, "abc", 4, summarise(table), 10.0, 5.0, unit.slug, varied, **more)
 
 
 def study(*records, **more):

@@ -74,7 +74,7 @@ def test_a_run_leaves_it_out_as_check_does_and_says_so(gaps, tmp_path):
     def run(name, **settings):
         config = configure(gaps[name], models=["net"], check=None, voxel_size=0.2, **settings)
         result = semstab.run(config, out=tmp_path / f"{name}{len(settings)}", report=False)
-        return result.runs[0].table.voxels, [note for of_scene in result.notes.values() for note in of_scene]
+        return result.runs[0].map_summary.voxels, [note for of_scene in result.notes.values() for note in of_scene]
 
     (left_out, said), (without, silent), (trusting, _) = run(value), run("0"), run(value, check_geometry=False)
     assert left_out == without < trusting

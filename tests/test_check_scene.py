@@ -83,8 +83,8 @@ def test_persistence_is_that_of_the_run(folder, sound):
     (run,) = semstab.run(configure(folder, voxel_size=0.1, models=["gt"], check=None), report=False).runs
     row = next(row for row in sound.persistence if row.voxel_size == 0.1)
     assert sound.fused_frames == 12
-    assert (row.voxels, row.mean_op) == (run.table.voxels, pytest.approx(run.table.mean_op))
-    assert row.shares == pytest.approx([stratum.share for stratum in run.table.strata])
+    assert (row.voxels, row.mean_op) == (run.map_summary.voxels, pytest.approx(run.map_summary.mean_op))
+    assert row.shares == pytest.approx([stratum.share for stratum in run.map_summary.strata])
     assert [row.voxel_size for row in sound.persistence] == [0.05, 0.1, 0.2]
 
 
@@ -390,7 +390,7 @@ def test_a_run_refuses_unsound_data_unless_told_otherwise(tmp_path):
     (run,) = semstab.run(
         trusting, out=tmp_path / "run", report=False
     ).runs  # the same folder: the numbers do not depend on it
-    assert run.table.voxels > 0
+    assert run.map_summary.voxels > 0
     assert "check" not in json.loads((tmp_path / "run/manifest.json").read_text())["seconds"]
     arguments = (
         "--data", folder, "-m", "net", "--voxel-size", 0.2, "--check", "none", "--rerun", "off", "--report", "off",

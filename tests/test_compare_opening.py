@@ -41,9 +41,9 @@ def test_a_label_source_is_selected_behind_a_colon_and_names_are_the_shortest(ru
     assert (found.model, list(found.scenes), found.source) == ("b", ["wall"], run)
     entry = found.scenes["wall"]
     assert entry.classes == entry.with_voxels("").table().classes
-    assert value(entry.sums, "psa") == pytest.approx(entry.summary.statistics.agreement.psa_op2.value)
+    assert value(entry.sums, "psa") == pytest.approx(entry.record.statistics.agreement.psa_op2.value)
     assert list(entry.flicker) == [1, 2, 3, 4, 5]
-    assert np.mean(list(entry.flicker.values())) == pytest.approx(entry.image_space.compensated_flicker_percent)
+    assert np.mean(list(entry.flicker.values())) == pytest.approx(entry.record.image_space.compensated_flicker_percent)
     shutil.copytree(run, tmp_path / "new")
     names = [each.name for each in open_runs([f"{run}:a", f"{run}:b"])]
     assert names == ["a", "b"]
@@ -89,8 +89,8 @@ def test_a_small_summary_holds_all_but_voxels(run, tmp_path):
     kept = open_run(file)
     assert (kept.model, list(kept.scenes)) == ("a", ["wall"])
     own, back = one.scenes["wall"], kept.scenes["wall"]
-    assert to_json(back.summary.statistics.agreement) == to_json(own.summary.statistics.agreement)
-    assert to_json(back.image_space) == to_json(own.image_space)
+    assert to_json(back.record.statistics.agreement) == to_json(own.record.statistics.agreement)
+    assert to_json(back.record.image_space) == to_json(own.record.image_space)
     assert (back.up, back.flicker) == (own.up, own.flicker)
     assert all(value(back.sums, key) == value(own.sums, key) for key in ("psa", "alpha", "voxel_alpha", "vss"))
     fails(

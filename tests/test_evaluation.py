@@ -105,7 +105,7 @@ def test_the_classes_with_most_of_the_disagreement_are_listed(tmp_path, monkeypa
     classes = one.record().statistics.spots.classes
     largest = sorted((row for row in classes if row.disagreement >= 0.01), key=lambda row: -row.disagreement)
     assert listed_classes(one)[0] == [row.name for row in largest]
-    covering = max(one.record().summary.table.classes, key=lambda row: row.share)
+    covering = max(one.record().map_summary.classes, key=lambda row: row.share)
     monkeypatch.setattr("semstab.report.terminal.disagreement.MAJORITY", covering.share)
     assert covering.name in listed_classes(one)[0]
     both, after = listed_classes(semstab.run(configure(root), out=tmp_path / "both", report=False))
@@ -271,7 +271,7 @@ def test_agreement_stands_beside_the_sweep(studied) -> None:
 def test_columns_without_a_number_are_left_out() -> None:
     table = voxels((5, 1, [1, 0, 0]), (5, 2, [1, 1, 0]))
     plain = record(table)
-    judged = dataclasses.replace(plain, summary=dataclasses.replace(plain.summary, statistics=(describe(table))))
+    judged = dataclasses.replace(plain, statistics=(describe(table)))
     (row,) = rows_of(study(judged), "temporal_agreement")
     assert "flip_rate" not in row
     assert row["repeated_voxels"] == 5
@@ -281,10 +281,7 @@ def test_columns_without_a_number_are_left_out() -> None:
 def test_the_mean_of_several_scenes_counts_each_once() -> None:
     maps = {"x": voxels((5, 2, [2, 0, 0]), (5, 2, [1, 1, 0])), "y": voxels((90, 2, [2, 0, 0]))}
     records = [record(table, scene=scene) for scene, table in maps.items()]
-    judged = [
-        dataclasses.replace(r, summary=dataclasses.replace(r.summary, statistics=(describe(maps[r.unit.scene]))))
-        for r in records
-    ]
+    judged = [dataclasses.replace(r, statistics=(describe(maps[r.unit.scene]))) for r in records]
     *_, total = rows_of(study(*judged), "uncertainty")
     entropies = [record.statistics.uncertainty.entropy_op2.value for record in judged]
     assert total["scene"] == "Mean"

@@ -89,8 +89,8 @@ def test_a_run_leaves_out_a_class_and_says_how_many_pixels(root, tmp_path) -> No
     out = tmp_path / "run"
     still = semstab.run(configure(root, exclude={"predicted_classes": ["Door"]}), out=out, report=False).runs[0]
     assert still.left_out > 0
-    assert still.table.points + still.left_out == everything.table.points
-    classes = {group.name: group.voxels for group in still.table.classes}
+    assert still.map_summary.points + still.left_out == everything.map_summary.points
+    classes = {group.name: group.voxels for group in still.map_summary.classes}
     assert classes["door"] == 0
     (path,) = (out / "frames").iterdir()
     assert sum(int(row["left_out"]) for row in csv.DictReader(path.read_text().splitlines())) == still.left_out

@@ -377,7 +377,7 @@ def test_labels_have_the_same_numbers_with_features_and_without(tmp_path):
     shutil.rmtree(tmp_path / "room" / "features")
     bench("room", "--voxel-size", "0.2", "-o", "without", cwd=tmp_path)
     one, other = (semstab.load_result(tmp_path / name).record() for name in ("with", "without"))
-    assert one.summary.table == other.summary.table
+    assert one.map_summary == other.map_summary
     assert dataclasses.replace(one.statistics, features=None) == other.statistics
 
 

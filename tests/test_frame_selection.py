@@ -175,7 +175,7 @@ def test_label_maps_that_were_not_asked_for_neither_break_nor_change_a_run(tmp_p
     (partial / "label_space.yaml").write_text("classes: 3")
     for incomplete in ("error", "skip"):
         (found,) = run_of(root, settings, incomplete=incomplete)
-        assert (found.table, found.frames) == (before[0].table, 6)
+        assert (found.map_summary, found.frames) == (before[0].map_summary, 6)
 
 
 def test_frames_are_selected_on_the_sequence_and_what_lacks_a_file_is_counted(tmp_path):

@@ -27,7 +27,7 @@ def result():
 
 def named(record, scene, model):
     unit = dataclasses.replace(record.unit, scene=scene, model=model)
-    return dataclasses.replace(record, summary=dataclasses.replace(record.summary, unit=unit))
+    return dataclasses.replace(record, unit=unit)
 
 
 def test_eleven_scenes_and_five_models_take_forty_lines(result):
@@ -44,12 +44,12 @@ def test_eleven_scenes_and_five_models_take_forty_lines(result):
 
 def test_a_model_that_truth_refutes_is_named_once_for_all_scenes(result):
     def misleading(record):
-        own = record.summary.statistics
+        own = record.statistics
         verdict = dataclasses.replace(own.verdict, level="misleading")
         wrong = dataclasses.replace(own.headline.wrong_of_consistent_op3, value=0.57, low=0.43, high=0.7)
         headline = dataclasses.replace(own.headline, wrong_of_consistent_op3=wrong)
         statistics = dataclasses.replace(own, verdict=verdict, headline=headline)
-        return dataclasses.replace(record, summary=dataclasses.replace(record.summary, statistics=statistics))
+        return dataclasses.replace(record, statistics=statistics)
 
     records = [misleading(r) if r.unit.model == "random" and r.unit.scene < "scene03" else r for r in result.records]
     text = " ".join(" ".join(screen(dataclasses.replace(result, records=tuple(records)))).split())

@@ -82,12 +82,12 @@ def test_the_summary_has_its_means_and_reads_them_back(run, study) -> None:
     assert entry["rival_all"] == pytest.approx(np.nanmean(values))
     assert entry["recurrent"]["rival_voxels_op3"] == np.count_nonzero(table.op >= 3)
     assert entry["strata"][0]["rival"] is None
-    assert result.runs[0].table[RIVAL] == entry["rival_all"]
+    assert result.runs[0].map_summary[RIVAL] == entry["rival_all"]
     assert all("rival" in row["differences"] for row in summary["agreement"])
     found, folder = study
     again = load_result(folder)
-    assert [row.summary.table[RIVAL] for row in again.records] == [row.summary.table[RIVAL] for row in found.records]
-    assert again.records[0].summary.table.recurrent.defined(RIVAL) > 0
+    assert [row.map_summary[RIVAL] for row in again.records] == [row.map_summary[RIVAL] for row in found.records]
+    assert again.records[0].map_summary.recurrent.defined(RIVAL) > 0
 
 
 def test_parquet_has_it_voxel_by_voxel(run) -> None:
@@ -124,7 +124,7 @@ def test_the_report_draws_it_by_op_and_cards_and_rows_of_models_have_it(run, stu
 def test_tables_and_the_comparison_have_it(study) -> None:
     made = [*tables(study[0]), *own_models(study[0])]
     found = {table.name: list(csv.DictReader(io.StringIO(to_csv(table)))) for table in made}
-    base = {record.unit.model: record.summary.table for record in study[0].select()}
+    base = {record.unit.model: record.map_summary for record in study[0].select()}
     for name in ("scenes", "persistence", "classes", "cross_model", "fusion", "sensitivity_voxel_size"):
         assert all({"rival", "rival_all"} & row.keys() for row in found[name]), name
     assert [float(row["rival_all"]) for row in found["scenes"]] == [round(t[RIVAL], 2) for t in base.values()]
@@ -187,10 +187,10 @@ LATER = Measure(key="later", title="Later", better="lower", of=second_largest, r
 def test_one_that_was_declared_later_is_undefined_in_earlier_results(run, study) -> None:
     with registered(LATER):
         earlier = load_result(run[1])
-        table = earlier.select()[0].summary.table
+        table = earlier.select()[0].map_summary
         assert np.isnan(table[LATER])
         assert np.isnan(table.recurrent[LATER])
-        assert (table.recurrent.defined(LATER), table[RIVAL]) == (0, run[0].select()[0].summary.table[RIVAL])
+        assert (table.recurrent.defined(LATER), table[RIVAL]) == (0, run[0].select()[0].map_summary[RIVAL])
         assert np.isnan(earlier.agreement[0].difference("later").max)
         shown = {made.name: to_csv(made) for made in (*tables(earlier), *tables(load_result(study[1])))}
         (row, *_) = csv.DictReader(io.StringIO(shown["agreement"]))

@@ -38,7 +38,7 @@ def test_the_estimate_holds_for_a_flight_and_saturates_over_one_place(tmp_path) 
     """From a sample of frames; frames that see nothing new add observations only."""
     root = tiny_scene.write(tmp_path / "wall", models=("a",), frames=60)
     plan, config = planned(root, voxel_size=0.05, pixel_stride=1)
-    table = semstab.run(config, report=False).runs[0].table
+    table = semstab.run(config, report=False).runs[0].map_summary
     size = map_size.map_size(plan.tasks[0], plan.units[0].config)
     assert size.voxels == pytest.approx(table.voxels, rel=0.3)
     assert size.observations == pytest.approx(table.observations, rel=0.3)

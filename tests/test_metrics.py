@@ -11,6 +11,7 @@ from hypothesis import strategies as st
 from semstab import Frame, Intrinsics, VoxelTable, backends
 from semstab.data.measures import ENTROPY, SBD, VSS, margin, measures
 from semstab.data.results import Means, MeasureMeans, UnitName
+from semstab.data.voxel_keys import voxel_keys
 from semstab.errors import DataError
 from semstab.metrics import (
     compare,
@@ -25,7 +26,7 @@ from semstab.metrics import (
     summarise,
     vss,
 )
-from semstab.metrics.agreement import COUNTS, SUMS, voxel_keys
+from semstab.metrics.agreement import COUNTS, SUMS
 from semstab.testing import JS_HALF, SEQUENCES, as_frames, checks, sight_line
 
 

@@ -94,12 +94,12 @@ def test_exported_masks_take_the_movers_out_of_the_map(run, tmp_path) -> None:  
         table = record.table()
         return int(np.isin(semstab.metrics.dominant(table), [table.classes.index("moving car")]).sum())
 
-    means = [record.summary.table.recurrent for record in (before, after)]
+    means = [record.map_summary.recurrent for record in (before, after)]
     assert means[1][VSS] > means[0][VSS]
     assert means[1][SBD] < means[0][SBD]
     assert cars(after) < 0.5 * cars(before)
     np.testing.assert_array_equal(kept.table().index, before.table().index)
-    assert kept.summary.table.recurrent[VSS] == before.summary.table.recurrent[VSS]
+    assert kept.map_summary.recurrent[VSS] == before.map_summary.recurrent[VSS]
 
 
 def test_the_map_and_the_recording_have_a_layer_of_what_moved(run) -> None:  # type: ignore[no-untyped-def]

@@ -97,7 +97,7 @@ def test_a_study_writes_frame_series_and_where_asked_a_recording_of_its_base_uni
     (base, *_) = result.select()
     rows = series(base.series)
     assert len(rows) == 6
-    assert int(rows[-1]["map_voxels"]) == base.summary.table.voxels
+    assert int(rows[-1]["map_voxels"]) == base.map_summary.voxels
     logged = set(read(out / "recording.rrd"))
     for model in "ab":
         assert f"/wall/series/map_vss_all/{model}/numba" in logged
@@ -118,7 +118,7 @@ def test_a_kept_unit_that_gained_a_measure_is_computed_again(root, tmp_path) -> 
         assert result.manifest["units"] == {
             "units": 2, "kept": 0, "computed": 2, "failed": 0, "executor": "in this process"
         }  # fmt: skip
-        assert result.runs[0].table[ones] == 1.0
+        assert result.runs[0].map_summary[ones] == 1.0
 
 
 def test_a_backend_of_ones_own_that_breaks_leaves_its_trace(root, tmp_path, monkeypatch) -> None:

@@ -69,7 +69,7 @@ WITHOUT = {"vss", "sbd", "entropy", "margin", "psa", "miou", "accuracy", "voxel_
 
 def numbers_of(record):
     """The numbers of a unit by their names, from its record in memory."""
-    own, recurrent = record.statistics, record.summary.table.recurrent
+    own, recurrent = record.statistics, record.map_summary.recurrent
     found = {
         "alpha": own.headline.alpha.value,
         "VSS (OP>=3)": recurrent.means.value["vss"],
@@ -189,7 +189,7 @@ def test_python_and_summary_json_have_them_under_names_with_the_population(run):
         assert content["statistics"]["headline"]["alpha"]["value"] == pytest.approx(numbers["alpha"])
         assert content["recurrent"]["vss_op3"] == pytest.approx(numbers["VSS (OP>=3)"])
         assert content["statistics"]["headline"]["psa_op2"]["value"] == pytest.approx(numbers["PSA (OP>=2)"])
-        assert content["vss_all"] == row["vss_all"] == record.summary.table.means.value["vss"]
+        assert content["vss_all"] == row["vss_all"] == record.map_summary.means.value["vss"]
         assert not WITHOUT & (content.keys() | content["recurrent"].keys() | content["statistics"]["headline"].keys())
 
 
@@ -237,7 +237,7 @@ def test_the_recording_has_them_in_its_text_and_at_the_end_of_its_series(run):
     result, folder = run
     rows = read(folder.with_name("recording.rrd"))
     for record in result.select():
-        unit, table = record.unit, record.summary.table
+        unit, table = record.unit, record.map_summary
         logged = [row["TextLog:text"][0] for row in rows[path(unit.scene, "log")] if row.get("TextLog:text")]
         (text,) = (text for text in logged if text.startswith(f"{unit.model}, {unit.backend}: "))
         for measure in measures():

@@ -22,7 +22,7 @@ def folder(tmp_path):
 def size_of(folder, *words, **more):
     said = bench("--data", "wall", "--out", "out", "--overwrite", *words, cwd=folder, **more).stderr
     (run,) = load_result(folder / "out").runs
-    return run.table.voxel_size, said
+    return run.map_summary.voxel_size, said
 
 
 def test_they_are_taken_where_no_file_is_named_and_said(folder) -> None:

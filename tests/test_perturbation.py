@@ -169,9 +169,9 @@ def test_noise_is_of_the_pixel_and_none_changes_nothing(config) -> None:
 def test_a_run_takes_it_as_a_setting_that_cannot_be_negative(config, tmp_path) -> None:
     plain = semstab.run(config(), report=False)
     noisy = semstab.run(config(perturbation=NOISE, seed=3), out=tmp_path / "run", report=False)
-    assert noisy.runs[0].table != plain.runs[0].table
+    assert noisy.runs[0].map_summary != plain.runs[0].map_summary
     again = semstab.run(load_config(tmp_path / "run" / "config.yaml"), report=False)
-    assert [run.table for run in again.runs] == [run.table for run in noisy.runs]
+    assert [run.map_summary for run in again.runs] == [run.map_summary for run in noisy.runs]
     assert json.loads(json.dumps(config(perturbation=NOISE, seed=3).model_dump(mode="json")))["seed"] == 3
     with pytest.raises(ConfigError, match=r"perturbation\.depth_noise: input should be greater than or equal to 0"):
         config(perturbation={"depth_noise": -0.1})

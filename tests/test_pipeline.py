@@ -35,7 +35,9 @@ def root(tmp_path):
 
 def without_times(result: Result) -> list:
     times = ("fuse_ms_per_frame", "stages_ms")
-    runs = [{key: value for key, value in to_json(run).items() if key not in times} for run in result.runs]
+    runs = [
+        {key: value for key, value in to_json(run.without_files()).items() if key not in times} for run in result.runs
+    ]
     return [runs, to_json(result.agreement)]
 
 
@@ -61,12 +63,12 @@ def test_ground_truth_of_a_static_wall_is_perfectly_stable(root) -> None:
     """Pixels are as large as voxels here, and the truth is tied to the wall: every voxel keeps one label."""
     (run,) = semstab.run(configure(root, models=["gt"]), report=False).runs
     # 8 columns, and one more a frame; 6 rows
-    assert run.table.voxels == (8 + 2) * 6
-    assert run.table.points == run.table.observations == 3 * 48
-    assert (run.table[VSS], run.table[SBD], run.table[ENTROPY]) == (1.0, 0.0, 0.0)
+    assert run.map_summary.voxels == (8 + 2) * 6
+    assert run.map_summary.points == run.map_summary.observations == 3 * 48
+    assert (run.map_summary[VSS], run.map_summary[SBD], run.map_summary[ENTROPY]) == (1.0, 0.0, 0.0)
     # of 10 columns, the outermost two a side are seen less often
-    assert [row.voxels for row in run.table.strata] == [2 * 6, 2 * 6, 6 * 6, 0]
-    assert run.table.recurrent.share == pytest.approx(0.6)
+    assert [row.voxels for row in run.map_summary.strata] == [2 * 6, 2 * 6, 6 * 6, 0]
+    assert run.map_summary.recurrent.share == pytest.approx(0.6)
     # two of eight columns change their class at each step to the right
     assert run.flicker_percent == pytest.approx(25.0)
 
@@ -111,9 +113,9 @@ def test_the_run_folder_holds_what_the_design_promises(root, tmp_path) -> None:
     table = semstab.VoxelTable.load(out / "voxels" / f"{unit.slug}.parquet")
     np.testing.assert_array_equal(voxels.column("vss").to_numpy(), metrics.vss(table))
     assert table.classes == ("wall", "door", "window")
-    assert metrics.summarise(table) == result.runs[0].table
+    assert metrics.summarise(table) == result.runs[0].map_summary
     events = semstab.Events.load(out / "events" / f"{unit.slug}.parquet")
-    assert metrics.summarise(events.table()) == result.runs[0].table
+    assert metrics.summarise(events.table()) == result.runs[0].map_summary
     rows = (out / "frames" / f"{unit.slug}.csv").read_text().splitlines()
     assert len(rows) == 4
     assert rows[1].split(",")[rows[0].split(",").index("drift")] == ""  # nothing was seen before
@@ -127,10 +129,10 @@ def test_the_frame_series_ends_where_the_table_is(root, tmp_path) -> None:
         (run,) = semstab.run(configure(root, models=["b"], backends=[backend], check=None), out=out, report=False).runs
         text = (out / "frames" / f"{run.unit.slug}.csv").read_text().splitlines()
         last = dict(zip(text[0].split(","), text[-1].split(","), strict=True))
-        assert int(last["map_voxels"]) == run.table.voxels
-        assert float(last["map_vss_all"]) == pytest.approx(run.table[VSS], abs=1e-12)
-        assert float(last["map_entropy_all"]) == pytest.approx(run.table[ENTROPY], abs=1e-12)
-        assert float(last["map_recurrent"]) == pytest.approx(run.table.recurrent.share, abs=1e-12)
+        assert int(last["map_voxels"]) == run.map_summary.voxels
+        assert float(last["map_vss_all"]) == pytest.approx(run.map_summary[VSS], abs=1e-12)
+        assert float(last["map_entropy_all"]) == pytest.approx(run.map_summary[ENTROPY], abs=1e-12)
+        assert float(last["map_recurrent"]) == pytest.approx(run.map_summary.recurrent.share, abs=1e-12)
 
 
 def test_running_the_resolved_configuration_again_gives_the_same_numbers(root, tmp_path) -> None:
@@ -243,7 +245,7 @@ def test_an_observer_that_fails_costs_nothing_else_and_is_told_at_the_end(root, 
     with pytest.raises(OSError, match="No space left"):
         semstab.run(configure(root, models=["a"]), out=out, observers=[Failing(), watching], report=False)
     assert watching.seen[-1] == "finished"
-    assert load_result(out).runs[0].table.voxels == 60
+    assert load_result(out).runs[0].map_summary.voxels == 60
 
 
 def test_disagreement_is_reported_after_everything_is_written(root, tmp_path, monkeypatch) -> None:
@@ -333,13 +335,13 @@ def test_a_selection_that_does_not_fit_is_refused_before_anything_is_read(root, 
 
 def test_pixel_stride_keeps_every_nth_pixel_and_a_taxonomy_file_merges_classes(root, tmp_path) -> None:
     (run,) = semstab.run(configure(root, models=["gt"], pixel_stride=2), report=False).runs
-    assert run.table.points == 3 * 4 * 3
-    assert run.table[VSS] == 1.0
+    assert run.map_summary.points == 3 * 4 * 3
+    assert run.map_summary[VSS] == 1.0
     path = tmp_path / "two.yaml"
     path.write_text(yaml.safe_dump({"classes": ["wall", {"name": "opening", "members": ["door", "window"]}]}))
     (run,) = semstab.run(configure(root, models=["gt"], taxonomy=str(path)), report=False).runs
-    assert (run.taxonomy, run.table.K) == ("two", 2)
-    assert [row.name for row in run.table.classes] == ["wall", "opening"]
+    assert (run.taxonomy, run.map_summary.K) == ("two", 2)
+    assert [row.name for row in run.map_summary.classes] == ["wall", "opening"]
 
 
 def test_the_number_of_threads_changes_no_number(root, tmp_path) -> None:

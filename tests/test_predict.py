@@ -663,7 +663,7 @@ def test_model_to_voxels_is_the_same_as_by_way_of_the_disk(scene):
     dataset = DatasetConfig(name="posed_folder", options={"root": str(scene)})
     (stored,) = run(Config(dataset=dataset, voxel_size=0.25, check=None), report=False).runs
     assert live.unit.model == "colour-clusters"
-    assert live.table == stored.table
+    assert live.map_summary == stored.map_summary
     assert live.flicker_percent == stored.flicker_percent
     assert not [path for path in before if "labels" in path.parts]
 
@@ -672,7 +672,7 @@ def test_a_run_with_predictions_is_kept_and_reproduced(scene, tmp_path):
     config = live_config(scene, PREDICTOR)
     first = run(config, out=tmp_path / "run", report=False)
     again = Config.build(yaml.safe_load((tmp_path / "run/config.yaml").read_text()))
-    assert run(again, out=tmp_path / "run", report=False).runs[0].table == first.runs[0].table
+    assert run(again, out=tmp_path / "run", report=False).runs[0].map_summary == first.runs[0].map_summary
     before = {path.name for path in (tmp_path / "run/units").iterdir()}
     Image.fromarray(predicted_scene.image(5, seed=9)).save(scene / "color/005.png")
     run(config, out=tmp_path / "run", report=False)
@@ -684,7 +684,7 @@ def test_labels_and_scores_of_several_models(scene):
         live_config(scene, PREDICTOR, f"{PREDICTOR},scores=true", f"{PREDICTOR},seed=3,name=other"), report=False
     )
     assert [unit.unit.model for unit in found.runs] == ["colour-clusters", "colour-clusters-scores", "other"]
-    hard, soft, _ = (unit.table for unit in found.runs)
+    hard, soft, _ = (unit.map_summary for unit in found.runs)
     assert soft[ENTROPY] > hard[ENTROPY]
 
 
@@ -748,7 +748,7 @@ def test_a_run_leaves_the_maps_that_it_read(scene, tmp_path):
                "labels": "{scene}/labels/{model}/{name}", "scores": "{scene}/scores/{model}/{name}"}}  # fmt: skip
     (again,) = run({"dataset": dataset, "voxel_size": 0.25, "check": None, "models": ["colour-clusters"]}).runs
     first = run(live_config(scene, PREDICTOR), out=tmp_path / "run", report=False).runs[0]
-    assert again.table == first.table
+    assert again.map_summary == first.map_summary
 
 
 def test_maps_are_read_again_whatever_is_fused_from_them(scene, tmp_path, monkeypatch):

@@ -22,7 +22,7 @@ from semstab import Frame, Intrinsics, LabelSpace, Result, VoxelTable, backends,
 from semstab.config import Config
 from semstab.data.measures import measures
 from semstab.data.records import Record, Variation
-from semstab.data.results import UnitName, UnitSummary
+from semstab.data.results import UnitName
 from semstab.engine import Observer
 from semstab.engine.series import FrameRow
 from semstab.engine.units import Plan, Unit, make_plan
@@ -433,8 +433,8 @@ def frame(index: int, label: int, at: tuple[float, float, float], timestamp: flo
     return Frame(index, depth, Intrinsics(8.0, 8.0, 4.0, 3.0), T_wc, labels=labels, timestamp=timestamp)
 
 
-def summary_of(table: VoxelTable) -> UnitSummary:
-    return UnitSummary(UNIT, "abc", 3, metrics.summarise(table), math.nan, 1.0)
+def record_of(table: VoxelTable) -> Record:
+    return Record(UNIT, "abc", 3, metrics.summarise(table), math.nan, 1.0, "key")
 
 
 def planned(indices: Sequence[int] = (0,)) -> Unit:
@@ -454,7 +454,7 @@ def record(path: Path | Target, frames: list[Frame], *, finish: bool = True) -> 
         watching.frame_fused(task, each, {UNIT: FrameRow(backend.integrate(each), each.timestamp, math.nan)})
     table = backend.table()
     if finish:
-        kept = Record("key", Variation(), summary_of(table))
+        kept = record_of(table)
         watching.unit_finished(unit, kept, table, None)
         watching.run_finished(Result("run", "numpy", (kept,)))
     return watching, table
@@ -491,7 +491,7 @@ def test_what_goes_wrong_beside_the_loop_is_said_and_the_file_is_closed(tmp_path
         raise RuntimeError("no room")
 
     monkeypatch.setattr(voxel_maps.VoxelLogger, "finish", fail)
-    watching.unit_finished(planned(), Record("key", Variation(), summary_of(table)), table, None)
+    watching.unit_finished(planned(), record_of(table), table, None)
     with pytest.raises(RuntimeError, match="no room"):
         watching.close()
     verify(path)

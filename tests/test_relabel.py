@@ -146,7 +146,7 @@ def test_a_run_reads_what_was_relabelled(fused, tmp_path):
     found = dataset_of(fused / "scene", labels_root=tmp_path, labels="labels/{model}/{name}")
     again = semstab.run(configure(fused / "scene", dataset=found, check=None))
     assert again.models == ("a-fused",)
-    assert again.record().summary.table.means.value["vss"] == 1.0
+    assert again.record().map_summary.means.value["vss"] == 1.0
     other = "holds predictions with other settings .min_op: 1 there, 2 here."
     fails(ConfigError, other, relabel, fused / "run", tmp_path, belief=Belief(min_op=2))
     changed = ("relabel", fused / "run", "--out", tmp_path, "--min-op", 2)

@@ -31,9 +31,9 @@ def run(tmp_path_factory):
 def test_the_summary_has_a_row_a_unit_and_a_unit_series_and_events(run):
     assert list(run.summary["model"]) == ["a", "b"]
     for (_, row), summary in zip(run.summary.iterrows(), run.result.runs, strict=True):
-        assert row["vss_all"] == summary.table.means.value["vss"]
-        assert row["entropy_op3"] == summary.table.recurrent.means.value["entropy"]
-        assert row["voxels"] == summary.table.voxels
+        assert row["vss_all"] == summary.map_summary.means.value["vss"]
+        assert row["entropy_op3"] == summary.map_summary.recurrent.means.value["entropy"]
+        assert row["voxels"] == summary.map_summary.voxels
     assert list(run.series(model="b")["frame"]) == [0, 1, 2]
     assert len(run.events(model="b")) == run.table(model="b").op.sum()
     fails(ConfigError, "2 units fit", run.table)
@@ -80,8 +80,7 @@ def test_the_parts_of_a_run_at_a_prompt_are_one_line_each(run):
     stated = verdict.removeprefix("<MapStatistics 'a': ").removesuffix(">")
     assert stated.startswith(f"{own.statistics.verdict}, alpha ")
     assert repr(own) == f"<Record scene, a: {stated}; numpy>"
-    assert repr(own.summary).startswith(f"<UnitSummary scene, a: {stated}; ")
-    assert repr(run.table(model="a")) == f"<VoxelTable: {own.summary.table.voxels:,} voxels of 0.25 m, 3 classes>"
+    assert repr(run.table(model="a")) == f"<VoxelTable: {own.map_summary.voxels:,} voxels of 0.25 m, 3 classes>"
     assert repr(run.events(model="a")).startswith("<Events: ")
 
 

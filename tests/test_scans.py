@@ -270,7 +270,7 @@ def test_scans_without_labels_are_no_images_to_predict_on(street, tmp_path):
 
 def test_strata_by_range_tell_a_model_that_is_worse_far_away(run):
     folder, _ = run
-    by_model = {record.unit.model: record.summary.statistics.ranges for record in semstab.load(folder).result.select()}
+    by_model = {record.unit.model: record.statistics.ranges for record in semstab.load(folder).result.select()}
     far, clean = by_model["far"], by_model["clean"]
     assert clean.reliable == clean.farthest
     assert not clean.is_told

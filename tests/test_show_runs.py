@@ -42,7 +42,7 @@ def test_each_model_of_each_run_has_a_row_with_the_numbers_of_its_run(folder) ->
         assert float(row["flicker_percent"]) == pytest.approx(record.image_space.compensated_flicker_percent, abs=0.05)
         assert row["verdict"] == record.statistics.verdict.level
         assert row["vss_op3"] == ""  # of so few voxels no mean is printed
-        assert int(row["frames"]) == record.summary.frames
+        assert int(row["frames"]) == record.frames
     assert "coarse" in said
     assert "runs.png" in said
     with Image.open(folder / "all/runs.png") as image:

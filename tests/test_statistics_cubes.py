@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from simulated_events import log_of
 
+from semstab.data.voxel_keys import voxel_keys
 from semstab.errors import DataError
-from semstab.metrics.agreement import voxel_keys
 from semstab.statistics.agreement import alpha_columns, alpha_of, psa_columns, ratio_of
 from semstab.statistics.cluster_sums import cubes_of
 from semstab.statistics.variance import gradient_of

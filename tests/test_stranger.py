@@ -44,7 +44,7 @@ def test_frames_in_which_nothing_is_seen_are_counted(tmp_path) -> None:
     (folder / "depth/0001.png").unlink()
     np.save(folder / "depth/0001.npy", np.full((tiny_scene.HEIGHT, tiny_scene.WIDTH), np.nan, np.float32))
     result = semstab.run(configure(folder))
-    assert result.select()[0].summary.frames_empty == 1
+    assert result.select()[0].frames_empty == 1
     assert "a: 1 of 3 frames have no pixel with both depth and a label" in printed(result)
 
 
@@ -56,7 +56,7 @@ def test_own_data_is_checked_on_a_sample_of_the_voxels(tmp_path) -> None:
     for row in result.agreement:
         assert row.agrees
         assert (row.backends, row.one_in) == (("numba", "numpy"), 16)
-        assert 0 < row.voxels[0] == row.voxels[1] < result.select()[0].summary.table.voxels / 4
+        assert 0 < row.voxels[0] == row.voxels[1] < result.select()[0].map_summary.voxels / 4
     assert "fusion by numba equals numpy in" in printed(result)
     longest = {"seconds": {"reference": 3.6, "statistics": 5.1, "keep": 0.4, "all": 9.0}}
     timed = dataclasses.replace(result, manifest=result.manifest | longest)
@@ -122,7 +122,7 @@ def test_without_a_voxel_size_own_data_gets_what_check_suggests(wide, tmp_path) 
     (checked,) = check(config)
     result = semstab.run(config, out=tmp_path / "run", report=False)
     size = result.advice["wide"].voxel_size
-    assert size == checked.suggestion.voxel_size == result.select()[0].summary.table.voxel_size
+    assert size == checked.suggestion.voxel_size == result.select()[0].map_summary.voxel_size
     assert read_yaml(tmp_path / "run" / "config.yaml")["voxel_size"] == size
     assert checked.persistence[1].voxel_size == size
 
@@ -132,7 +132,7 @@ def test_a_model_on_the_built_in_city_has_the_voxels_of_the_citys_own_models() -
     given = {"dataset": city, "check": None, "scenes": ["scene0"]}
     own = resolve(load_config(given))
     predicted = resolve(predicted_config([parse_predictor("colour-clusters")], None, given))
-    assert semstab.run(predicted, report=False).select()[0].summary.table.voxel_size == own.voxel_size
+    assert semstab.run(predicted, report=False).select()[0].map_summary.voxel_size == own.voxel_size
 
 
 def test_a_given_voxel_size_is_told_where_it_lies(wide) -> None:

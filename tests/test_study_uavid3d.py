@@ -68,10 +68,10 @@ def test_from_images_to_numbers_by_the_documented_commands(data, models, tmp_pat
     parts = ["--only", "shared_taxonomy", "--report", "off"]
     called([*study, *settings, *parts, "--out", str(tmp_path / "study"), "-q"])
     result = load_result(tmp_path / "study")
-    units = {(record.variation.sweep, record.unit.model): record.summary for record in result.records}
+    units = {(record.variation.sweep, record.unit.model): record for record in result.records}
     names = load_study("uavid3d").models or []
     assert set(units) == {(sweep, name) for sweep in ("base", "shared_taxonomy") for name in names}
-    classes = {(sweep, summary.table.K) for (sweep, _), summary in units.items()}
+    classes = {(sweep, summary.map_summary.K) for (sweep, _), summary in units.items()}
     assert classes == {("base", 6), ("shared_taxonomy", 3)}
     assert all(summary.frames == 3 for summary in units.values())
     assert [each.model for each in result.regions] == ["sam-raw"]

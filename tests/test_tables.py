@@ -96,10 +96,7 @@ def test_drift_that_few_places_tell_of_is_not_shown(walls):
         dataclasses.replace(found, drift=dataclasses.replace(found.drift, voxels=found.repeated.voxels // 5))
         for found in (row.statistics for row in walls.select())
     ]
-    rows = [
-        dataclasses.replace(row, summary=dataclasses.replace(row.summary, statistics=found))
-        for row, found in zip(walls.select(), few, strict=True)
-    ]
+    rows = [dataclasses.replace(row, statistics=found) for row, found in zip(walls.select(), few, strict=True)]
     assert "drift" in {table.name for table in tables(walls)}
     assert "drift" not in {table.name for table in tables(dataclasses.replace(walls, records=tuple(rows)))}
     assert math.isnan(pooled(rows).drift.value)
@@ -162,7 +159,7 @@ def test_a_comparison_needs_one_taxonomy_and_two_models():
     a, b = (record(voxels((5, 2, SURE)), model=name) for name in "ab")
     assert "cross_model" in [table.name for table in tables(study(a, b))]
     assert "cross_model" not in [table.name for table in tables(study(a))]
-    other = dataclasses.replace(b, summary=dataclasses.replace(b.summary, taxonomy="other"))
+    other = dataclasses.replace(b, taxonomy="other")
     assert "cross_model" not in [table.name for table in tables(study(a, other))]
     shared = [record(voxels((7, 2, SURE)), SHARED, model=name) for name in "ab"]
     rows = rows_of(study(a, other, *shared), "cross_model")

@@ -234,7 +234,7 @@ def test_missing_labels_and_a_single_frame_are_named(tmp_path) -> None:
     with pytest.raises(DataError, match=r"1 missing: labels/right/0003.png"):
         semstab.run(options(folder))
     result = semstab.run(options(folder, incomplete="skip"))
-    assert result.records[0].summary.frames == COUNT - 1
+    assert result.records[0].frames == COUNT - 1
     with pytest.raises(DataError, match="clip: a single frame is selected"):
         semstab.run({**options(folder), "frames": {"stop": 1}})
     with pytest.raises(DataError, match="no images here"):

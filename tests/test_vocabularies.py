@@ -354,7 +354,7 @@ def test_prompts_of_a_model_with_its_own_text_encoder_are_ranked(tmp_path, model
     result = semstab.load_result(tmp_path / "run")
     assert [*result.models] == ["net@few", "net@many"]
     for name, prompts in lists.items():
-        assert len(prompts) == result.record(model=f"net@{name}").summary.table.K
+        assert len(prompts) == result.record(model=f"net@{name}").map_summary.K
     (difference,) = rank_models(result).differences
     assert {difference.model, difference.other} == {"net@few", "net@many"}
     assert difference.low < difference.value < difference.high

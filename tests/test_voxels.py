@@ -13,6 +13,7 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
 from semstab import Events, VoxelTable, backends
+from semstab.data.voxel_keys import in_order
 from semstab.errors import DataError
 from semstab.metrics import entropy, vss
 from semstab.testing import EXACT, SEQUENCES, SUMS, as_frames, assert_same_map, checks, sight_line, voxels
@@ -272,3 +273,12 @@ def test_a_write_that_fails_leaves_the_old_file(tmp_path, monkeypatch, table):
         table.save(path)
     assert path.read_bytes() == old
     assert [p.name for p in tmp_path.iterdir()] == ["map.parquet"]
+
+
+@pytest.mark.parametrize("span", [50, 2**31 - 1], ids=["packed", "too far apart for keys"])
+def test_voxels_are_sorted_by_their_columns_however_far_apart_they_are(span):
+    index = np.random.default_rng(3).integers(-span, span, (500, 3))
+    index[::3, 0] = index[0, 0]
+    expected = np.array(sorted(index.tolist()))
+    np.testing.assert_array_equal(index[in_order(index)], expected)
+    assert len(in_order(index[:0])) == 0

@@ -52,10 +52,7 @@ def wall_study(base: Path) -> tuple[Result, Path]:
     with (base / "wall study.lock").open("w") as lock:
         fcntl.flock(lock, fcntl.LOCK_EX)
         result = load_result(folder) if (folder / "summary.json").exists() else made(base, folder)
-    records = tuple(
-        dataclasses.replace(record, summary=dataclasses.replace(record.summary, fuse_ms_per_frame=12.5))
-        for record in result.records
-    )
+    records = tuple(dataclasses.replace(record, fuse_ms_per_frame=12.5) for record in result.records)
     return dataclasses.replace(result, records=records), folder
 
 

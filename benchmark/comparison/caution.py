@@ -4,10 +4,9 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
 
-from semstab.comparison.entries import EntryNumbers
+from semstab.comparison.entries import Entry
 from semstab.data.contrast import Contrast
-from semstab.data.records import ImageSpace
-from semstab.data.results import UnitSummary
+from semstab.data.records import Record
 from semstab.data.statistics import short
 from semstab.metrics import macro_mean
 from semstab.statistics.agreement import ALPHA
@@ -21,9 +20,9 @@ MUCH_LESS = 0.8
 """A number of one model below this part of the other model's number is reported."""
 
 
-def suspicions(summary: UnitSummary, image_space: ImageSpace) -> Iterator[str]:
+def suspicions(record: Record) -> Iterator[str]:
     """Yield why frames of one model may agree although its labels are poor; nothing if its verdict is not to act."""
-    statistics, recall = summary.statistics, image_space.edge_recall
+    statistics, recall = record.statistics, record.image_space.edge_recall
     if statistics is None or statistics.verdict.level not in ("stable", "usable"):
         return
     if statistics.spots is not None and statistics.spots.labelled < LIMITS.labelled:
@@ -38,7 +37,7 @@ def suspicions(summary: UnitSummary, image_space: ImageSpace) -> Iterator[str]:
 
 def cautions(
     names: tuple[str, str],
-    scenes: Sequence[tuple[EntryNumbers, EntryNumbers]],
+    scenes: Sequence[tuple[Entry, Entry]],
     contrasts: Sequence[Contrast],
 ) -> Iterator[str]:
     """Yield what stands against the conclusion that the more stable of two models is the better one.
@@ -65,15 +64,13 @@ def cautions(
             f"{more} uses fewer classes than {less} ({classes[0]:.1f} against {classes[1]:.1f} effective classes):"
             " merged classes cannot be confused"
         )
-    edges = _means([[scene[k].image_space.edge_recall for scene in scenes] for k in order])
+    edges = _means([[scene[k].record.image_space.edge_recall for scene in scenes] for k in order])
     if edges[0] < MUCH_LESS * edges[1]:
         yield (
             f"labels of {more} follow {edges[0]:.0%} of the edges of depth, labels of {less} {edges[1]:.0%}: coarse or"
             " blurred labels flicker less"
         )
-    for text in dict.fromkeys(
-        text for scene in scenes for text in suspicions(scene[stable].summary, scene[stable].image_space)
-    ):
+    for text in dict.fromkeys(text for scene in scenes for text in suspicions(scene[stable].record)):
         yield f"{more}: {text}"
 
 
@@ -98,6 +95,6 @@ def _means(of_both: Sequence[Sequence[float]]) -> tuple[float, float]:
     return first, second
 
 
-def _effective_classes(entry: EntryNumbers) -> float:
-    statistics = entry.summary.statistics
+def _effective_classes(entry: Entry) -> float:
+    statistics = entry.record.statistics
     return float("nan") if statistics is None or statistics.spots is None else statistics.spots.effective_classes

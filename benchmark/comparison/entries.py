@@ -13,8 +13,7 @@ import numpy as np
 
 from semstab.data.contrast import FrameShare
 from semstab.data.georeference import Georeference
-from semstab.data.records import ImageSpace, Record
-from semstab.data.results import UnitSummary
+from semstab.data.records import Record
 from semstab.data.statistics import LabelledPairs, MapStatistics
 from semstab.engine.series import read_cells, read_names
 from semstab.errors import ConfigError, DataError, summarize_error
@@ -26,39 +25,30 @@ Flicker = Mapping[int, float]
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
-class EntryNumbers:
-    """Numbers of a unit that is compared.
-
-    Attributes:
-        up: The scene's up axis, if it is known.
-        seed: The seed of a simulated scene.
-    """
-
-    summary: UnitSummary
-    image_space: ImageSpace
-    georeference: Georeference | None
-    up: tuple[float, float, float] | None
-    seed: int | None
-
-
-@dataclass(frozen=True, eq=False, kw_only=True)
-class Entry(EntryNumbers):
+class Entry:
     """A unit that is compared: a label source on a scene.
 
     Attributes:
+        record: Its record; of a small summary without files.
+        up: The scene's up axis, if it is known.
+        seed: The seed of a simulated scene.
         where: The folder or the file that it comes from, in print; the model of a run that a program holds.
-        record: Its record in the folder; None for a small summary, which holds no voxels.
-        small: Sums and flicker of a small summary.
+        is_small: True for a small summary, which holds no voxels.
+        small: Sums and flicker, if they are not those of the record's files.
     """
 
+    record: Record
+    georeference: Georeference | None
+    up: tuple[float, float, float] | None
+    seed: int | None
     where: str
-    record: Record | None = None
+    is_small: bool = False
     small: tuple[ClusterSums, Flicker] | None = None
 
     @property
     def pairs(self) -> LabelledPairs:
         """Return the pairs of views of a spot of which both have a label; all of them if that is not known."""
-        statistics = self.summary.statistics
+        statistics = self.record.statistics
         return LabelledPairs() if statistics is None or statistics.spots is None else statistics.spots.pairs
 
     @functools.cached_property
@@ -70,10 +60,9 @@ class Entry(EntryNumbers):
         """
         if self.small is not None:
             return self.small[0]
-        assert self.record is not None
         if (pixels := self.record.pixels) is not None:
             nothing = np.zeros((0, 3), np.int32), np.zeros(0, np.int32), np.zeros((0, 0))
-            return ClusterSums(*nothing, {}, 1.0, classes=pixels.classes, fused=self.summary.frames)
+            return ClusterSums(*nothing, {}, 1.0, classes=pixels.classes, fused=self.record.frames)
         file = self.record.sums_file
         if file is None or not file.is_file():
             raise DataError(f"{self.where}: it has no sums by frame and cube of {self.record.unit.slug}; run it again")
@@ -87,12 +76,11 @@ class Entry(EntryNumbers):
         """Flicker of each frame but the first."""
         if self.small is not None:
             return self.small[1]
-        assert self.record is not None
         return _flicker(self.record.series)
 
     def named(self, frames: Sequence[FrameShare]) -> tuple[FrameShare, ...]:
         """Return frames with the names of their files, where the run stored them."""
-        if self.record is None or self.record.series is None:
+        if self.record.series is None:
             return tuple(frames)
         names = read_names(self.record.series)
         return tuple(replace(frame, name=names.get(frame.frame, "")) for frame in frames)
@@ -100,8 +88,8 @@ class Entry(EntryNumbers):
     @property
     def caveat(self) -> str:
         """Why its agreement does not assess its labels, in the words of its verdict; '' if agreement does."""
-        statistics = self.summary.statistics
-        if self.record is not None and (pixels := self.record.pixels) is not None:
+        statistics = self.record.statistics
+        if (pixels := self.record.pixels) is not None:
             silent = pixels.effective_classes < LEAST_CLASSES
             return f"uninformative: nearly all of its labels are {pixels.largest_class}" if silent else ""
         if statistics is None or statistics.verdict.level not in ("uninformative", "misleading"):
@@ -115,7 +103,7 @@ class Entry(EntryNumbers):
 
     def with_voxels(self, purpose: str) -> Record:
         """Return the record with its voxels. Raises DataError, which names the purpose, if the record has no voxels."""
-        if self.record is None:
+        if self.is_small:
             raise DataError(
                 f"{self.where}: it is a small summary, without the voxels that {purpose} needs; give the folder"
             )
@@ -149,7 +137,7 @@ class RunHandle:
     @property
     def features_alone(self) -> bool:
         """Return whether the model gives features and no labels."""
-        return any(gives_features_alone(entry.summary.statistics) for entry in self.scenes.values())
+        return any(gives_features_alone(entry.record.statistics) for entry in self.scenes.values())
 
     def require_labels(self) -> None:
         """Raise ConfigError if the model gives features alone."""

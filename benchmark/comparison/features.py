@@ -38,7 +38,7 @@ class FeatureDifference:
 
 def agreement_of(entry: Entry) -> FeatureAgreement | None:
     """Return the agreement of a run's features in a scene; None if it has none."""
-    return None if entry.summary.statistics is None else entry.summary.statistics.features
+    return None if entry.record.statistics is None else entry.record.statistics.features
 
 
 def other_network(base: RunHandle, other: RunHandle, scene: str) -> str:

@@ -20,8 +20,9 @@ from semstab.core.types import Float64, Int32, Int64, Mask
 from semstab.data.contrast import Area, FrameShare
 from semstab.data.events import Events
 from semstab.data.measures import dominant
+from semstab.data.voxel_keys import in_order, voxel_keys
 from semstab.data.voxels import VoxelTable
-from semstab.metrics.agreement import shared_rows, voxel_keys
+from semstab.metrics.agreement import shared_rows
 from semstab.statistics.agreement import disagreement
 from semstab.statistics.correctness import join_truth
 
@@ -85,7 +86,7 @@ class Changed:
     @classmethod
     def joined(cls, parts: Sequence[Changed]) -> Changed:
         """Join the changes of several parts."""
-        order = np.lexsort(np.concatenate([part.table.index for part in parts]).T[::-1])
+        order = in_order(np.concatenate([part.table.index for part in parts]))
 
         def column(name: str) -> Any:
             columns = [getattr(part, name) for part in parts]

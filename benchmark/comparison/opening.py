@@ -108,9 +108,8 @@ def handle_of(result: Result, model: str, source: Path | None = None) -> RunHand
     seed = result.manifest.get("seed")
     scenes = {
         scene: Entry(
-            summary=record.summary, image_space=record.image_space, georeference=result.georeference.get(scene),
-            up=result.up.get(scene), seed=seed if isinstance(seed, int) else None, where=str(source or model),
-            record=record,
+            record=record, georeference=result.georeference.get(scene), up=result.up.get(scene),
+            seed=seed if isinstance(seed, int) else None, where=str(source or model),
         )
         for record in result.select(model=model)
         for scene in [record.unit.scene]

@@ -110,7 +110,7 @@ def pair(entries: Sequence[Entry], names: Sequence[str], scope: Scope = THIS_SCE
         DataError: If a file of a run cannot be read.
     """
     result = _paired(entries, names)
-    mixed = len({entry.summary.reduced is None for entry in entries}) > 1
+    mixed = len({entry.record.reduced is None for entry in entries}) > 1
     regions = None if mixed or result.frames_differ else result.regions
     notes = (LABELS_AND_SCORES,) if mixed else ()
     return replace(result, scope=scope, mixed=mixed, regions=regions, notes=(*result.notes, *notes))
@@ -121,7 +121,7 @@ def _paired(entries: Sequence[Entry], names: Sequence[str]) -> Common:
         return Common("images", (OF_IMAGES,), tuple(entry.sums for entry in entries))
     if note := other_frame_of_reference(entries):
         return _apart(entries, note)
-    if len(sizes := {entry.summary.table.voxel_size for entry in entries}) > 1:
+    if len(sizes := {entry.record.map_summary.voxel_size for entry in entries}) > 1:
         note = OTHER_SIZES.format(sizes=" and ".join(f"{size:g} m" for size in sorted(sizes)))
         return replace(_of_whole_maps("cubes", note, entries), sizes_differ=True)
     if note := _no_voxels(entries):
@@ -228,7 +228,7 @@ def on_common_observations(
     runs = [*entries.values()]
     if other_frame_of_reference(runs) or _no_voxels(runs):
         return None
-    samples = _observations_of_the_same_frames([entry.record for entry in runs if entry.record is not None])
+    samples = _observations_of_the_same_frames([entry.record for entry in runs])
     if not samples:
         return None
     shared, notes = _compared(entries, samples)
@@ -301,7 +301,7 @@ def other_frame_of_reference(entries: Sequence[Entry]) -> str:
 def _no_voxels(entries: Sequence[Entry]) -> str:
     """Return why no voxels can be paired; '' if voxels can be paired."""
     for entry in entries:
-        if entry.record is None:
+        if entry.is_small:
             return f"{entry.where} is a small summary, without voxels: {BY_CUBES}"
         if entry.record.voxels_file is None or not entry.record.voxels_file.exists():
             return f"{entry.where} has no voxels: {BY_CUBES}"

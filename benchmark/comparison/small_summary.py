@@ -13,11 +13,13 @@ from typing import Any
 
 import numpy as np
 
-from semstab.comparison.entries import Entry, EntryNumbers, RunHandle, valid_flicker
+from semstab.comparison.entries import Entry, RunHandle, valid_flicker
 from semstab.core.files import ScratchFolder, atomic_path, parse_json, read_limited
 from semstab.core.json_form import from_json, to_json
 from semstab.core.sealed_zip import packed, unpacked
 from semstab.data import parquet
+from semstab.data.georeference import Georeference
+from semstab.data.records import ImageSpace, Record
 from semstab.errors import DataError, sanitize, summarize_error
 from semstab.statistics.cluster_sums import ClusterSums
 
@@ -37,7 +39,12 @@ MANY_GROUPS = 32
 
 
 @dataclass(frozen=True, kw_only=True)
-class _Scene(EntryNumbers):
+class _Scene:
+    summary: Record
+    image_space: ImageSpace
+    georeference: Georeference | None
+    up: tuple[float, float, float] | None
+    seed: int | None
     name: str
     frames: tuple[int, ...]
     flicker: tuple[float, ...]
@@ -68,7 +75,16 @@ def save_summary(
     if video := next((name for name, entry in run.scenes.items() if not entry.sums.layout), None):
         raise DataError(f"{path}: {video} is a video, without a map to summarise; compare the folder of the run")
     scenes = tuple(
-        _Scene(**_numbers(entry), name=name, frames=(*entry.flicker,), flicker=(*entry.flicker.values(),))
+        _Scene(
+            summary=entry.record.without_files(),
+            image_space=entry.record.image_space,
+            georeference=entry.georeference,
+            up=entry.up,
+            seed=entry.seed,
+            name=name,
+            frames=(*entry.flicker,),
+            flicker=(*entry.flicker.values(),),
+        )
         for name, entry in run.scenes.items()
     )
     content = json.dumps({"kind": KIND, "schema": SCHEMA, **to_json(_Content(run.model, scenes, {**run.about}))})
@@ -122,7 +138,11 @@ def load_summary(path: str | Path) -> RunHandle:
             except DataError as error:
                 raise DataError(f"{path}: the sums of {numbers.name} are damaged; write the summary again") from error
             flicker = dict(zip(numbers.frames, numbers.flicker, strict=True))
-            scenes[numbers.name] = Entry(**_numbers(numbers), where=str(path), small=(sums, flicker))
+            scenes[numbers.name] = Entry(
+                record=dataclasses.replace(numbers.summary.without_files(), image_space=numbers.image_space),
+                georeference=numbers.georeference, up=numbers.up, seed=numbers.seed,
+                where=str(path), is_small=True, small=(sums, flicker),
+            )  # fmt: skip
     return RunHandle(content.model, path, content.model, scenes, content.about)
 
 
@@ -130,10 +150,6 @@ def _require_name(path: Path, name: str) -> None:
     """Raise DataError for a name that no folder of a scene or model has."""
     if not name or len(name) > LONGEST_NAME or not name.isprintable():
         raise DataError(f"{path}: {sanitize(repr(name))[:80]} is no name of a scene or model; write the summary again")
-
-
-def _numbers(numbers: EntryNumbers) -> dict[str, Any]:
-    return {field.name: getattr(numbers, field.name) for field in dataclasses.fields(EntryNumbers)}
 
 
 def _archive(content: str, sums: list[ClusterSums], *, single: bool) -> bytes:

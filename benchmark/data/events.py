@@ -15,7 +15,8 @@ from semstab.core.types import Float64, Int32, Int64
 from semstab.data import parquet
 from semstab.data.evidence import Evidence
 from semstab.data.information import entropy_bits, js_divergence, normalise
-from semstab.data.voxels import INDEX, OF_EVENTS, OF_VOXELS, VoxelTable, freeze, in_order, require_memory
+from semstab.data.voxel_keys import in_order
+from semstab.data.voxels import INDEX, OF_EVENTS, OF_VOXELS, VoxelTable, freeze, index_columns, require_memory
 from semstab.errors import DataError
 
 COMPUTED = [name for name in OF_VOXELS if name not in (*INDEX, "evidence")]
@@ -176,14 +177,14 @@ class Events:
         """Return one log of the voxels of several that share none."""
         if len(parts) == 1:
             return parts[0]
-        index = {name: np.concatenate([getattr(part, name) for part in parts]) for name in INDEX}
+        index = np.concatenate([np.stack([part.ix, part.iy, part.iz], axis=1) for part in parts])
         order = in_order(index)
         count = np.concatenate([np.diff(np.append(part.starts, len(part))) for part in parts])
         first = np.cumsum(count) - count
         number = np.repeat(np.arange(len(order)), count[order])
         rows = np.arange(len(number)) + (first[order] - np.cumsum(count[order]) + count[order])[number]
         return cls(
-            **{name: values[order] for name, values in index.items()},
+            **index_columns(index[order]),
             voxel=number,
             frame=np.concatenate([part.frame for part in parts])[rows],
             evidence=Evidence.joined([part.evidence for part in parts], rows),

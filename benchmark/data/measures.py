@@ -269,15 +269,15 @@ ENTROPY = Measure(
 MARGIN = Measure(key="margin", title="Margin", short="M", better="higher", of=margin, range=(0.0, 1.0), panel=False)
 
 RESERVED = frozenset((
-    "K", "accuracy", "advice", "alpha", "alpha_by_meaning", "backend", "categories", "checked", "classes",
+    "accuracy", "advice", "alpha", "alpha_by_meaning", "backend", "categories", "checked", "classes",
     "compensated_flicker_percent", "confused_with", "coverage", "ece", "entropy_between", "entropy_op2",
-    "entropy_within", "feature_alpha",
-    "evidence", "files", "flicker_percent", "frames", "frames_empty", "frames_left_out", "fuse_ms_per_frame",
-    "image_space", "input", "iou", "key", "label", "left_out", "mean_op", "means", "miou", "model", "name", "notes",
-    "observation_accuracy", "observations", "op", "pixels", "points", "precision", "psa", "quality", "recurrent",
-    "reduced", "sbd_excess", "sbd_null", "scene", "scores_left_out", "series", "share", "stages_ms",
-    "statistics", "strata", "summary", "table", "taxonomy", "truth_file", "unit", "up", "variation",
-    "video_measures", "voxel_alpha", "voxel_size", "voxels", "voxels_file", "well_seen", "wrong_of_consistent",
+    "entropy_within", "evidence", "feature_alpha", "files", "flicker_percent", "frames", "frames_empty",
+    "frames_left_out", "fuse_ms_per_frame", "image_space", "input", "iou", "K", "key", "label", "left_out",
+    "map_summary", "mean_op", "means", "miou", "model", "name", "notes", "observation_accuracy", "observations", "op",
+    "pixels", "points", "precision", "psa", "quality", "recurrent", "reduced", "sbd_excess", "sbd_null", "scene",
+    "scores_left_out", "series", "share", "stages_ms", "statistics", "strata", "taxonomy", "truth_file", "unit", "up",
+    "variation", "video_measures", "voxel_alpha", "voxel_size", "voxels", "voxels_file", "well_seen",
+    "wrong_of_consistent",
 ))  # fmt: skip
 """Keys that no measure may have: fields next to its mean in JSON, other differences of maps, other compared numbers."""
 

@@ -15,9 +15,10 @@ from semstab.core.json_form import INLINE
 from semstab.core.palette import KIND_COLORS, KINDS
 from semstab.data import voxels
 from semstab.data.display import as_figure
+from semstab.data.frames import LeftOut
 from semstab.data.georeference import Georeference
 from semstab.data.measures import measures
-from semstab.data.results import Agreement, UnitName, UnitSummary, VoxelAdvice
+from semstab.data.results import Agreement, ReducedScores, TableSummary, UnitName, VoxelAdvice
 from semstab.data.statistics import UNKNOWN, MapStatistics, OutlyingFrames
 from semstab.data.voxels import VoxelTable
 from semstab.errors import ConfigError
@@ -209,9 +210,19 @@ class Record:
     """Record of one finished unit: its numbers, and the names of its files.
 
     Attributes:
-        key: Hash of its inputs and settings, under which it is stored.
-        summary: Its report: unit (scene, model, backend), means, strata, classes, times, and what
-            `semstab.statistics` reports of the map.
+        unit: Its scene, model and backend.
+        frames: Number of fused frames.
+        map_summary: Means, strata and classes of its voxels.
+        flicker_percent: Flicker in the images, mean over the frames.
+        key: Hash of its inputs and settings, under which it is stored; '' in a small summary.
+        variation: The settings in which it differs from the base units.
+        stages_ms: Mean milliseconds a frame by stage, see `STAGES`.
+        left_out: Pixels that were left out of fusion because what they show moves.
+        frames_left_out: Selected frames without a file or a pose.
+        frames_empty: Fused frames without a valid pixel.
+        scores_left_out: The scores that `top_k` left out, if it is set.
+        statistics: What `semstab.statistics.describe` reports of the map, if requested.
+        reduced: The numbers of soft scores that are reduced to labels, for soft scores.
         image_space: Image-space measures of the 'base' units; all NaN elsewhere.
         quality: Quality of the labels of single frames, if `frame_quality` is set.
         video_measures: VC and TC as published, if `video_measures` is set.
@@ -229,9 +240,21 @@ class Record:
         notes: Remarks of the check on its depth and labels, which look wrong but may be right.
     """
 
-    key: str
-    variation: Variation
-    summary: UnitSummary = field(metadata=INLINE)
+    unit: UnitName = field(metadata=INLINE)
+    taxonomy: str
+    frames: int
+    map_summary: TableSummary = field(metadata=INLINE)
+    flicker_percent: float
+    fuse_ms_per_frame: float
+    key: str = ""
+    variation: Variation = Variation()
+    stages_ms: Mapping[str, float] = field(default_factory=dict)
+    left_out: int = 0
+    frames_left_out: int = 0
+    frames_empty: int = 0
+    scores_left_out: LeftOut | None = None
+    statistics: MapStatistics | None = None
+    reduced: ReducedScores | None = None
     image_space: ImageSpace = ImageSpace()
     quality: FrameQuality | None = None
     video_measures: VideoMeasures | None = None
@@ -249,12 +272,38 @@ class Record:
     def __repr__(self) -> str:
         sweep, value = self.variation.sweep, self.variation.value
         varied = "" if sweep == BASE else f", {sweep}" if value is None else f", {sweep} {value:g}"
-        return f"<Record {self.summary.stated}; {self.unit.backend}{varied}>"
+        return f"<Record {self.stated}; {self.unit.backend}{varied}>"
 
     @property
-    def statistics(self) -> MapStatistics | None:
-        """Return the statistics of the map."""
-        return self.summary.statistics
+    def stated(self) -> str:
+        """Its scene and model, the verdict and alpha: 'scene0, m: stable (p .98), alpha .93 (.92 to .95)'."""
+        statistics_text = "" if self.statistics is None else f": {self.statistics.stated}"
+        return f"{self.unit.scene}, {self.unit.model}{statistics_text}"
+
+    def row(self) -> dict[str, str | int | float]:
+        """Return a row: its names, the verdict and the number that it rests on, the size of its map, means of measures.
+
+        Means are of all voxels, and of the recurrent ones. Pixels without a label count as disagreeing in the verdict.
+        Without statistics the verdict is empty, and alpha is NaN.
+        """
+        table, unit = self.map_summary, self.unit
+        alpha = UNKNOWN if self.statistics is None else self.statistics.headline.alpha
+        verdict = None if self.statistics is None else self.statistics.verdict
+        return {
+            "scene": unit.scene, "model": unit.model, "backend": unit.backend,
+            "verdict": "" if verdict is None else verdict.decisive,
+            "probability": math.nan if verdict is None else verdict.decisive_probability,
+            "alpha": alpha.value, "alpha_low": alpha.low, "alpha_high": alpha.high, "confidence": alpha.level,
+            "agreeing": math.nan if self.statistics is None else self.statistics.agreeing,
+            "taxonomy": self.taxonomy, "K": table.K, "voxel_size": table.voxel_size, "frames": self.frames,
+            "points": table.points, "observations": table.observations, "voxels": table.voxels,
+            "mean_op": table.mean_op,
+            **{f"{key}_all": value for key, value in table.means.value.items()},
+            "recurrent_share": table.recurrent.share,
+            **{f"{key}_op3": value for key, value in table.recurrent.means.value.items()},
+            "flicker_percent": self.flicker_percent, "fuse_ms_per_frame": self.fuse_ms_per_frame,
+            "compensated_flicker_percent": self.image_space.compensated_flicker_percent,
+        }  # fmt: skip
 
     @property
     def outlying_frames(self) -> OutlyingFrames | None:
@@ -263,14 +312,13 @@ class Record:
             return self.pixels.outlying_frames
         return None if self.statistics is None else self.statistics.outlying_frames
 
-    @property
-    def unit(self) -> UnitName:
-        """Its scene, model and backend."""
-        return self.summary.unit
-
     def without_own(self) -> Record:
         """Return it without what stands in the unit's own file alone."""
         return replace(self, **OF_THE_UNIT)
+
+    def without_files(self) -> Record:
+        """Return its numbers alone, for a place to which its files do not go along."""
+        return replace(self.without_own(), voxels_file=None, truth_file=None, series=None)
 
     def table(self) -> VoxelTable:
         """Return its voxels, read from their file."""
@@ -473,11 +521,11 @@ class Result:
         return {sweep: tuple(sorted(values)) for sweep, values in values.items()}
 
     @property
-    def runs(self) -> tuple[UnitSummary, ...]:
-        """The summaries of the units at the base settings by every backend, a scene and model after the other."""
+    def runs(self) -> tuple[Record, ...]:
+        """The units at the base settings by every backend, a scene and model after the other."""
         units = (*self.select(), *self.select(BACKENDS))
         groups = dict.fromkeys((record.unit.scene, record.unit.model) for record in units)
-        return tuple(r.summary for group in groups for r in units if (r.unit.scene, r.unit.model) == group)
+        return tuple(r for group in groups for r in units if (r.unit.scene, r.unit.model) == group)
 
     def to_arrow(self) -> pa.Table:
         """Return one row a unit: names, verdict, alpha with its interval, the map's size and means, flicker."""
@@ -492,9 +540,8 @@ class Result:
         return voxels.to_pandas(self._columns())
 
     def _columns(self) -> dict[str, Any]:
-        flicker = {record.unit: record.image_space.compensated_flicker_percent for record in reversed(self.records)}
         benchmark_column: dict[str, str | int | float] = {"benchmark": self.benchmark} if self.benchmark else {}
-        rows = [run.row() | {"compensated_flicker_percent": flicker[run.unit]} | benchmark_column for run in self.runs]
+        rows = [run.row() | benchmark_column for run in self.runs]
         return {name: np.array([row[name] for row in rows]) for name in (rows[0] if rows else ())}
 
     def _repr_html_(self) -> str:
@@ -502,7 +549,7 @@ class Result:
         rows: list[list[voxels.Cell]] = []
         colors = dict[str, str]()
         for run in self.runs:
-            table, unit = run.table, run.unit
+            table, unit = run.map_summary, run.unit
             means = (voxels.number(table.recurrent[measure], measure.digits[0]) for measure in measures())
             numbers = voxels.number(table.mean_op, 2), *means, voxels.number(100 * table.recurrent.share, 2)
             verdict = alpha = ""

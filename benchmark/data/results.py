@@ -10,9 +10,7 @@ from dataclasses import dataclass, field, replace
 
 from semstab.core.json_form import INLINE, inline
 from semstab.core.types import Float32, Int64, UInt16
-from semstab.data.frames import LeftOut
 from semstab.data.measures import RECURRENT, Measure, MeasureMeans
-from semstab.data.statistics import UNKNOWN, MapStatistics
 
 SCHEMA = 1
 """Version of summary.json."""
@@ -147,7 +145,7 @@ class Means:
 
 @dataclass(frozen=True)
 class Recurrent(Means):
-    """Means over the voxels with OP >= 3: JSON has them as in `UnitSummary.row`, `vss_op3`."""
+    """Means over the voxels with OP >= 3: JSON has them as in `Record.row`, `vss_op3`."""
 
     means: MeasureMeans = field(metadata=inline(f"_op{RECURRENT}"))
 
@@ -193,64 +191,6 @@ class TableSummary:
             self, means=unknown(self.means), strata=strata, recurrent=recurrent, classes=classes, well_seen=well_seen,
             categories={}, confused_with={},
         )  # fmt: skip
-
-
-@dataclass(frozen=True)
-class UnitSummary:
-    """One entry of 'runs' in summary.json.
-
-    stages_ms has mean milliseconds a frame by stage, see `STAGES`; left_out counts the pixels that were left out of
-    fusion because what they show moves, frames_left_out the selected frames without a file or a pose, frames_empty
-    the fused frames without a valid pixel; scores_left_out is there with `top_k`; statistics is the report of
-    `semstab.statistics.describe` on the map, or None if not requested; reduced is there for soft scores.
-    """
-
-    unit: UnitName = field(metadata=INLINE)
-    taxonomy: str
-    frames: int
-    table: TableSummary = field(metadata=INLINE)
-    flicker_percent: float
-    fuse_ms_per_frame: float
-    stages_ms: Mapping[str, float] = field(default_factory=dict)
-    left_out: int = 0
-    frames_left_out: int = 0
-    frames_empty: int = 0
-    scores_left_out: LeftOut | None = None
-    statistics: MapStatistics | None = None
-    reduced: ReducedScores | None = None
-
-    def __repr__(self) -> str:
-        return f"<UnitSummary {self.stated}; {self.table.voxels:,} voxels of {self.table.voxel_size:g} m>"
-
-    @property
-    def stated(self) -> str:
-        """Its scene and model, the verdict and alpha: 'scene0, m: stable (p .98), alpha .93 (.92 to .95)'."""
-        statistics_text = "" if self.statistics is None else f": {self.statistics.stated}"
-        return f"{self.unit.scene}, {self.unit.model}{statistics_text}"
-
-    def row(self) -> dict[str, str | int | float]:
-        """Return a row: its names, the verdict and the number that it rests on, the size of its map, means of measures.
-
-        Means are of all voxels, and of the recurrent ones. Pixels without a label count as disagreeing in the verdict.
-        Without statistics the verdict is empty, and alpha is NaN.
-        """
-        table, unit = self.table, self.unit
-        alpha = UNKNOWN if self.statistics is None else self.statistics.headline.alpha
-        verdict = None if self.statistics is None else self.statistics.verdict
-        return {
-            "scene": unit.scene, "model": unit.model, "backend": unit.backend,
-            "verdict": "" if verdict is None else verdict.decisive,
-            "probability": math.nan if verdict is None else verdict.decisive_probability,
-            "alpha": alpha.value, "alpha_low": alpha.low, "alpha_high": alpha.high, "confidence": alpha.level,
-            "agreeing": math.nan if self.statistics is None else self.statistics.agreeing,
-            "taxonomy": self.taxonomy, "K": table.K, "voxel_size": table.voxel_size, "frames": self.frames,
-            "points": table.points, "observations": table.observations, "voxels": table.voxels,
-            "mean_op": table.mean_op,
-            **{f"{key}_all": value for key, value in table.means.value.items()},
-            "recurrent_share": table.recurrent.share,
-            **{f"{key}_op3": value for key, value in table.recurrent.means.value.items()},
-            "flicker_percent": self.flicker_percent, "fuse_ms_per_frame": self.fuse_ms_per_frame,
-        }  # fmt: skip
 
 
 @dataclass(frozen=True)

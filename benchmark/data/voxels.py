@@ -18,6 +18,7 @@ from semstab.data import parquet
 from semstab.data.display import as_figure, from_above
 from semstab.data.evidence import Evidence
 from semstab.data.measures import MeasureMeans, dominant, measures, vss
+from semstab.data.voxel_keys import in_order
 from semstab.errors import DataError, MissingDependencyError
 
 if TYPE_CHECKING:
@@ -108,19 +109,6 @@ OF_EVENTS: Types = {"voxel": np.int32, "frame": np.int32, "evidence": np.float64
 def index_columns(index: npt.NDArray[np.integer[Any]]) -> dict[str, Any]:
     """Return voxel indices (n, 3) as the columns ix, iy, iz."""
     return dict(zip(INDEX, index.T.astype(np.int32), strict=True))
-
-
-def in_order(index: Mapping[str, npt.NDArray[Any]]) -> Int64:
-    """Return the order of voxels by ix, iy, iz."""
-    columns = [index[name].astype(np.int64) for name in INDEX]
-    if not len(columns[0]):
-        return np.zeros(0, np.int64)
-    x, y, z = (column - column.min() for column in columns)
-    width, height = int(y.max()) + 1, int(z.max()) + 1
-    if (int(x.max()) + 1) * width * height >= 2**63:
-        order: Int64 = np.lexsort(columns[::-1])
-        return order
-    return np.argsort((x * width + y) * height + z, kind="stable")
 
 
 def require_memory(path: Path, files: Sequence[Path]) -> None:
@@ -355,7 +343,7 @@ class VoxelTable:
         all_names = [*dict.fromkeys((*names, *(sorting if len(files) > 1 else ())))]
         parts = [parquet.columns(file, all_names) for file in files]
         columns = {name: np.concatenate([part[name] for part in parts]) for name in all_names}
-        order = in_order(columns) if len(files) > 1 else slice(None)
+        order = in_order(np.stack([columns[name] for name in INDEX], axis=1)) if len(files) > 1 else slice(None)
         return {name: columns[name][order] for name in names}
 
     @classmethod
@@ -363,8 +351,7 @@ class VoxelTable:
         """Return one table of the voxels of several that share none."""
         if len(parts) == 1:
             return parts[0]
-        index = {name: np.concatenate([getattr(part, name) for part in parts]) for name in INDEX}
-        order = in_order(index)
+        order = in_order(np.concatenate([part.index for part in parts]))
         columns: dict[str, Any] = {
             name: np.concatenate([getattr(part, name) for part in parts])[order]
             for name in parts[0]._types

@@ -370,7 +370,7 @@ def _contradiction(result: Result) -> str | None:
     if other := [record.unit.backend for record in result.select() if record.unit.backend != result.backend]:
         return f"a run at the base settings is fused by '{other[0]}', not by '{result.backend}'"
     for record in result.records:
-        table = record.summary.table
+        table = record.map_summary
         if not table.strata or (table.voxels and not table.classes):
             return f"{record.unit} has no {'classes' if table.strata else 'strata'}"
     for row in result.agreement:

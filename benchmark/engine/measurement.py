@@ -33,7 +33,7 @@ from semstab.data.records import (
     PixelStatistics,
     Record,
 )
-from semstab.data.results import STAGES, ReducedScores, UnitSummary, slug
+from semstab.data.results import STAGES, ReducedScores, slug
 from semstab.data.voxels import VoxelTable
 from semstab.datasets import Scene
 from semstab.engine.fused_map import SMALL, FusedMap, fused_map
@@ -228,37 +228,21 @@ def record_of(
     points: VoxelTable | Float64,
 ) -> Record:
     """Return the record of a unit from its time series, its result, the statistics of its map and its points (n, 3)."""
-    record = Record(
-        unit_key(unit.identity, task.digest),
-        unit.variation,
-        _summary(unit, task, rows, result, analysis),
-        input=task.digest,
-        files=result.files,
-        checked=result.checked,
+    config, target = unit.config, task.mapping.target
+    of_map = TableSums.read(result.sums).summary(
+        config.voxel_size if unit.fuses else math.nan, target.classes, config.strata
     )
-    if not unit.image_space:
-        return record
-    image_space = ImageSpaceMeter(result.image).result(record.summary.flicker_percent)
-    if task.mapping.target == OF_FEATURES:
-        image_space = image_space.without_classes()
-    up = up_axis(task.scene, points, result.poses) if task.scene.posed else None
-    return replace(record, image_space=image_space, up=up, quality=result.quality, video_measures=result.video_measures)
-
-
-def _summary(unit: Unit, task: Task, rows: Series, result: TileResult, analysis: Analysis | None) -> UnitSummary:
-    """Return the numbers of a unit's map, series and statistics."""
-    config = unit.config
-    sums = TableSums.read(result.sums)
-    table = sums.summary(config.voxel_size if unit.fuses else math.nan, task.mapping.target.classes, config.strata)
-    of_features = task.mapping.target == OF_FEATURES
+    of_features = target == OF_FEATURES
     cut, most = rows.column("scores_left_out"), rows.column("most_scores_left_out")
-    return UnitSummary(
+    record = Record(
         unit=unit.name,
-        taxonomy=task.mapping.target.name,
+        taxonomy=target.name,
         frames=len(task.indices),
-        table=table.without_classes() if of_features else table,
+        map_summary=of_map.without_classes() if of_features else of_map,
         flicker_percent=math.nan if of_features else mean(rows.column("flicker_percent")),
         fuse_ms_per_frame=mean(1e3 * rows.column("seconds")),
+        key=unit_key(unit.identity, task.digest),
+        variation=unit.variation,
         stages_ms={stage: mean(1e3 * rows.column(f"{stage}_seconds")) for stage in STAGES},
         left_out=int(rows.column("left_out").sum()),
         frames_left_out=task.left_out,
@@ -266,7 +250,17 @@ def _summary(unit: Unit, task: Task, rows: Series, result: TileResult, analysis:
         scores_left_out=None if np.isnan(cut).all() else LeftOut(mean(cut), float(np.nanmax(most))),
         statistics=None if analysis is None else analysis.summary,
         reduced=_reduced(result.reduced) if len(result.reduced) else None,
+        input=task.digest,
+        files=result.files,
+        checked=result.checked,
     )
+    if not unit.image_space:
+        return record
+    image_space = ImageSpaceMeter(result.image).result(record.flicker_percent)
+    if of_features:
+        image_space = image_space.without_classes()
+    up = up_axis(task.scene, points, result.poses) if task.scene.posed else None
+    return replace(record, image_space=image_space, up=up, quality=result.quality, video_measures=result.video_measures)
 
 
 def _reduced(sums: Float64) -> ReducedScores:

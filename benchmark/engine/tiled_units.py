@@ -14,6 +14,7 @@ import numpy.typing as npt
 from semstab.core.types import Float64
 from semstab.data.parquet import tile_of
 from semstab.data.records import TRUTH, VOXELS, Record
+from semstab.data.voxel_keys import in_order
 from semstab.data.voxels import VoxelTable
 from semstab.engine.folder import Folder
 from semstab.engine.measurement import (
@@ -222,4 +223,4 @@ def _centers(folder: Path, files: Iterable[str], voxel_size: float, voxels: int)
         return np.zeros((0, 3))
     parts = [VoxelTable.columns(file, ("ix", "iy", "iz")) for file in tables]
     index = np.concatenate([np.stack([*part.values()], axis=1)[::step] for part in parts])
-    return (index[np.lexsort(index.T[::-1])] + 0.5) * voxel_size
+    return (index[in_order(index)] + 0.5) * voxel_size

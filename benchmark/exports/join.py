@@ -18,13 +18,13 @@ from semstab.core.files import atomic_path
 from semstab.core.prefetch import SizedCache
 from semstab.core.types import Float64, Int64
 from semstab.data.tiles import AT_HAND, TileIndex
+from semstab.data.voxel_keys import voxel_keys
 from semstab.data.voxels import VoxelTable
 from semstab.datasets.files.surfaces import open_las, points_at_once
 from semstab.datasets.formats.ply import Header
 from semstab.errors import ConfigError, DataError
 from semstab.exports import clouds
 from semstab.exports.voxels import ExportedUnit, ExportedVoxels
-from semstab.metrics.agreement import voxel_keys
 
 if TYPE_CHECKING:
     import laspy

@@ -33,7 +33,7 @@ def write_taxonomy(run: Path, record: Record, file: Path) -> Grouping:
     with settings_of_folder(run) as config:
         taxonomy = config.taxonomy
     space = (
-        LabelSpace(record.summary.taxonomy, tuple(row.name for row in record.summary.table.classes))
+        LabelSpace(record.taxonomy, tuple(row.name for row in record.map_summary.classes))
         if taxonomy is None
         else LabelSpace.load(taxonomy)
     )

@@ -26,10 +26,11 @@ from semstab.data.parquet import files_of
 from semstab.data.records import OVERVIEW, Record, Result
 from semstab.data.results import slug
 from semstab.data.tiles import AT_HAND, TileIndex
+from semstab.data.voxel_keys import in_order, voxel_keys
 from semstab.data.voxels import VoxelTable
 from semstab.errors import ConfigError, DataError
 from semstab.metrics import CATEGORIES, categories
-from semstab.metrics.agreement import rows_of, voxel_keys
+from semstab.metrics.agreement import rows_of
 from semstab.report.figures.maps import Overview
 from semstab.statistics import psa
 from semstab.statistics.acceptance import AcceptanceThresholds
@@ -205,7 +206,7 @@ class ExportedUnit:
             {name: replace(column, values=column.values[keep]) for name, column in columns.items()},
             names,
             _colors(record.voxels_file.parents[1] / OVERVIEW / f"{slug(scene, model)}.npz", table.K),
-            record.summary.taxonomy,
+            record.taxonomy,
             self._result.up.get(scene) if georeference is None else (0.0, 0.0, 1.0),
             georeference,
             self._result.benchmark,
@@ -216,7 +217,7 @@ def together(parts: Sequence[ExportedVoxels]) -> ExportedVoxels:
     """Return the voxels of several tiles as one."""
     if len(parts) == 1:
         return parts[0]
-    order = np.lexsort(np.concatenate([part.table.index for part in parts]).T[::-1])
+    order = in_order(np.concatenate([part.table.index for part in parts]))
     columns = {
         name: replace(column, values=np.concatenate([part.columns[name].values for part in parts])[order])
         for name, column in parts[0].columns.items()

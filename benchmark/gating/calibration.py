@@ -11,6 +11,7 @@ from semstab.comparison.opening import open_run
 from semstab.comparison.voxels import in_share, share_of
 from semstab.data.records import Record
 from semstab.data.tiles import Tiles, side_by_side
+from semstab.data.voxel_keys import in_order
 from semstab.data.voxels import VoxelTable
 from semstab.errors import ConfigError, DataError
 from semstab.statistics.acceptance import AcceptanceThresholds, calibrate
@@ -36,7 +37,7 @@ def calibrate_run(run: str | Path, *, precision: float = 0.95, confidence: float
                 " run it on a scene that has it, without --no-truth"
             )
         maps.append(_with_truth(record, record.truth_file))
-        sampled = min(sampled, share_of(record.summary.table.voxels))
+        sampled = min(sampled, share_of(record.map_summary.voxels))
     first = maps[0][0]
     for table, _ in maps[1:]:
         if (table.classes, table.voxel_size) != (first.classes, first.voxel_size):
@@ -48,12 +49,12 @@ def calibrate_run(run: str | Path, *, precision: float = 0.95, confidence: float
 
 def _with_truth(record: Record, truth_file: Path) -> tuple[VoxelTable, Truth]:
     """Return a map with its true classes, or a sample of a very large map by a hash of the location."""
-    share, parts = share_of(record.summary.table.voxels), []
+    share, parts = share_of(record.map_summary.voxels), []
     files = [file for file in (record.voxels_file, truth_file) if file is not None]
     for table, truth in side_by_side([Tiles.open(file, VoxelTable) for file in files]):
         sample = table.rows(in_share(table, share))
         parts.append((sample, join_truth(sample, truth).label))
-    order = np.lexsort(np.concatenate([table.index for table, _ in parts]).T[::-1])
+    order = in_order(np.concatenate([table.index for table, _ in parts]))
     label = np.concatenate([labels for _, labels in parts])[order]
     return VoxelTable.joined([table for table, _ in parts]), Truth(label >= 0, label)
 

@@ -184,7 +184,7 @@ def require_values(rule: Rule, pairs: Sequence[Pair]) -> None:
                 raise ConfigError(
                     f"rule '{rule.text}': {entry.where} has no {measure_text}: {NOTHING}; {rule.measure.if_missing}"
                 )
-        mixed = old is not None and (new.summary.reduced is None) != (old.summary.reduced is None)
+        mixed = old is not None and (new.record.reduced is None) != (old.record.reduced is None)
         if mixed and (rule.measure.quantity in OF_EVIDENCE or isinstance(rule.measure.quantity, Measure)):
             raise ConfigError(f"rule '{rule.text}': {SCORES}")
 
@@ -263,7 +263,7 @@ def silence_notes(rule: Rule, pairs: Sequence[Pair]) -> list[str]:
     if not bounds_alpha(rule):
         return []
     return [
-        f"{new.summary.unit.scene}: the run gives no label in {1 - new.pairs.share:.1%} of the pairs of views, which"
+        f"{new.record.unit.scene}: the run gives no label in {1 - new.pairs.share:.1%} of the pairs of views, which"
         f" count as disagreeing: alpha is {short(value_of(rule, new), digits=3)}, and"
         f" {short(value(new.sums, ALPHA.key), digits=3)} of what it labels"
         for new, _ in pairs
@@ -278,7 +278,7 @@ def _is_nearly_one_class(sums: ClusterSums | None) -> bool:
 
 def _same_frames(new: Entry, base: Entry) -> bool:
     """Return whether both are of the same frames, in some of which a model may have given no label."""
-    return new.summary.frames == base.summary.frames and within_a_flight(new.sums, base.sums)
+    return new.record.frames == base.record.frames and within_a_flight(new.sums, base.sums)
 
 
 def _covered(new: ClusterSums, base: ClusterSums) -> float:

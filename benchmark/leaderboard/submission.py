@@ -194,16 +194,16 @@ def require_whole(benchmark: Benchmark, handle: RunHandle) -> None:
     for scene in benchmark.scenes:
         if (entry := handle.scenes.get(scene)) is None:
             raise DataError(f"{handle.where}: {scene} of {benchmark.id} is missing; run all of its scenes")
-        summary, digests = entry.summary, (benchmark.digests or {}).get(scene)
-        if digests is not None and summary.frames != len(digests.split()):
+        record, digests = entry.record, (benchmark.digests or {}).get(scene)
+        if digests is not None and record.frames != len(digests.split()):
             raise DataError(
-                f"{handle.where}: {scene} has {summary.frames} frames, but {len(digests.split())} in {benchmark.id};"
+                f"{handle.where}: {scene} has {record.frames} frames, but {len(digests.split())} in {benchmark.id};"
                 " run it again"
             )
-        if not math.isclose(summary.table.voxel_size, benchmark.voxel_size):
+        if not math.isclose(record.map_summary.voxel_size, benchmark.voxel_size):
             raise DataError(f"{handle.where}: its voxels are not those of {benchmark.id}; run it again")
-        if summary.statistics is None or (benchmark.statistics and not entry.sums.truth):
-            lacking = "statistics" if summary.statistics is None else "ground truth"
+        if record.statistics is None or (benchmark.statistics and not entry.sums.truth):
+            lacking = "statistics" if record.statistics is None else "ground truth"
             raise DataError(f"{handle.where}: {scene} has no {lacking}; run it again")
     if more := [scene for scene in handle.scenes if scene not in benchmark.scenes]:
         raise DataError(f"{handle.where}: {more[0]} is no scene of {benchmark.id}; run it again")
@@ -222,7 +222,7 @@ def _benchmark_of(run: Path, config: Config) -> Benchmark:
 
 
 def _about(benchmark: Benchmark, result: Result, config: Config, handle: RunHandle, card: ModelCard) -> Submission:
-    network = [entry.summary.stages_ms.get("network", math.nan) for entry in handle.scenes.values()]
+    network = [entry.record.stages_ms.get("network", math.nan) for entry in handle.scenes.values()]
     predicted = config.dataset.name == PREDICTED and not np.isnan(network).all()
     versions = {name: version for name in PACKAGES if (version := version_of(name))}
     return Submission(

@@ -43,7 +43,7 @@ class FusedResult(Result):
         record = self.record()
         assert record.statistics is not None
         flicker = record.image_space.compensated_flicker_percent
-        return Summary.of(record.summary.frames, record.summary.table, record.statistics, flicker)
+        return Summary.of(record.frames, record.map_summary, record.statistics, flicker)
 
     def report(self, path: str | Path) -> Path:
         """Write report.html, one file without a network; return its path."""

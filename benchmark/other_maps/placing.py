@@ -14,8 +14,8 @@ import numpy.typing as npt
 from semstab.config import nearest
 from semstab.core.types import Float64, Int32, Int64
 from semstab.data.georeference import Georeference
+from semstab.data.voxel_keys import voxel_keys
 from semstab.errors import ConfigError, DataError
-from semstab.metrics.agreement import voxel_keys
 from semstab.other_maps.classes import NONE
 from semstab.other_maps.clouds import System
 

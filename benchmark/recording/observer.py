@@ -26,7 +26,7 @@ from semstab.data.frames import Frame
 from semstab.data.labels import LabelSpace
 from semstab.data.measures import measures
 from semstab.data.records import Record, RegionFlicker, Result
-from semstab.data.results import UnitName, UnitSummary
+from semstab.data.results import TableSummary, UnitName
 from semstab.data.voxels import VoxelTable
 from semstab.datasets import Scene
 from semstab.engine.folder import load_result
@@ -120,7 +120,7 @@ class GroupLog:
             stream.log(where, image_of_features, over_camera(stride))
 
     def log_unit(
-        self, stream: rr.RecordingStream, summary: UnitSummary, table: VoxelTable, tolerance: float, factor: int = 1,
+        self, stream: rr.RecordingStream, record: Record, table: VoxelTable, tolerance: float, factor: int = 1,
         moved: UInt8 | None = None,
     ) -> None:  # fmt: skip
         """Log a unit's final voxels, their differences from the drawn unit, its numbers, the agreement of its frames.
@@ -128,25 +128,26 @@ class GroupLog:
         - `factor`: the factor of a table that is thinned already: it is not compared
         - `moved`: (n,) the states of the table's voxels, if movers were found
         """
-        unit, first = summary.unit, drawn(self.task)
+        unit, first = record.unit, drawn(self.task)
         if factor == 1:
             self._tables[unit.backend] = table
         if first in self._tables and factor == 1:
             for other in self._tables if unit.backend == first else [unit.backend]:
                 if other != first:
                     self._log_difference(stream, first, other, tolerance)
-        silent = not_assessed(summary)
+        silent = not_assessed(record)
         note = self._map(unit.backend).finish(stream, table, factor, assessed=not silent, moved=moved)
         note += f"; {silent}" if silent else ""
-        recurrent = summary.table.recurrent
+        of_map = record.map_summary
+        recurrent = of_map.recurrent
         means = (f"{m.named} {recurrent[m]:.{m.digits[0]}f} {m.unit}".rstrip() for m in measures())
         text = (
-            f"{unit.model}, {unit.backend}: {summary.table.voxels:,} voxels, mean OP {summary.table.mean_op:.2f},"
-            f" {', '.join(means)} (K = {summary.table.K}){note}"
+            f"{unit.model}, {unit.backend}: {of_map.voxels:,} voxels, mean OP {of_map.mean_op:.2f},"
+            f" {', '.join(means)} (K = {of_map.K}){note}"
         )
         stream.log(path(unit.scene, "log"), rr.TextLog(text))
-        if summary.statistics is not None:
-            document = rr.TextDocument(agreement_report(summary.statistics), media_type=rr.MediaType.MARKDOWN)
+        if record.statistics is not None:
+            document = rr.TextDocument(agreement_report(record.statistics), media_type=rr.MediaType.MARKDOWN)
             stream.log(path(unit.scene, "agreement", unit.model), document, static=True)
 
     def log_flips(self, stream: rr.RecordingStream, clock: Clock) -> None:
@@ -277,7 +278,7 @@ class Recording(Observer):
                 continue
             try:
                 if pictures and not isinstance(task.scene, _ClosedScene):
-                    self._replay_frames(task, records[0].summary)
+                    self._replay_frames(task, records[0].map_summary)
             except (SemstabError, OSError) as error:
                 logger.warning("%s, %s: recorded without pictures (%s)", scene, model, error)
             background.drain()
@@ -360,11 +361,11 @@ class Recording(Observer):
         """Return the backend that is drawn among those that are fused now."""
         return drawn(dataclasses.replace(self._planned(task), backends=task.backends))
 
-    def _replay_frames(self, task: Task, summary: UnitSummary) -> None:
+    def _replay_frames(self, task: Task, of_map: TableSummary) -> None:
         """Read and fuse the frames of a task again; where the map would not fit into memory, drift is left out."""
-        config, scene, K = self._plan.config, task.scene.name, summary.table.K
+        config, scene, K = self._plan.config, task.scene.name, of_map.K
         posed = task.scene.posed
-        fits = expected_bytes(REPLAY, summary.table.voxels, 0, K, soft=True) < available_bytes() / 2
+        fits = expected_bytes(REPLAY, of_map.voxels, 0, K, soft=True) < available_bytes() / 2
         self._fused = create(REPLAY, voxel_size=config.voxel_size, num_classes=K) if fits and posed else None
         frames = prefetch(
             lambda index: read(task, index, config.pixel_stride, color=not posed),
@@ -379,18 +380,18 @@ class Recording(Observer):
             self._opened()[0].log(path(scene, "log"), rr.TextLog(text))
 
     def _log_unit(self, group: GroupLog, record: Record, table: VoxelTable, factor: int = 1) -> None:
-        summary, moved = record.summary, states_of(record, table.centers)
+        moved, unit = states_of(record, table.centers), record.unit
         stream, background = self._opened()
-        self._logged.add(summary.unit)
-        if not_assessed(summary):
-            self._not_assessed.add((summary.unit.scene, summary.unit.model))
+        self._logged.add(unit)
+        if not_assessed(record):
+            self._not_assessed.add((unit.scene, unit.model))
         if moved is not None:
-            self._with_movers.add((summary.unit.scene, summary.unit.model))
+            self._with_movers.add((unit.scene, unit.model))
         tolerance = self._plan.config.tolerance
 
         def job() -> None:
-            group.log_unit(stream, summary, table, tolerance, factor, moved)
-            self._scenes[summary.unit.scene].see(stream, group.task, table)
+            group.log_unit(stream, record, table, tolerance, factor, moved)
+            self._scenes[unit.scene].see(stream, group.task, table)
             self._outdated = True
             if self._sent == 1:  # later layouts wait for the end: each has all scenes
                 self._send_layout(stream)
@@ -489,7 +490,7 @@ def _plan_of(run: Path, config: Config, result: Result) -> Plan:
         axis, posed = None if up is None else np.array(up), record.pixels is None
         scene = _ClosedScene(unit.scene, result.models, axis, posed=posed)
         classes = next(record.tiles()).classes if record.pixels is None else record.pixels.classes
-        space = LabelSpace(record.summary.taxonomy, classes)
+        space = LabelSpace(record.taxonomy, classes)
         if config.taxonomy is not None:
             with contextlib.suppress(SemstabError):
                 space = LabelSpace.load(config.taxonomy)

@@ -75,7 +75,7 @@ class Pooled:
 
 def pooled(records: Sequence[Record]) -> Pooled:
     """Pool the voxels of one or more units; the time of a frame is the macro mean."""
-    tables = [record.summary.table for record in records]
+    tables = [record.map_summary for record in records]
     voxels = sum(table.voxels for table in tables)
     strata = tuple(pool(rows, voxels) for rows in zip(*(table.strata for table in tables), strict=True))
     names = dict.fromkeys(row.name for table in tables for row in table.classes)
@@ -89,7 +89,7 @@ def pooled(records: Sequence[Record]) -> Pooled:
         strata=strata,
         classes=tuple(pool(rows, voxels) for rows in of_class),
         well_seen=tuple(split_last(tables)),
-        fuse_ms_per_frame=macro_mean([record.summary.fuse_ms_per_frame for record in records]),
+        fuse_ms_per_frame=macro_mean([record.fuse_ms_per_frame for record in records]),
         psa=_estimate(records, lambda stats: stats.agreement.psa_op2),
         alpha=_estimate(records, lambda stats: stats.headline.alpha),
         drift=_estimate(records, lambda stats: stats.drift.sbd_op2 if stats.order_known else UNDEFINED),

@@ -10,11 +10,11 @@ import yaml
 
 from semstab.backends import rule_of
 from semstab.comparison.caution import suspicions
-from semstab.config import BACKENDS, BASE
+from semstab.config import BACKENDS
 from semstab.data.features import OF_FEATURES
 from semstab.data.measures import VSS
 from semstab.data.records import Record, Result
-from semstab.data.results import UnitSummary, VoxelAdvice
+from semstab.data.results import VoxelAdvice
 from semstab.data.statistics import OutlyingFrames, short
 from semstab.datasets import GROUND_TRUTH
 from semstab.metrics import macro_mean
@@ -44,7 +44,7 @@ def noted(result: Result) -> Iterator[str]:
 
 def warnings(result: Result) -> Iterator[str]:
     """Yield the facts without which a run would be misread, the most important first, each with a remedy."""
-    runs = [record.summary for record in result.select()]
+    runs = result.select()
     for run in runs:
         if run.frames_left_out:
             yield (
@@ -69,8 +69,8 @@ def warnings(result: Result) -> Iterator[str]:
                 f"{_name(run, result)}: top_k leaves out {cut.mean:.2%} of a pixel's scores on average,"
                 f" {cut.most:.2%} at most; no belief changes by more than that"
             )
-    seen_once = sum(row.voxels for run in runs for row in run.table.strata if row.name == "OP=1")
-    once = seen_once / max(1, sum(run.table.voxels for run in runs))
+    seen_once = sum(row.voxels for run in runs for row in run.map_summary.strata if row.name == "OP=1")
+    once = seen_once / max(1, sum(run.map_summary.voxels for run in runs))
     if once >= MOSTLY_ONCE:
         yield (
             f"{once:.0%} of the voxels were seen in one frame only, and look stable for that reason; larger voxels"
@@ -88,13 +88,13 @@ def warnings(result: Result) -> Iterator[str]:
             " labels: semstab-bench show RUN reduced"
         )
     for record in result.select():
-        yield from (f"{_name(record.summary, result)}: {text}" for text in (*_suspicions(record), *_traffic(record)))
+        yield from (f"{_name(record, result)}: {text}" for text in (*_suspicions(record), *_traffic(record)))
     yield from _one_class_covers(runs)
 
 
 def _not_counting_frames(result: Result) -> Iterator[str]:
     """Yield which maps have evidence by another rule than the mean, of which what counts frames is not known."""
-    units = [record.summary for sweep in (BASE, BACKENDS) for record in result.select(sweep)]
+    units = (*result.select(), *result.select(BACKENDS))
     labelled = [run for run in units if run.taxonomy != OF_FEATURES.name]
     assessed = [(run.unit.backend, run.statistics) for run in labelled if run.statistics is not None]
     names = [name for name, stats in assessed if stats.repeated.voxels and math.isnan(stats.agreement.psa_op2.value)]
@@ -105,12 +105,12 @@ def _not_counting_frames(result: Result) -> Iterator[str]:
         )
 
 
-def _one_class_covers(runs: Sequence[UnitSummary]) -> Iterator[str]:
+def _one_class_covers(runs: Sequence[Record]) -> Iterator[str]:
     """Yield which classes cover most of a map, so that they determine most of its numbers."""
     covering: dict[str, list[tuple[str, float]]] = {}
-    for run in (summary for summary in runs if summary.taxonomy != OF_FEATURES.name):
-        if max(row.share for row in run.table.classes) >= ONE_CLASS:
-            largest = max(run.table.classes, key=lambda row: row.voxels)
+    for run in (run for run in runs if run.taxonomy != OF_FEATURES.name):
+        if max(row.share for row in run.map_summary.classes) >= ONE_CLASS:
+            largest = max(run.map_summary.classes, key=lambda row: row.voxels)
             covering.setdefault(largest.name, []).append((run.unit.model, largest.share))
     for name, shares in covering.items():
         all_of_them = len(shares) == len(runs)
@@ -156,7 +156,7 @@ def outlying_line(outlying: OutlyingFrames, of: str = "", *, most: int = MOST_FR
     return f"{head}: {len(names)} of {outlying.judged}{unjudged}, {' '.join(names[:most])}{more}"
 
 
-def not_assessed(run: UnitSummary) -> str:
+def not_assessed(run: Record) -> str:
     """Return why agreement does not assess a map: nearly all of it is one class; '' if agreement assesses it."""
     statistics = run.statistics
     if statistics is None or statistics.spots is None or statistics.verdict.level != "uninformative":
@@ -186,7 +186,7 @@ def _is_untested(record: Record) -> bool:
 def _suspicions(record: Record) -> Iterator[str]:
     """Yield reasons why frames may agree although the labels are poor; of the ground truth none."""
     if record.unit.model != GROUND_TRUTH:
-        yield from suspicions(record.summary, record.image_space)
+        yield from suspicions(record)
 
 
 def _traffic(record: Record) -> Iterator[str]:
@@ -201,7 +201,7 @@ def _traffic(record: Record) -> Iterator[str]:
     )
 
 
-def _name(run: UnitSummary, result: Result) -> str:
+def _name(run: Record, result: Result) -> str:
     return f"{run.unit.scene}, {run.unit.model}" if len(result.scenes) > 1 else run.unit.model
 
 
@@ -227,7 +227,7 @@ def _size(scene: str, advice: VoxelAdvice, result: Result) -> str:
     )
 
 
-def mixed(runs: Sequence[UnitSummary]) -> bool:
+def mixed(runs: Sequence[Record]) -> bool:
     """Return whether some runs are of hard labels and others of soft scores."""
     return len({run.reduced is None for run in runs}) > 1
 
@@ -244,13 +244,13 @@ def _ranking(result: Result) -> Iterator[str]:
     """Yield that the order of the models by VSS changes if only recurrent voxels count."""
     records = comparable(result)
     means = {name: pooled(rows) for name, rows in by_model(records).items()}
-    if mixed([record.summary for record in result.select()]):
+    if mixed(result.select()):
         return
     if not means or any(voxels.recurrent.voxels < ENOUGH for voxels in means.values()):
         return
     all_voxels = _order({name: voxels.every[VSS] for name, voxels in means.items()})
     recurrent = _order({name: voxels.recurrent[VSS] for name, voxels in means.items()})
-    taxonomy = records[0].summary.taxonomy
+    taxonomy = records[0].taxonomy
     if all_voxels != recurrent:
         yield (
             f"VSS of all voxels misleads: in one taxonomy ({taxonomy}) its order is {all_voxels}, and {recurrent} for"
@@ -265,7 +265,7 @@ def _order(values: Mapping[str, float]) -> str:
 def _least_seen(records: Sequence[Record]) -> Iterator[str]:
     """Yield the paradox between scenes: the scene with the highest mean VSS may be the one seen least."""
     for model, rows in by_model(records).items():
-        tables = {row.unit.scene: row.summary.table for row in rows if row.summary.table.voxels}
+        tables = {row.unit.scene: row.map_summary for row in rows if row.map_summary.voxels}
         if len(tables) < 2:
             continue
         steadiest = max(tables, key=lambda name: tables[name][VSS])

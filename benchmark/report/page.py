@@ -228,7 +228,7 @@ def _scenes(result: Result, folder: Path, above: Mapping[str, FromAbove]) -> Ite
             if path.exists():
                 overviews[record.unit.model] = Overview.load(path)
         up, colors = result.up.get(scene), {name: k for k, name in enumerate(result.models)}
-        labelled = [record for record in records if record.summary.taxonomy != OF_FEATURES.name]
+        labelled = [record for record in records if record.taxonomy != OF_FEATURES.name]
         mapped = [] if up is None else [record for record in labelled if record.voxels_file is not None]
         yield {
             "name": scene,
@@ -278,7 +278,7 @@ def _map(
             break
         step += 1
     kinds = np.where(rows == EMPTY, len(CATEGORIES), category[rows]).astype(np.uint8)
-    silent = not_assessed(record.summary)
+    silent = not_assessed(record)
     shades = [NOT_ASSESSED] * len(CATEGORIES) if silent else CATEGORY_COLORS
     palette = np.array([(k * 67 % 256, k * 131 % 256, k * 29 % 256) for k in range(table.K)], dtype=np.uint8)
     palette = palette if overview is None else overview.palette
@@ -482,10 +482,9 @@ def _subtitle(result: Result) -> str:
         counts.append((len(maps), "map"))
     parts = [f"{n:,} {name}{'' if n == 1 else 's'}" for n, name in counts]
     if records := result.select():
-        run = records[0].summary
-        classes = " and ".join(map(str, sorted({record.summary.table.K for record in records})))
-        parts += [f"{run.frames} frames", f"{classes} classes"]
-        fused = [f"voxels of {run.table.voxel_size:g} m", f"fused by {result.backend}"]
+        classes = " and ".join(map(str, sorted({record.map_summary.K for record in records})))
+        parts += [f"{records[0].frames} frames", f"{classes} classes"]
+        fused = [f"voxels of {records[0].map_summary.voxel_size:g} m", f"fused by {result.backend}"]
         parts += ["no depth, no poses"] if records[0].pixels is not None else fused
     definition = [f"definition {result.benchmark.partition('(')[2].rstrip(')')}"] if result.benchmark else []
     return " · ".join([*parts, *definition])

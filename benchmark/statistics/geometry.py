@@ -19,10 +19,11 @@ from semstab.core.types import Int64
 from semstab.data.frames import Frame
 from semstab.data.labels import IGNORE_8BIT, IGNORE_16BIT
 from semstab.data.statistics import Losses
+from semstab.data.voxel_keys import voxel_keys
 from semstab.data.voxels import VoxelTable
 from semstab.errors import DataError
 from semstab.metrics import dominant
-from semstab.metrics.agreement import shared_rows, voxel_keys
+from semstab.metrics.agreement import shared_rows
 from semstab.statistics.accumulate import Cubes
 from semstab.statistics.agreement import psa
 from semstab.statistics.cluster_sums import mean_functional

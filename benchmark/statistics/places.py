@@ -11,8 +11,8 @@ import numpy.typing as npt
 
 from semstab.core.types import Float64, Int32, Int64, Mask
 from semstab.data.records import Record
+from semstab.data.voxel_keys import voxel_keys
 from semstab.data.voxels import VoxelTable
-from semstab.metrics.agreement import voxel_keys
 from semstab.statistics.agreement import psa
 from semstab.statistics.observations import SpotObservations
 

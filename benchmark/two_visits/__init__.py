@@ -165,7 +165,6 @@ def _scene(
         tasks = []
         for handle, entry in zip(handles, entries, strict=True):
             assert handle.source is not None
-            assert entry.record is not None
             manifest = _manifest(handle)
             tasks.append(held.enter_context(task_of(handle.source, entry.record, manifest, code)))
         visited = _asked(tasks, to_first, handles)

@@ -362,7 +362,7 @@ class TopViews:
         """Return the unit's voxels that are seen from above."""
         slug = record.unit.slug
         if self._last is None or self._last[0] != slug:
-            large = record.in_tiles and record.summary.table.voxels > MOST
+            large = record.in_tiles and record.map_summary.voxels > MOST
             table = topmost(record.tiles(), up) if large else self._tables.table_of(record)
             self._last = slug, FromAbove.of(table, up)
         return self._last[1]

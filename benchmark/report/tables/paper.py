@@ -237,6 +237,6 @@ def _of(means: Means) -> Numbers:
 
 
 def _macro(records: Sequence[Record]) -> Numbers:
-    tables = [record.summary.table for record in records]
+    tables = [record.map_summary for record in records]
     vss, sbd, entropy = (macro_mean([table[measure] for table in tables]) for measure in (VSS, SBD, ENTROPY))
     return 100.0, vss, sbd, entropy

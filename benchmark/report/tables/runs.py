@@ -65,17 +65,17 @@ def runs_table(results: Mapping[str, Result]) -> Table:
 
 
 def _row(record: Record) -> Row:
-    run, statistics, unknown = record.summary, record.statistics, math.nan
-    recurrent = run.table.recurrent
+    statistics, unknown = record.statistics, math.nan
+    recurrent = record.map_summary.recurrent
     means = [recurrent[measure] if recurrent.voxels >= ENOUGH else unknown for measure in (VSS, SBD)]
     verdict = None if statistics is None else statistics.verdict
     headline = None if statistics is None else statistics.headline
     correct = None if statistics is None else statistics.correctness
     return (
-        run.unit.scene, run.unit.model, "" if verdict is None else verdict.decisive,
+        record.unit.scene, record.unit.model, "" if verdict is None else verdict.decisive,
         unknown if verdict is None else 100 * verdict.decisive_probability,
         unknown if headline is None else headline.alpha,
         "" if headline is None else headline.alpha.scope,
         unknown if statistics is None else 100 * statistics.agreeing, record.image_space.compensated_flicker_percent,
-        *means, unknown if correct is None else correct.miou_op2, run.table.voxel_size, run.frames,
+        *means, unknown if correct is None else correct.miou_op2, record.map_summary.voxel_size, record.frames,
     )  # fmt: skip

@@ -99,7 +99,7 @@ def _sweep_row(sweep: Sweep, level: Level, *, assessed: bool) -> Row:
 def reduced(result: Result) -> list[Table]:
     """Return numbers that compare hard labels with soft scores, which are reduced to each pixel's likeliest class."""
     records = result.select()
-    if len({record.summary.reduced is None for record in records}) < 2:
+    if len({record.reduced is None for record in records}) < 2:
         return []
     columns = (
         Column("scene", "Scene"),
@@ -119,7 +119,7 @@ def reduced(result: Result) -> list[Table]:
 
 
 def _reduced_row(record: Record) -> Row:
-    reduced, table, statistics = record.summary.reduced, record.summary.table, record.statistics
+    reduced, table, statistics = record.reduced, record.map_summary, record.statistics
     if reduced is not None:
         return record.unit.scene, reduced.vss_all, reduced.vss_op3, reduced.voxel_alpha_op2
     alpha = math.nan if statistics is None else statistics.agreement.voxel_alpha_op2.value

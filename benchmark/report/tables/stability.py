@@ -25,8 +25,8 @@ def of_measures(*, over: str, compared: bool = False) -> list[Column]:
 
 def settings(records: Sequence[Record]) -> str:
     """Return the voxel sizes and taxonomies of the units, as a sentence."""
-    sizes = sorted({record.summary.table.voxel_size for record in records})
-    spaces = dict.fromkeys(f"{record.summary.taxonomy} (K = {record.summary.table.K})" for record in records)
+    sizes = sorted({record.map_summary.voxel_size for record in records})
+    spaces = dict.fromkeys(f"{record.taxonomy} (K = {record.map_summary.K})" for record in records)
     return f"Voxels measure {', '.join(f'{size:g}' for size in sizes)} m; the taxonomy is {', '.join(spaces)}."
 
 
@@ -37,7 +37,7 @@ def comparable(result: Result) -> tuple[Record, ...]:
     """
     records = result.select(SHARED) or result.select()
     several = len(by_model(records)) > 1
-    return records if several and len({record.summary.taxonomy for record in records}) == 1 else ()
+    return records if several and len({record.taxonomy for record in records}) == 1 else ()
 
 
 # The overview of the models has alpha, the means of all voxels and of the recurrent ones, and their share.
@@ -111,12 +111,12 @@ def scenes(result: Result) -> list[Table]:
 
 
 def _scene_row(record: Record) -> Row:
-    table = record.summary.table
+    table = record.map_summary
     return record.unit.scene, table.voxels, table.points, table.mean_op, *table.means.of_all()
 
 
 def _scene_total(records: Sequence[Record]) -> Row:
-    tables = [record.summary.table for record in records]
+    tables = [record.map_summary for record in records]
     return (
         "Total / Mean",
         sum(table.voxels for table in tables),
@@ -146,7 +146,7 @@ def persistence(result: Result) -> list[Table]:
         f"{settings(records)} The means are pooled: they run over the voxels of all scenes together. The last row is"
         " the recurrent voxels. A voxel seen once has no SBD; if its pixels agree, its VSS is 1 and its entropy is 0."
     )
-    if any(split_last([record.summary.table for record in of_model]) for of_model in by_model(records).values()):
+    if any(split_last([record.map_summary for record in of_model]) for of_model in by_model(records).values()):
         caption += " If most voxels are in the last stratum, its parts follow."
     return [Table("persistence", "Stability by observation persistence", caption, columns, tuple(groups))]
 
@@ -195,7 +195,7 @@ def cross_model(result: Result) -> list[Table]:
 
 
 def _comparison_rows(records: Sequence[Record]) -> tuple[Row, ...]:
-    tables, together = [record.summary.table for record in records], pooled(records)
+    tables, together = [record.map_summary for record in records], pooled(records)
     return (
         ("all voxels, macro", together.voxels, 100.0, *_macro(tables)),
         ("all voxels, pooled", *_means_row(together.every)[1:]),

@@ -39,7 +39,7 @@ def class_lines(records: Sequence[Record], width: int, begin: str = "") -> Itera
     for name in names:
         of_model = [record for record in records if record.unit.model == name]
         classes, shares = class_means(of_model), _class_shares(of_model)
-        confused_with = {k: v for record in of_model for k, v in record.summary.table.confused_with.items()}
+        confused_with = {k: v for record in of_model for k, v in record.map_summary.confused_with.items()}
         listed = sorted(
             (key for key, (_, disagreement) in classes.items() if disagreement >= CONTRIBUTES and key in shares),
             key=lambda key: -classes[key][1],
@@ -79,9 +79,9 @@ def class_means(records: Sequence[Record]) -> dict[str, tuple[float, float]]:
 def _class_shares(records: Sequence[Record]) -> dict[str, float]:
     """Return the share of the map that each class dominates."""
     voxels: dict[str, int] = {}
-    for row in (row for record in records for row in record.summary.table.classes):
+    for row in (row for record in records for row in record.map_summary.classes):
         voxels[row.name] = voxels.get(row.name, 0) + row.voxels
-    total = sum(record.summary.table.voxels for record in records)
+    total = sum(record.map_summary.voxels for record in records)
     return {name: n / max(1, total) for name, n in voxels.items()}
 
 

@@ -29,8 +29,8 @@ def features_alone(features: FeatureAgreement, record: Record) -> Iterator[str]:
     yield from wrapped(WITHOUT)
     yield ""
     yield from feature_lines(features)
-    recurrent = record.summary.table.recurrent
-    yield f"  map  {record.summary.table.voxels:,} voxels, {percent(recurrent.share)} seen 3 times or more"
+    recurrent = record.map_summary.recurrent
+    yield f"  map  {record.map_summary.voxels:,} voxels, {percent(recurrent.share)} seen 3 times or more"
     yield ""
 
 

@@ -33,7 +33,7 @@ SCENE_NAME, CELL = 18, 6
 def many_scenes(result: Result, records: Sequence[Record], width: int) -> Iterator[str]:
     """Yield the answer, a row for each model over all scenes, a line for each scene, and what refutes a verdict."""
     listed = ", ".join(result.scenes) if len(result.scenes) <= 3 else f"{len(result.scenes)} scenes"
-    yield from head_lines(listed, result, [record.summary for record in records], width)
+    yield from head_lines(listed, result, records, width)
     for text in (sentences := list(order_of_models(result))):
         yield from wrapped(text)
     if sentences:

@@ -8,7 +8,6 @@ from collections.abc import Iterator
 from semstab.core.console import wrapped
 from semstab.data.measures import measures
 from semstab.data.records import Record, Result
-from semstab.data.results import UnitSummary
 from semstab.data.statistics import Estimate, MapStatistics, short
 from semstab.metrics import CATEGORIES
 from semstab.report.means import ENOUGH
@@ -31,14 +30,14 @@ JUDGED = ("stable", "usable", "unstable")
 
 def one_model(result: Result, record: Record, width: int) -> Iterator[str]:
     """Yield the verdict, the shares of the map, flicker, the classes that disagree most, and the paper's means."""
-    run, statistics = record.summary, record.statistics
-    yield from head_lines(f"{run.unit.scene} / {run.unit.model}", result, [run], width)
+    statistics = record.statistics
+    yield from head_lines(f"{record.unit.scene} / {record.unit.model}", result, [record], width)
     if statistics is not None and statistics.features is not None and statistics.features.alone:
         yield from features_alone(statistics.features, record)
         return
     if statistics is not None:
-        yield from _verdict(run)
-    recurrent, shares = run.table.recurrent, run.table.categories
+        yield from _verdict(statistics)
+    recurrent, shares = record.map_summary.recurrent, record.map_summary.categories
     if shares:
         low, drifting, uncertain, stable = percents([shares[name] for name in CATEGORIES])
         yield f"  voxels  {stable} stable  {uncertain} uncertain  {drifting} drifting  {low} in less than 3 frames"
@@ -57,10 +56,8 @@ def one_model(result: Result, record: Record, width: int) -> Iterator[str]:
     yield ""
 
 
-def _verdict(run: UnitSummary) -> Iterator[str]:
+def _verdict(statistics: MapStatistics) -> Iterator[str]:
     """Yield the level, the number that it rests on, and the meaning of that number."""
-    statistics = run.statistics
-    assert statistics is not None
     level, alpha = statistics.verdict.level.upper(), statistics.decisive_alpha
     name = "alpha" if statistics.static is None else "alpha (static)"
     if statistics.verdict.level == "no verdict":

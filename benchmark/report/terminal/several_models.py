@@ -29,19 +29,19 @@ def columns() -> list[tuple[str, str]]:
 
 def row_of(record: Record, begin: str = "") -> list[str]:
     """Return a model's row under `columns`, its name without a beginning."""
-    run, statistics = record.summary, record.statistics
+    statistics = record.statistics
     level, alpha, agree = "-", "", math.nan
     if statistics is not None:
         level, alpha = str(statistics.verdict), statistics.headline.alpha.text()
         agree = 100 * statistics.agreeing
         if statistics.features is not None and statistics.features.alone:
             level, alpha, agree = "features", statistics.features.alpha.text(), math.nan
-    recurrent = run.table.recurrent
+    recurrent = record.map_summary.recurrent
     means = {m: recurrent[m] if recurrent.voxels >= ENOUGH else math.nan for m in headlines()}
     measure_texts = [short(value, digits=m.digits[0]) for m, value in means.items()]
     flicker = record.image_space.compensated_flicker_percent
     agreeing, flickering, overlap = number(agree, 0), number(flicker, 1), short(miou(record), digits=3)
-    return [run.unit.model.removeprefix(begin), level, alpha, agreeing, flickering, *measure_texts, overlap]
+    return [record.unit.model.removeprefix(begin), level, alpha, agreeing, flickering, *measure_texts, overlap]
 
 
 def miou(record: Record) -> float:
@@ -55,7 +55,7 @@ def names_text(record: Record) -> str:
     spots = None if record.statistics is None else record.statistics.spots
     if "@" not in record.unit.model or spots is None:
         return ""
-    return f"{record.summary.table.K} names, worth {spots.effective_classes:.1f} of equal share"
+    return f"{record.map_summary.K} names, worth {spots.effective_classes:.1f} of equal share"
 
 
 OF_MAP = "voxels"
@@ -65,7 +65,7 @@ MOST_MAPS = 2
 
 def several_models(result: Result, records: Sequence[Record], width: int) -> Iterator[str]:
     """Yield which model is more stable where that is known, then a row for each model."""
-    yield from head_lines(result.scenes[0], result, [record.summary for record in records], width)
+    yield from head_lines(result.scenes[0], result, records, width)
     for text in (sentences := list(order_of_models(result))):
         yield from wrapped(text)
     if sentences:
@@ -76,11 +76,11 @@ def several_models(result: Result, records: Sequence[Record], width: int) -> Ite
     yield from laid_out([*heads, *rows], width)
     if begin:
         yield f"  names of models begin with '{begin}'"
-    if any(record.summary.table.recurrent.voxels < ENOUGH for record in records):
+    if any(record.map_summary.recurrent.voxels < ENOUGH for record in records):
         titles = ", ".join(measure.title for measure in headlines())
         yield from wrapped(f"-: fewer than {ENOUGH:,} voxels were seen in 3 frames or more, too few for {titles}")
     yield from legend(has_truth=has_truth)
-    if len(records) <= MOST_MAPS and any(record.summary.table.categories for record in records):
+    if len(records) <= MOST_MAPS and any(record.map_summary.categories for record in records):
         yield from ("", *_map_shares(records, width, begin), "")
     told = [record for record in records if not _is_change_of(record, [*result.models])]
     yield from class_lines(told, width, begin)
@@ -128,9 +128,9 @@ def _wrong_lines(records: Sequence[Record]) -> Iterator[str]:
 
 def _map_shares(records: Sequence[Record], width: int, begin: str) -> Iterator[str]:
     """Yield a row for each map: how much of it is stable, uncertain, drifting, and seen too rarely to tell."""
-    with_categories = [record for record in records if record.summary.table.categories]
+    with_categories = [record for record in records if record.map_summary.categories]
     rows = [
-        percents([record.summary.table.categories[name] for name in reversed(CATEGORIES)]) for record in with_categories
+        percents([record.map_summary.categories[name] for name in reversed(CATEGORIES)]) for record in with_categories
     ]
     heads = ("stable", "uncertain", "drifting", "in less than 3 frames")
     models = [record.unit.model.removeprefix(begin) for record in with_categories]

@@ -153,7 +153,7 @@ def _speeds(result: Result) -> str:
     """Return the frames a second that each network predicts; '' where labels were read."""
     took: dict[str, list[float]] = {}
     for record in result.select():
-        milliseconds = record.summary.stages_ms.get("network", math.nan)
+        milliseconds = record.stages_ms.get("network", math.nan)
         if milliseconds > 0:
             took.setdefault(record.unit.model, []).append(milliseconds)
     return ", ".join(f"{model} {1e3 / macro_mean(times):.3g} frames/s" for model, times in took.items())

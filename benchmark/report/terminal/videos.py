@@ -30,12 +30,12 @@ NEEDS = (
 
 def videos(result: Result, records: Sequence[Record], width: int) -> Iterator[str]:
     """Yield the videos, the answer, a row for each model over all videos, and the frames that stand out."""
-    frames = sorted({record.summary.frames for record in records})
+    frames = sorted({record.frames for record in records})
     counts = f"{frames[0]} to {frames[-1]}" if len(frames) > 1 else f"{frames[0]}"
     sizes = " and ".join(
         dict.fromkeys(f"{w}x{h}" for w, h in (record.pixels.size for record in records if record.pixels))
     )
-    classes = " and ".join(map(str, sorted({record.summary.table.K for record in records})))
+    classes = " and ".join(map(str, sorted({record.map_summary.K for record in records})))
     listed = result.scenes[0] if len(result.scenes) == 1 else f"{len(result.scenes)} videos"
     yield f"{listed}    {counts} frames of {sizes}, {classes} classes    no depth, no poses"
     yield ""

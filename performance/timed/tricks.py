@@ -1,0 +1,79 @@
+"""What each setting of the process is worth: CPU time of whole commands without it, over their time with all.
+
+Each command is a process of its own; the ways to start it take turns, and ratios are of medians. The runs, of six
+frames of 640x480 and of 3840x2160, are without check, recording and report.
+"""
+
+from __future__ import annotations
+
+import tempfile
+from pathlib import Path
+from statistics import median
+from typing import Any
+
+import measuring
+from timed.command import OFF, write_scene
+
+COMMAND = """
+import gc, os
+from semstab.core import process
+configure = process.configure_process
+{change}
+from semstab.__main__ import main
+main()
+"""
+WITHOUT_VARIABLE = """
+def without():
+    configure()
+    os.environ.pop("{name}")
+process.configure_process = without
+"""
+WITHOUT_MALLOPT = """
+def without():
+    libc, process._libc = process._libc, lambda: None
+    configure()
+    process._libc = libc
+process.configure_process = without
+"""
+WAYS = {
+    "all": "",
+    "gc.freeze before a run": "gc.freeze = lambda: None",
+    "mallopt": WITHOUT_MALLOPT,
+    "OMP_WAIT_POLICY": WITHOUT_VARIABLE.format(name="OMP_WAIT_POLICY"),
+    "OPENBLAS_NUM_THREADS": WITHOUT_VARIABLE.format(name="OPENBLAS_NUM_THREADS"),
+    "imports where they are used": "import semstab.api, semstab.recording",
+}
+"""Changes to the process before the command starts, by what they take away."""
+
+
+def main(
+    rounds: int = 7,
+    commands: tuple[str, ...] = ("help", "list", "six frames", "large frames"),
+    ways: tuple[str, ...] = tuple(WAYS),
+) -> Any:
+    with tempfile.TemporaryDirectory() as name:
+        folder = Path(name)
+        words: dict[str, tuple[str | Path, ...]] = {"help": ("--help",), "list": ("list",)}
+        if "six frames" in commands:
+            words["six frames"] = ("--data", write_scene(folder / "six", 6, (640, 480)), "--voxel-size", "0.02", *OFF)
+        if "large frames" in commands:
+            large = write_scene(folder / "large", 6, (3840, 2160))
+            words["large frames"] = ("--data", large, "--voxel-size", "0.05", *OFF)
+        table = measuring.Table(without="", **dict.fromkeys((c.replace(" ", "_") for c in commands), ".2f"))
+        ratios: dict[str, dict[str, float]] = {way: {} for way in ways}
+        for command in commands:
+
+            def seconds(change: str, command: str = command) -> float:
+                with tempfile.TemporaryDirectory() as out:
+                    more = ("--quiet", "--out", Path(out) / "run") if "frames" in command else ()
+                    script = COMMAND.format(change=change)
+                    return measuring.python("-c", script, *words[command], *more, quiet=True).cpu_s
+
+            works = {way: (lambda change=change: seconds(change)) for way, change in WAYS.items() if way in ways}
+            found = {way: median(times) for way, times in measuring.in_turns(works, rounds).items()}
+            print(f"{command}: {found['all']:.2f} s of CPU time")
+            for way, took in found.items():
+                ratios[way][command.replace(" ", "_")] = took / found["all"]
+        for way, row in ratios.items():
+            table.add(without=way, **row)
+    return table.rows
