@@ -97,18 +97,11 @@ class Events:
         index = {name: getattr(self, name) for name in INDEX}
         return VoxelTable(**index, **columns, evidence=evidence, voxel_size=self.voxel_size, classes=self.classes)
 
-    def accumulated(self) -> Evidence:
-        """Return the evidence (n, K) of each voxel."""
-        return Evidence.joined([log._accumulated() for log in self._few_at_a_time()])
-
-    def _accumulated(self) -> Evidence:
-        return Evidence.of(_sum_by_voxel(self.evidence[:], self.starts))
-
     def _columns(self) -> dict[str, Any]:
         starts, s_bar = self.starts, self.evidence[:]
         return {
             "op": np.diff(np.append(starts, len(self))).astype(np.int32),
-            "evidence": self._accumulated(),
+            "evidence": Evidence.of(_sum_by_voxel(s_bar, starts)),
             "drift_sum": _sum_by_voxel(self.drift(), starts),
             "pixels": _sum_by_voxel(self.pixels.astype(np.int64), starts),
             "first_frame": np.minimum.reduceat(self.frame, starts) if len(self) else self.frame,
@@ -211,6 +204,12 @@ class Events:
             content = parquet.read(path, OF_EVENTS | INDEX)
             first = np.flatnonzero(np.diff(content["voxel"], prepend=-1))
             return cls(**content | {name: content[name][first] for name in INDEX})
+
+
+def accumulated(events: Events) -> Evidence:
+    """Return the evidence (n, K) of each voxel of a log."""
+    logs = events._few_at_a_time()
+    return Evidence.joined([Evidence.of(_sum_by_voxel(log.evidence[:], log.starts)) for log in logs])
 
 
 def _sum_by_voxel(values: npt.NDArray[Any], starts: Int64) -> npt.NDArray[Any]:

@@ -8,6 +8,7 @@ from collections.abc import Callable
 import numpy as np
 
 from semstab.core.types import THIS_SCENE, Float64, Int64, Mask, Scope, UInt8
+from semstab.data.events import accumulated
 from semstab.data.records import Record
 from semstab.data.statistics import Interval, MisplacedFrame, MovedClass, MovedSpots
 from semstab.statistics.accumulate import sums_of_spots
@@ -124,7 +125,7 @@ def _dominant(spots: SpotObservations) -> Int64:
     """Return the dominant class (n,) of each spot; -1 without a label."""
     log, at = spots.observations(), spots.of_log()
     label = np.full(len(spots.point), -1, np.int64)
-    label[at] = log.accumulated().argmax(axis=1)
+    label[at] = accumulated(log).argmax(axis=1)
     return label
 
 
