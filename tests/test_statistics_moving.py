@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 
 import numpy as np
 import pytest
@@ -12,6 +12,7 @@ from street import DRIVES, Street
 from semstab import Frame, Intrinsics
 from semstab.data.statistics import MisplacedFrame, poses_that_do_not_fit
 from semstab.statistics import Sampler, SpotObservations
+from semstab.statistics.loops.moving import tally
 from semstab.statistics.moving import moving_percent, static_spots
 from semstab.statistics.votes import MOST_KEPT, SpotVotes, next_to_moved
 
@@ -26,16 +27,25 @@ def box_at(frame: int) -> tuple[float, float]:
     return -30.0 + 3.0 * frame, 2.0
 
 
+def away(_: int) -> tuple[float, float]:
+    """A place that no view shows."""
+    return -50.0, 0.0
+
+
 def frames(
-    *, noise: float = 0.0, shift: float = 0.0, shifted: range = range(0), drives: bool = True
+    *,
+    noise: float = 0.0,
+    shift: float = 0.0,
+    shifted: range = range(0),
+    place: Callable[[int], tuple[float, float]] = box_at,
 ) -> Iterator[Frame]:
-    """A camera looks down on a floor with two boxes, 3 m high, of which one drives; some poses are wrong."""
+    """A camera looks down on a floor with two boxes, 3 m high, of which one moves; some poses are wrong."""
     rng = np.random.default_rng(3)
     u, v = np.meshgrid((np.arange(W) - CAMERA.cx) / FOCAL, (np.arange(H) - CAMERA.cy) / FOCAL)
     for k in range(FRAMES):
         x, y = 0.4 * k - 5.0, 0.0
         depth, labels = np.full((H, W), HEIGHT), np.full((H, W), FLOOR, np.uint8)
-        for own, (left, top) in ((PARKED, (-3.0, -5.0)), (DRIVING, box_at(k) if drives else (-50.0, 0.0))):
+        for own, (left, top) in ((PARKED, (-3.0, -5.0)), (DRIVING, place(k))):
             top_of_box = HEIGHT - 3.0
             px, py = x + u * top_of_box, y + v * top_of_box
             inside = (left <= px) & (px < left + 4.0) & (top <= py) & (py < top + 4.0)
@@ -74,7 +84,7 @@ def test_what_drives_has_moved_and_what_stands_has_not(noise: float) -> None:
 
 
 def test_nothing_moved_where_all_stands() -> None:
-    spots = sampled(frames(noise=0.01, drives=False))
+    spots = sampled(frames(noise=0.01, place=away))
     assert spots.votes is not None
     assert spots.votes.moved.mean() < 0.001
     assert not spots.votes.misplaced.any()
@@ -86,7 +96,7 @@ def test_nothing_moved_where_all_stands() -> None:
 def test_views_before_a_spot_was_found_see_through_it() -> None:
     """A box arrives in the last frames and stays: all views that see through it are earlier ones."""
     late = []
-    for frame in frames(drives=False):
+    for frame in frames(place=away):
         assert frame.labels is not None
         depth, labels = frame.depth.copy(), frame.labels.copy()
         if frame.index >= FRAMES - 8:
@@ -102,7 +112,7 @@ def test_views_before_a_spot_was_found_see_through_it() -> None:
 
 def test_frames_with_wrong_poses_are_named_and_do_not_look_like_movers() -> None:
     wrong = range(10, 13)
-    spots = sampled(frames(shift=-1.5, shifted=wrong, drives=False))
+    spots = sampled(frames(shift=-1.5, shifted=wrong, place=away))
     votes = spots.votes
     assert votes is not None
     assert spots.views.frame[votes.misplaced].tolist() == list(wrong)
@@ -161,13 +171,43 @@ def test_of_long_flights_every_so_many_views_are_kept() -> None:
 def test_two_views_and_a_third_of_the_votes_decide() -> None:
     seen, through = np.array([0, 0, 1, 3, 4, 9, 1], np.uint16), np.array([0, 2, 1, 2, 2, 1, 0], np.uint16)
     none = np.zeros(0)
-    votes = SpotVotes(seen, 0 * seen, through, seen > 100, none, none > 0, np.array([1000, 3]), 0.01)
+    votes = SpotVotes(seen, 0 * seen, through, 0 * seen, seen > 100, none, none > 0, np.array([1000, 3]), 0.01)
     assert votes.moved.tolist() == [False, True, False, True, False, False, False]
     assert votes.static.tolist() == [False, False, False, False, True, True, False]
-    # votes 2 of 2, 2 of 5, 3 of 6 and 4 of 10 with a rate of 3.5 in 1001
+    # votes 2 of 2, 2 of 5, 3 of 6, and 4 of 10 or 3 of 10 at an end, with a rate of 3.5 in 1001
     q = 3.5 / 1001
-    expected = np.mean([q**2, 10 * q**2 * (1 - q) ** 3 + 10 * q**3, 20 * q**3, 210 * q**4])
+    expected = np.mean([q**2, 10 * q**2 * (1 - q) ** 3 + 10 * q**3, 20 * q**3, 210 * q**4 + 2 * q**3])
     assert votes.false_share == pytest.approx(expected, rel=0.05)
+
+
+@pytest.mark.parametrize(("in_time", "at_end"), [
+    ("sssssssss", 0), ("ssssssttt", 3), ("tttssssss", 3), ("ttssssttt", 3), ("tthtsssts", 3), ("sssthhtht", 3),
+    ("sstttssss", 0), ("ssssst--t", 2), ("ttttttttt", 9), ("hh-hhh---", 0),
+])  # fmt: skip
+def test_votes_count_at_an_end_if_the_spot_is_not_seen_there(in_time: str, at_end: int) -> None:
+    """Votes of views in their order: s sees it, t sees through it, h has it hidden, - does not tell."""
+    votes = np.array(["-sht".index(vote) for vote in in_time], np.uint8)[:, None]
+    counts, found, between = np.zeros((1, 3), np.uint16), np.zeros(1, np.uint16), np.zeros(2, np.int64)
+    tally(votes, np.ones(len(votes), np.bool_), counts, found, between)
+    assert counts[0].tolist() == [in_time.count(kind) for kind in "sht"]
+    assert found[0] == at_end
+
+
+@pytest.mark.parametrize(("leaves", "moved"), [(20, True), (22, False)])
+def test_what_stood_for_long_and_left_has_moved_if_three_views_see_through_it(leaves: int, moved: bool) -> None:
+    spots = sampled(frames(place=lambda k: (-5.0, 2.0) if k < leaves else away(k)))
+    votes, on_box = spots.votes, classes(spots) == DRIVING
+    assert votes is not None
+    assert (votes.through[on_box] <= FRAMES - leaves).all()
+    assert votes.moved[on_box].mean() > 0.6 if moved else votes.static[on_box].mean() > 0.6
+    assert votes.moved[~on_box].mean() < 0.005
+    pixels = frames(place=lambda _: (-5.0, 2.0))
+    sampler = Sampler(3)
+    for frame in frames(place=lambda k: (-5.0, 2.0) if k < leaves else away(k)):
+        sampler.add(frame)
+    mask = sampler.moving_pixels(votes, frame := next(pixels))
+    assert frame.labels is not None
+    assert mask[frame.labels == DRIVING].mean() > 0.9 if moved else not mask.any()
 
 
 @pytest.mark.parametrize(("around", "spacing", "told"), [
@@ -182,6 +222,19 @@ def test_an_unknown_spot_next_to_spots_that_moved_moved_too(around: str, spacing
     )
     moved, static = (np.array([False, False, *(kind == each for each in around)]) for kind in "ms")
     assert next_to_moved(point, moved, static, spacing).tolist() == [told, *[False] * (len(around) + 1)]
+
+
+def test_spots_next_to_spots_that_moved_are_told_in_two_steps() -> None:
+    """Columns of a grid: one of spots that moved, then unknown ones, or unknown ones between moved and static ones."""
+    x, y = np.meshgrid(np.arange(6), np.arange(5), indexing="ij")
+    point, column = np.stack([x.ravel(), y.ravel(), 0 * x.ravel()], axis=1).astype(np.float64), x.ravel()
+    nothing = np.zeros(len(point), np.bool_)
+    told = next_to_moved(point, column == 0, nothing, 1.0)
+    assert told.tolist() == np.isin(column, (1, 2)).tolist()
+    told = next_to_moved(point, column == 0, column == 2, 1.0)
+    assert told.tolist() == (column == 1).tolist()
+    told = next_to_moved(point, column == 0, (column == 1) & (y.ravel() < 4), 1.0)
+    assert not told[column > 1].any()
 
 
 def test_an_oncoming_car_is_found_in_scans_by_what_it_left_behind() -> None:

@@ -133,8 +133,8 @@ class VisitedSpots:
     def change(self) -> Int64:
         """(n,) what happened to the surface at each spot: UNKNOWN, STAYED, GONE, NEW or MOVED.
 
-        A visit shows that nothing is there if two of its views or more see through a spot, and more than a third of
-        those that tell. A spot moved within a visit if some of its views see it nevertheless.
+        A visit shows that nothing is there if the spot moved by the votes of its views: if they see through it. A spot
+        moved within a visit if some of its views see it nevertheless.
         """
         first, second = self.votes
         change = np.full(len(self.spots.point), UNKNOWN)

@@ -58,14 +58,19 @@ LEAST_THROUGH, SHARE_THROUGH = 2, 1 / 3
 """A spot moved if LEAST_THROUGH views see through it, and more than SHARE_THROUGH of the views that see it or through
 it."""
 
+LEAST_AT_END = 3
+"""It moved, too, if as many views see through it before the first one that sees it, or after the last one: it came, or
+left, and stood for longer than it was away."""
+
 LEAST_VOTES = 2
 """Views that see a spot or see through it, below which it is unknown whether it moved."""
 
-NEXT_TO, LEAST_NEXT_TO = 1.5, 2
+NEXT_TO, LEAST_NEXT_TO, STEPS = 1.5, 2, 2
 """An unknown spot moved if LEAST_NEXT_TO spots or more within NEXT_TO spacings of spots moved, and half of those there
-that are known: most such spots lie at an edge of the depth of a thing that moved, which no view tells."""
+that are known; then so did unknown spots next to it, STEPS steps in all. Most such spots lie at an edge of the depth of
+a thing that moved, which no view tells."""
 
-OF_SPOTS = ("seen", "hidden", "through", "next_to")
+OF_SPOTS = ("seen", "hidden", "through", "at_end", "next_to")
 """Votes on each spot, and whether it is next to spots that moved, by name."""
 
 CONTRADICTS, MANY = 0.04, 50
@@ -185,13 +190,15 @@ class DepthMemory:
         depth_views = np.array([depth.view for depth in self.kept], np.int64)
         fits, shares = _fitting(votes, depth_views, found, views)
         counts, between = np.zeros((len(point), 3), np.uint16), np.zeros(2, np.int64)
-        tally(votes, fits[depth_views], counts, between)
-        counts[~fits[found]] = 0
+        at_end = np.zeros(len(point), np.uint16)
+        tally(votes, fits[depth_views], counts, at_end, between)
+        counts[~fits[found]] = at_end[~fits[found]] = 0
         num_seen, hidden, through = counts.T.copy()
         nothing = np.zeros(len(point), np.bool_)
-        alone = SpotVotes(num_seen, hidden, through, nothing, shares, ~fits, between, gap_of(sigma))
-        next_to = next_to_moved(point, alone.moved, alone.static, spacing)
-        return dataclasses.replace(alone, next_to=next_to & fits[found])
+        alone = SpotVotes(num_seen, hidden, through, at_end, nothing, shares, ~fits, between, gap_of(sigma))
+        rows, next_to = np.flatnonzero(fits[found]), np.zeros(len(point), np.bool_)
+        next_to[rows] = next_to_moved(point[rows], alone.moved[rows], alone.static[rows], spacing)
+        return dataclasses.replace(alone, next_to=next_to)
 
     def moving_pixels(self, frame: Frame, sigma: float, misplaced: Mask, *, sparse: bool = False) -> Mask:
         """Return the pixels (H, W) of a frame whose surface moved: the kept views, but for misplaced ones, tell.
@@ -208,14 +215,16 @@ class DepthMemory:
         z = depth[valid]
         rays = np.stack([(column - K.cx) / K.fx, (row - K.cy) / K.fy, np.ones(len(z))], axis=1)
         point = (rays * z[:, None]) @ frame.T_wc[:3, :3].T + frame.T_wc[:3, 3]
-        num_seen, through = np.zeros((2, len(z)), np.int64)
+        num_seen, through, until_seen, since_seen = np.zeros((4, len(z)), np.int64)
         for view_depth in self.kept:
             if not misplaced[view_depth.view]:
                 kinds = view_depth.votes(point, sigma) & 3
                 num_seen += kinds == SEEN
                 through += kinds == THROUGH
+                since_seen = (since_seen + (kinds == THROUGH)) * (kinds != SEEN)
+                until_seen = np.where(num_seen == 0, through, until_seen)
         moves = np.zeros(depth.shape, np.bool_)
-        moves[valid] = has_moved(through, num_seen + through)
+        moves[valid] = has_moved(through, num_seen + through, np.maximum(until_seen, since_seen))
         small = _grown(moves, np.where(valid, depth, np.nan), gap_of(sigma))
         mask = small.repeat(step, axis=0).repeat(step, axis=1)
         bottom, right = (max(0, n - m) for n, m in zip(frame.depth.shape, mask.shape, strict=True))
@@ -235,23 +244,25 @@ def _grown(moves: Mask, depth: Float64, gap: float) -> Mask:
     return moves
 
 
-def has_moved(through: npt.NDArray[Any], votes: npt.NDArray[Any]) -> Mask:
-    """Return what moved: LEAST_THROUGH views see through it, and more than SHARE_THROUGH of all votes."""
-    return np.asarray((through >= LEAST_THROUGH) & (through > SHARE_THROUGH * votes), np.bool_)
+def has_moved(through: npt.NDArray[Any], votes: npt.NDArray[Any], at_end: npt.NDArray[Any]) -> Mask:
+    """Return what moved: enough views see through it and more than SHARE_THROUGH of all, or enough at an end."""
+    many = (through >= LEAST_THROUGH) & (through > SHARE_THROUGH * votes)
+    return np.asarray(many | (at_end >= LEAST_AT_END), np.bool_)
 
 
 def next_to_moved(point: Float64, moved: Mask, static: Mask, spacing: float) -> Mask:
-    """Return which spots (n,) are neither moved nor static, and next to spots that moved."""
+    """Return which spots (n,) are neither moved nor static, and next to spots that moved, in up to STEPS steps."""
     from scipy.spatial import cKDTree
 
     next_to: Mask = np.zeros(len(point), np.bool_)
-    unknown = np.flatnonzero(~moved & ~static)
-    if len(unknown) and np.count_nonzero(moved) >= LEAST_NEXT_TO:
-        of_moved, of_static = (
-            cKDTree(point[kind]).query_ball_point(point[unknown], NEXT_TO * spacing, return_length=True)
-            for kind in (moved, static)
-        )
-        next_to[unknown] = (of_moved >= LEAST_NEXT_TO) & (of_moved >= of_static)
+    stayed = cKDTree(point[static])
+    for _ in range(STEPS):
+        unknown, of_moved = np.flatnonzero(~moved & ~static & ~next_to), point[moved | next_to]
+        if not len(unknown) or len(of_moved) < LEAST_NEXT_TO:
+            break
+        trees = cKDTree(of_moved), stayed
+        near = [tree.query_ball_point(point[unknown], NEXT_TO * spacing, return_length=True) for tree in trees]
+        next_to[unknown] = (near[0] >= LEAST_NEXT_TO) & (near[0] >= near[1])
     return next_to
 
 
@@ -272,6 +283,7 @@ class SpotVotes:
     Attributes:
         seen, hidden, through: (n,) uint16 views of each spot, without those that are misplaced; 0 of a spot that was
             found in one of these.
+        at_end: (n,) uint16 of those that see through it, the ones before the first that sees it, or after the last.
         next_to: (n,) spots of which too few views tell, next to spots that moved.
         through_of_view: (V,) share of the spots of other views that a view sees through, of those that it sees or sees
             through; NaN of views whose depth was not kept.
@@ -283,6 +295,7 @@ class SpotVotes:
     seen: UInt16
     hidden: UInt16
     through: UInt16
+    at_end: UInt16
     next_to: Mask
     through_of_view: Float64
     misplaced: Mask
@@ -311,9 +324,9 @@ class SpotVotes:
         misplaced = np.zeros(len(shares), np.bool_)
         misplaced[np.array(of_views["misplaced"], np.int64)] = True
         between = np.array(of_views["between"], np.int64).reshape(2)
-        num_seen, hidden, through = (columns[name].astype(np.uint16) for name in OF_SPOTS[:3])
+        num_seen, hidden, through, at_end = (columns[name].astype(np.uint16) for name in OF_SPOTS[:4])
         next_to = columns["next_to"].astype(np.bool_)
-        return cls(num_seen, hidden, through, next_to, shares, misplaced, between, float(of_views["gap"]))
+        return cls(num_seen, hidden, through, at_end, next_to, shares, misplaced, between, float(of_views["gap"]))
 
     @property
     def votes(self) -> Int64:
@@ -323,12 +336,13 @@ class SpotVotes:
     @property
     def moved(self) -> Mask:
         """(n,) spots that moved: by the votes of views, or by the spots next to them."""
-        return has_moved(self.through, self.votes) | self.next_to
+        return has_moved(self.through, self.votes, self.at_end) | self.next_to
 
     @property
     def static(self) -> Mask:
-        """(n,) spots that did not move: enough views tell, and at most SHARE_THROUGH of them see through it."""
-        return np.asarray((self.votes >= LEAST_VOTES) & (self.through <= SHARE_THROUGH * self.votes), np.bool_)
+        """(n,) spots that did not move: at most SHARE_THROUGH of enough votes see through it, and few at an end."""
+        few = (self.through <= SHARE_THROUGH * self.votes) & (self.at_end < LEAST_AT_END)
+        return np.asarray((self.votes >= LEAST_VOTES) & few, np.bool_)
 
     @property
     def known(self) -> Mask:
@@ -342,9 +356,10 @@ class SpotVotes:
 
     @property
     def false_share(self) -> float:
-        """Share of the spots known by votes that errors alone call moved, if they meet views independently.
+        """Largest share of the spots known by votes that errors alone call moved, if they meet views independently.
 
-        Of n votes, r see through the spot with the probability b(r; n, q), where q is `false_rate`.
+        Of n votes, r see through the spot with the probability b(r; n, q), where q is `false_rate`; the first or the
+        last LEAST_AT_END of them with at most 2 q^LEAST_AT_END.
         """
         from scipy import special
 
@@ -352,7 +367,9 @@ class SpotVotes:
         if not len(n):
             return math.nan
         least = np.maximum(LEAST_THROUGH, np.floor(SHARE_THROUGH * n + 1e-9) + 1)
-        return float(special.bdtrc(least - 1, n, self.false_rate) @ count / count.sum())
+        at_end = np.where(least > LEAST_AT_END, 2 * self.false_rate**LEAST_AT_END, 0.0)  # fewer need no such run
+        moved = np.minimum(special.bdtrc(least - 1, n, self.false_rate) + at_end, 1.0)
+        return float(moved @ count / count.sum())
 
     def take(self, rows: Any) -> SpotVotes:
         """Return the votes on some of the spots."""

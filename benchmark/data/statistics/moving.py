@@ -57,7 +57,7 @@ class MovedSpots:
         alpha: Alpha of the others, 'alpha (static)'.
         gap: How much farther than a spot, relative, all is that a view shows which sees through it.
         false_rate: Share of the votes on what stayed that see through it.
-        false_share: Share of the known spots that such votes call moved, if they are independent.
+        false_share: Largest share of the known spots that such votes call moved, if they are independent.
         classes: Classes by the share of their spots that moved, most first, without those that did not move.
         misplaced: Frames whose poses do not fit; what they see counts for nothing here.
     """

@@ -183,14 +183,16 @@ def is_farther(near, row, column, around, reach, code):
 
 
 @serial
-def tally(votes, counted, counts, between):
+def tally(votes, counted, counts, at_end, between):
     """Count the votes (V, n) of the views that count, in their order: seen, hidden, through (n, 3) of each spot.
 
-    `between` (2,) counts the votes whose neighbours in time, among those that see the spot or see through it, both see
-    it, and those of them that see through it: a thing that is there before and after has not moved.
+    at_end (n,) are the views that see through a spot before the first one that sees it, or after the last, the larger
+    number. `between` (2,) counts the votes whose neighbours in time, among those that see the spot or see through it,
+    both see it, and those of them that see through it: a thing that is there before and after has not moved.
     """
     for i in range(votes.shape[1]):
         before, last = UNKNOWN, UNKNOWN
+        until_seen = since_seen = 0
         for k in range(votes.shape[0]):
             kind = np.int64(votes[k, i] & 3)
             if kind == UNKNOWN or not counted[k]:
@@ -198,7 +200,10 @@ def tally(votes, counted, counts, between):
             counts[i, kind - 1] += 1
             if kind == HIDDEN:
                 continue
+            since_seen = since_seen + 1 if kind == THROUGH else 0
+            until_seen = max(until_seen, since_seen) if counts[i, SEEN - 1] == 0 else until_seen
             if before == SEEN and kind == SEEN and last != UNKNOWN:
                 between[0] += 1
                 between[1] += last == THROUGH
             before, last = last, kind
+        at_end[i] = max(until_seen, since_seen)
