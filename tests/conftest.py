@@ -35,7 +35,7 @@ def _temporary_folder_in_memory(folder: Path = Path("/dev/shm"), least: int = 4 
         return
     found = os.statvfs(folder)
     if found.f_bavail * found.f_frsize >= least and not found.f_flag & os.ST_NOEXEC:
-        os.environ["TMPDIR"] = str(folder)  # of the workers and of what tests start, too
+        tempfile.tempdir = os.environ["TMPDIR"] = str(folder)  # the latter of workers and of what tests start
 
 
 _temporary_folder_in_memory()
