@@ -58,7 +58,7 @@ def run_of(folder: Path, *, blurred: int | None = None, color: bool = True) -> P
     scene = write_posed(folder / "floor", names, {"net": frames}, classes=["floor", "mat", "hole"], up_axis="z")
     semstab.run({
         "dataset": {"name": "posed_folder", "options": {"root": str(scene)}}, "voxel_size": SIZE, "taxonomy": None,
-        "check": None,
+        "check": None, "check_geometry": False,
     }, out=folder / "run", report=False)  # fmt: skip
     return folder / "run"
 
@@ -157,7 +157,7 @@ def test_tasks_hold_more_errors_than_their_images(tmp_path):
     """On the city: pixels whose class is not the truth, in the outlines and in all of the image."""
     config = {
         "dataset": {"name": "city", "options": {"width": 96, "height": 54, "frames": 16}}, "scenes": ["scene0"],
-        "models": ["sim-flicker"], "voxel_size": 0.5, "taxonomy": None, "check": None,
+        "models": ["sim-flicker"], "voxel_size": 0.5, "taxonomy": None, "check": None, "check_geometry": False,
     }  # fmt: skip
     semstab.run(config, out=tmp_path / "run", report=False)
     coco = opened(written(tmp_path / "run", tmp_path, most=100))

@@ -72,7 +72,8 @@ def test_a_run_leaves_it_out_as_check_does_and_says_so(gaps, tmp_path):
     value = "65535"
 
     def run(name, **settings):
-        config = configure(gaps[name], models=["net"], check=None, voxel_size=0.2, **settings)
+        usual = {"models": ["net"], "check": None, "check_geometry": True, "voxel_size": 0.2}
+        config = configure(gaps[name], **usual | settings)
         result = semstab.run(config, out=tmp_path / f"{name}{len(settings)}", report=False)
         return result.runs[0].map_summary.voxels, [note for of_scene in result.notes.values() for note in of_scene]
 

@@ -80,7 +80,8 @@ def test_motion_is_that_of_the_poses(sound):
 
 def test_persistence_is_that_of_the_run(folder, sound):
     """All 12 frames are fused, so that OP is the run's own."""
-    (run,) = semstab.run(configure(folder, voxel_size=0.1, models=["gt"], check=None), report=False).runs
+    config = configure(folder, voxel_size=0.1, models=["gt"], check=None, check_geometry=True)
+    (run,) = semstab.run(config, report=False).runs
     row = next(row for row in sound.persistence if row.voxel_size == 0.1)
     assert sound.fused_frames == 12
     assert (row.voxels, row.mean_op) == (run.map_summary.voxels, pytest.approx(run.map_summary.mean_op))
@@ -382,7 +383,7 @@ def test_a_file_that_cannot_be_written_is_one_line(short, tmp_path):
 
 def test_a_run_refuses_unsound_data_unless_told_otherwise(tmp_path):
     folder = write(tmp_path / "room", Room(walk(5), told_pose=np.linalg.inv))
-    config = configure(folder, models=["net"], check=None, voxel_size=0.2)
+    config = configure(folder, models=["net"], check=None, check_geometry=True, voxel_size=0.2)
     with pytest.raises(DataError, match=r"room: depth reprojects .* pose_convention: world_to_camera"):
         semstab.run(config, out=tmp_path / "run", report=False)
     assert not list((tmp_path / "run").rglob("*.parquet"))
@@ -425,7 +426,7 @@ def test_the_manifest_says_what_was_found_and_what_it_cost(folder, tmp_path):
         def geometry_checked(self, task, verdict):
             seen.append((task.scene.name, verdict.state))
 
-    config = configure(folder, models=["net", "gt"], check=None, voxel_size=0.2)
+    config = configure(folder, models=["net", "gt"], check=None, check_geometry=True, voxel_size=0.2)
     semstab.run(config, out=tmp_path / "run", observers=[Watching()], report=False)
     manifest = json.loads((tmp_path / "run/manifest.json").read_text())
     assert manifest["geometry"]["room"]["state"] == "sound"

@@ -16,7 +16,7 @@ from semstab.statistics.moving import MOVED, STATE_COLORS, STAYED, states_of
 
 CITY = {
     "dataset": {"name": "city", "options": {"width": 160, "height": 90, "frames": 40}}, "scenes": ["scene0"],
-    "models": ["gt"], "check": None, "voxel_size": 1.0,
+    "models": ["gt"], "check": None, "check_geometry": False, "voxel_size": 1.0,
 }  # fmt: skip
 
 

@@ -404,5 +404,5 @@ def test_a_backend_that_is_its_own_check_is_said_to_check_nothing(root, caplog):
     semstab.run(configure(root, backends=["numpy"], check="numpy", models=["a"]), report=False)
     assert "check: numpy is the backend that fuses, so it checks nothing" in caplog.text
     caplog.clear()
-    semstab.run(configure(root, backends=["numpy"], models=["a"], check=None), report=False)
+    semstab.run(configure(root, backends=["numpy"], models=["a"], check=None, check_geometry=True), report=False)
     assert "check" not in caplog.text

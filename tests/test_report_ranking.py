@@ -34,7 +34,12 @@ def result(tmp_path_factory):
         "constant": {"labeller": "constant"},
     }  # fmt: skip
     options = {"frames": 12, "width": 128, "height": 72, "seed": 1, "models": models}
-    city = {"dataset": {"name": "city", "options": options}, "scenes": ["scene0"], "voxel_size": 0.4}
+    city = {
+        "dataset": {"name": "city", "options": options},
+        "scenes": ["scene0"],
+        "voxel_size": 0.4,
+        "check_geometry": False,
+    }
     out = tmp_path_factory.mktemp("ranking") / "run"
     config = semstab.load_config(overrides={**city, "models": list(models), "check": None})
     return semstab.run(config, out=out, report=False), out

@@ -43,14 +43,14 @@ def test_frames_in_which_nothing_is_seen_are_counted(tmp_path) -> None:
     folder = tiny_scene.write(tmp_path / "scene", models=("a",))
     (folder / "depth/0001.png").unlink()
     np.save(folder / "depth/0001.npy", np.full((tiny_scene.HEIGHT, tiny_scene.WIDTH), np.nan, np.float32))
-    result = semstab.run(configure(folder))
+    result = semstab.run(configure(folder, check_geometry=True))
     assert result.select()[0].frames_empty == 1
     assert "a: 1 of 3 frames have no pixel with both depth and a label" in printed(result)
 
 
 def test_own_data_is_checked_on_a_sample_of_the_voxels(tmp_path) -> None:
     folder = tiny_scene.write(tmp_path / "scene", frames=12)
-    config = configure(folder, backends=["numba"], check="sample", voxel_size=0.05)
+    config = configure(folder, backends=["numba"], check="sample", voxel_size=0.05, check_geometry=True)
     result = semstab.run(config, out=tmp_path / "run", report=False)
     assert [record.unit.backend for record in result.records] == ["numba", "numba"]
     for row in result.agreement:
@@ -78,7 +78,7 @@ def test_the_sample_finds_a_backend_that_is_wrong(tmp_path, monkeypatch) -> None
 
     monkeypatch.setattr(NumbaHash, "table", wrong)
     folder = tiny_scene.write(tmp_path / "scene", models=("a",), frames=40)
-    result = semstab.run(configure(folder, backends=["numba"], check="sample", voxel_size=0.05))
+    result = semstab.run(configure(folder, backends=["numba"], check="sample", voxel_size=0.05, check_geometry=True))
     assert not result.agrees
     assert "DISAGREE" in printed(result)
 
@@ -136,7 +136,7 @@ def test_a_model_on_the_built_in_city_has_the_voxels_of_the_citys_own_models() -
 
 
 def test_a_given_voxel_size_is_told_where_it_lies(wide) -> None:
-    result = semstab.run(configure(wide, backends=["numba"], check=None, voxel_size=1.0))
+    result = semstab.run(configure(wide, backends=["numba"], check=None, voxel_size=1.0, check_geometry=True))
     assert not result.advice["wide"].chosen
     assert "noise of depth" not in printed(result)
     advice = dataclasses.replace(result.advice["wide"], voxel_size=0.5 * result.advice["wide"].suggested)

@@ -20,12 +20,15 @@ def find_matches(points, R, t, factors, lens, image, power, rays, u, v, z, depth
     fx, fy, cx, cy = lens
     rays_fx, rays_fy, rays_cx, rays_cy = rays
     H, W = image.shape
+    N = points.shape[1]
+    turned = np.empty((3, N))
+    for i in range(N):
+        for axis in range(3):
+            turned[axis, i] = R[axis, 0] * points[0, i] + R[axis, 1] * points[1, i] + R[axis, 2] * points[2, i]
     for f in range(factors.shape[0]):
         tx, ty, tz = t[0] / factors[f], t[1] / factors[f], t[2] / factors[f]
-        for i in range(points.shape[1]):
-            x = R[0, 0] * points[0, i] + R[0, 1] * points[1, i] + R[0, 2] * points[2, i] + tx
-            y = R[1, 0] * points[0, i] + R[1, 1] * points[1, i] + R[1, 2] * points[2, i] + ty
-            ahead = R[2, 0] * points[0, i] + R[2, 1] * points[1, i] + R[2, 2] * points[2, i] + tz
+        for i in range(N):
+            x, y, ahead = turned[0, i] + tx, turned[1, i] + ty, turned[2, i] + tz
             column, row = np.floor(fx * (x / ahead) + cx + 0.5), np.floor(fy * (y / ahead) + cy + 0.5)
             within = ahead > 0 and 0 <= column < W and 0 <= row < H
             u[f, i], v[f, i] = (np.int64(column), np.int64(row)) if within else (0, 0)

@@ -305,8 +305,10 @@ def motion(pose: Float64, other: Float64) -> tuple[Float64, Float64]:
 
 def median_of_seen(errors: npt.NDArray[Any]) -> Float64:
     """Return the median of finite values along the last axis (the lower one of two), or NaN without finite values."""
-    ordered = np.sort(errors, axis=-1)
-    num_finite = np.isfinite(ordered).sum(axis=-1)
-    middle = np.take_along_axis(ordered, np.maximum(num_finite - 1, 0)[..., None] // 2, axis=-1)[..., 0]
-    median: Float64 = np.where(num_finite > 0, middle, np.nan)
+    finite, median = np.isfinite(errors), np.full(errors.shape[:-1], np.nan)
+    for row in np.ndindex(median.shape):
+        seen = errors[row][finite[row]]
+        if (middle := (len(seen) - 1) // 2) >= 0:
+            seen.partition(middle)
+            median[row] = seen[middle]
     return median

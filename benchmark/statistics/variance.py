@@ -121,16 +121,13 @@ def variances(
         distance: (n, n) between the effects, whose correlation is exp(-distance / range); range 0: independent.
         ranges: Correlation lengths that are tried, and their weights before the data.
     """
-    from scipy import special
-
-    n = len(effect)
-    if n < 2 or not effect.var() > 0:
+    n, seen = len(effect), effect.var()
+    if n < 2 or not seen > 0:
         return NOTHING
     contrasts = _contrasts(n)
-    error = contrasts.T @ noise @ contrasts + 1e-9 * effect.var() * np.eye(n - 1)
+    error = contrasts.T @ noise @ contrasts + 1e-9 * seen * np.eye(n - 1)
     whiten = np.linalg.inv(np.linalg.cholesky(error)) @ contrasts.T
-    whitened, largest = whiten @ effect, (n - 1) / special.chdtri(n - 1, 1 - UNLIKELY)
-    sizes = effect.var() * n / (n - 1) * np.geomspace(SMALLEST, largest, SIZES)
+    whitened, sizes = whiten @ effect, seen * n / (n - 1) * _sizes(n)
     logs, result = [], []
     for reach, prior in ranges.items():
         alike = np.exp(-distance / reach) if reach > 0 else np.eye(n)
@@ -284,14 +281,8 @@ class Effects:
     @functools.cached_property
     def locations(self) -> Variances:
         """The variances over new locations."""
-        grid = self.grid
-        of = _neighbours(grid.cubes, MOST_LOCATIONS)
-        weight: Float64 = np.bincount(of, weights=grid.all).astype(np.float64)
-        effect = np.bincount(of, weights=grid.block)
-        at = np.stack([np.bincount(of, weights=grid.all * axis) / weight for axis in grid.cubes.T], axis=1)
-        apart = np.linalg.norm(at[:, None] - at[None], axis=2)
-        centre = weight @ at / weight.sum()
-        extent = 2 * math.sqrt(float(weight @ ((at - centre) ** 2).sum(axis=1)) / float(weight.sum()))
+        of, weight, apart, extent = _locations(self.grid.cubes, self.grid.all)
+        effect = np.bincount(of, weights=self.grid.block)
         return variances(
             effect / weight,
             weight,
@@ -309,6 +300,16 @@ def _contrasts(n: int) -> Float64:
     return contrasts
 
 
+@functools.lru_cache(maxsize=64)
+def _sizes(n: int) -> Float64:
+    """Return the variances (SIZES,) of n effects that are tried, as shares of the variance that was seen."""
+    from scipy import special
+
+    sizes: Float64 = np.geomspace(SMALLEST, (n - 1) / special.chdtri(n - 1, 1 - UNLIKELY), SIZES)
+    sizes.setflags(write=False)
+    return sizes
+
+
 def _of_frames(effect: Float64, weight: Float64, noise: Float64, at: Float64) -> Variances:
     """Return the variances over new frames; `at` (F,) is when they were taken, ascending."""
     step = float(np.median(np.diff(at)))  # effects last for a number of fused frames
@@ -316,15 +317,40 @@ def _of_frames(effect: Float64, weight: Float64, noise: Float64, at: Float64) ->
     return variances(effect, weight, noise, np.abs(np.subtract.outer(at, at)), ranges)
 
 
-def _neighbours(cubes: Int64, most: int) -> Int64:
-    """Return the group (G,) of cubes (G, 3), in at most `most` groups of neighbours: halves of halves."""
-    return _halved(np.ascontiguousarray(cubes, np.int64).tobytes(), most)
+Locations = tuple[Int64, Float64, Float64, float]
+
+
+def _locations(cubes: Int64, amount: Float64) -> Locations:
+    """Return the locations of a model, of cubes (G, 3) that each hold an amount (G,).
+
+    These are the location (G,) of each cube, the amount (n,) in each location, the distance (n, n) between locations
+    and the extent of all, in edges of a cube.
+    """
+    return _located(np.ascontiguousarray(cubes, np.int64).tobytes(), np.ascontiguousarray(amount, np.float64).tobytes())
+
+
+@functools.lru_cache(maxsize=16)
+def _located(cubes: bytes, amount: bytes) -> Locations:
+    """Return the locations of cubes: most numbers of a map count the same in the same ones."""
+    points, of, amounts = _points(cubes), _halved(cubes, MOST_LOCATIONS), np.frombuffer(amount)
+    weight: Float64 = np.bincount(of, weights=amounts).astype(np.float64)
+    at = np.stack([np.bincount(of, weights=amounts * axis) / weight for axis in points.T], axis=1)
+    apart: Float64 = np.linalg.norm(at[:, None] - at[None], axis=2)
+    centre = weight @ at / weight.sum()
+    extent = 2 * math.sqrt(float(weight @ ((at - centre) ** 2).sum(axis=1)) / float(weight.sum()))
+    for array in (weight, apart):
+        array.setflags(write=False)
+    return of, weight, apart, extent
+
+
+def _points(cubes: bytes) -> Float64:
+    return np.frombuffer(cubes, np.int64).reshape(-1, 3).astype(np.float64)
 
 
 @functools.lru_cache(maxsize=16)
 def _halved(cubes: bytes, most: int) -> Int64:
-    """Return the groups of cubes: the numbers of a map lie in the same ones."""
-    points = np.frombuffer(cubes, np.int64).reshape(-1, 3).astype(np.float64)
+    """Return the group (G,) of cubes (G, 3), in at most `most` groups of neighbours: halves of halves."""
+    points = _points(cubes)
     groups = [np.arange(len(points))]
     while 2 * len(groups) <= most and len(groups) < len(points):
         halves = []
