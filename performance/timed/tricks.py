@@ -1,4 +1,4 @@
-"""What each setting of the process is worth: CPU time of whole commands without it, over their time with all.
+"""Settings of the process by what they are worth: CPU time of whole commands without one, over their time with all.
 
 Each command is a process of its own; the ways to start it take turns, and ratios are of medians. The runs, of six
 frames of 640x480 and of 3840x2160, are without check, recording and report.
