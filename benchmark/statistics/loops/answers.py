@@ -112,22 +112,32 @@ def project(point, depth, camera, T, noise, allowed, spot, pixel, x, y, error, r
         elif noise > 0.0:
             error[i], room[i] = misfit_on_plane(depth, row, column, x[i] - column, y[i] - row, z[i], noise)
         if room[i] > allowed and error[i] < 0.0:  # the spot is in front of all that its pixel shows
-            for turn in range(3):
-                a, b = towards(x[i] - column, y[i] - row, turn)
-                there = inverse(depth, row + b, column + a)
-                if there > 0.0:
-                    dx, dy = x[i] - column - a, y[i] - row - b
-                    if noise > 0.0:
-                        _, room_there = misfit_on_plane(depth, row + b, column + a, dx, dy, z[i], noise)
-                    else:
-                        _, room_there = misfit(depths_around(depth, row + b, column + a), dx, dy, z[i])
-                    if room_there <= allowed:
-                        pixel[i], here, room[i] = (row + b) * W + column + a, there, room_there
-                        break
+            row, column, room_there = fitting_pixel(depth, row, column, x[i], y[i], z[i], noise, allowed)
+            if room_there <= allowed:
+                pixel[i], here, room[i] = row * W + column, inverse(depth, row, column), room_there
         spot[found], pixel[found], x[found], y[found] = spot[i], pixel[i], x[i], y[i]
         error[found], room[found] = error[i], room[i]
         found += here > 0.0
     return found
+
+
+@serial
+def fitting_pixel(depth, row, column, x, y, z, noise, allowed):
+    """Return the first of the next pixels towards (x, y) that shows the surface of a spot, and its `room`.
+
+    If none does, that is 1.
+    """
+    for turn in range(3):
+        a, b = towards(x - column, y - row, turn)
+        if inverse(depth, row + b, column + a) > 0.0:
+            dx, dy = x - column - a, y - row - b
+            if noise > 0.0:
+                _, room = misfit_on_plane(depth, row + b, column + a, dx, dy, z, noise)
+            else:
+                _, room = misfit(depths_around(depth, row + b, column + a), dx, dy, z)
+            if room <= allowed:
+                return row + b, column + a, room
+    return row, column, 1.0
 
 
 @serial

@@ -12,7 +12,7 @@ MOST_PLACES = 1 << 16
 """Most places that are looked at in a block of pixels: a pixel of damaged depth may show thousands of kilometres."""
 
 AT_ONCE = 64
-"""Places of a block that are looked at in one go."""
+"""Places that are looked at in one go, of many blocks."""
 
 
 @serial
