@@ -182,16 +182,12 @@ class DepthMemory:
             sigma: Standard deviation of how depth differs between views, relative.
             spacing: Distance of spots in metres; with 0 no spot is told by those next to it.
         """
-        from semstab.statistics.loops.moving import tally
-
         votes = np.zeros((len(self.kept), len(point)), np.uint8)
         for view_votes, depth in zip(votes, self.kept, strict=True):
             view_votes[firm] = depth.votes(point[firm], sigma)
         depth_views = np.array([depth.view for depth in self.kept], np.int64)
         fits, shares = _fitting(votes, depth_views, found, views)
-        counts, between = np.zeros((len(point), 3), np.uint16), np.zeros(2, np.int64)
-        at_end = np.zeros(len(point), np.uint16)
-        tally(votes, fits[depth_views], counts, at_end, between)
+        counts, at_end, between = _tallied(votes, fits[depth_views])
         counts[~fits[found]] = at_end[~fits[found]] = 0
         num_seen, hidden, through = counts.T.copy()
         nothing = np.zeros(len(point), np.bool_)
@@ -206,8 +202,6 @@ class DepthMemory:
         Places in blocks of pixels are asked, of sparse depth all pixels that have it; pixels next to such blocks move,
         too, if they go on at the same depth.
         """
-        from semstab.statistics.loops.moving import SEEN, THROUGH
-
         step = 1 if sparse else max(1, round(math.sqrt(frame.depth.size / BLOCKS)))
         depth = frame.depth[step // 2 :: step, step // 2 :: step].astype(np.float64)
         valid, K = (depth > 0) & (depth < np.inf), frame.intrinsics
@@ -215,16 +209,14 @@ class DepthMemory:
         z = depth[valid]
         rays = np.stack([(column - K.cx) / K.fx, (row - K.cy) / K.fy, np.ones(len(z))], axis=1)
         point = (rays * z[:, None]) @ frame.T_wc[:3, :3].T + frame.T_wc[:3, 3]
-        num_seen, through, until_seen, since_seen = np.zeros((4, len(z)), np.int64)
-        for view_depth in self.kept:
-            if not misplaced[view_depth.view]:
-                kinds = view_depth.votes(point, sigma) & 3
-                num_seen += kinds == SEEN
-                through += kinds == THROUGH
-                since_seen = (since_seen + (kinds == THROUGH)) * (kinds != SEEN)
-                until_seen = np.where(num_seen == 0, through, until_seen)
+        kept = [view_depth for view_depth in self.kept if not misplaced[view_depth.view]]
+        votes = np.zeros((len(kept), len(point)), np.uint8)
+        for view_votes, view_depth in zip(votes, kept, strict=True):
+            view_votes[:] = view_depth.votes(point, sigma)
+        counts, at_end, _ = _tallied(votes, np.ones(len(kept), np.bool_))
+        num_seen, _, through = counts.astype(np.int64).T
         moves = np.zeros(depth.shape, np.bool_)
-        moves[valid] = has_moved(through, num_seen + through, np.maximum(until_seen, since_seen))
+        moves[valid] = has_moved(through, num_seen + through, at_end)
         small = _grown(moves, np.where(valid, depth, np.nan), gap_of(sigma))
         mask = small.repeat(step, axis=0).repeat(step, axis=1)
         bottom, right = (max(0, n - m) for n, m in zip(frame.depth.shape, mask.shape, strict=True))
@@ -242,6 +234,16 @@ def _grown(moves: Mask, depth: Float64, gap: float) -> Mask:
             grown |= padded[side] & (np.abs(around[side] - depth) <= gap * depth)
         moves = grown
     return moves
+
+
+def _tallied(votes: npt.NDArray[np.uint8], counted: Mask) -> tuple[UInt16, UInt16, Int64]:
+    """Return the counts of the votes (V, n) of the views that count (V,): see `tally`."""
+    from semstab.statistics.loops.moving import tally
+
+    counts, at_end = np.zeros((votes.shape[1], 3), np.uint16), np.zeros(votes.shape[1], np.uint16)
+    between = np.zeros(2, np.int64)
+    tally(votes, counted, counts, at_end, between)
+    return counts, at_end, between
 
 
 def has_moved(through: npt.NDArray[Any], votes: npt.NDArray[Any], at_end: npt.NDArray[Any]) -> Mask:
