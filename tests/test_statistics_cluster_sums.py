@@ -12,6 +12,7 @@ from simulated_events import grid, log_of, log_of_evidence, soft
 from striped_floor import K, fused, sampled
 from striped_floor import flight as over_stripes
 
+from semstab.core.arrays import distinct_keys
 from semstab.core.json_form import to_json
 from semstab.data.measures import Measure, dominant, entropy, margin, registered, sbd, vss
 from semstab.errors import DataError
@@ -355,3 +356,13 @@ def test_rows_are_counted_as_they_are_told_apart(reach) -> None:
         np.testing.assert_array_equal(distinct, np.unique(rows, axis=0))
         np.testing.assert_array_equal(distinct[of], rows)
         assert count_distinct(rows) == len(distinct)
+
+
+@pytest.mark.parametrize("most", [3, 40, 200, 10**12])
+def test_distinct_keys_are_those_of_numpy_whether_they_are_counted_or_put_in_order(most: int) -> None:
+    for n in (0, 1, 50, 100):
+        key = np.random.default_rng([most, n]).integers(0, most, n)
+        keys, of = distinct_keys(key)
+        expected, expected_of = np.unique(key, return_inverse=True)
+        assert keys.tolist() == expected.tolist()
+        assert of.tolist() == expected_of.tolist()
