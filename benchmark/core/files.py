@@ -10,7 +10,6 @@ import os
 import shutil
 import stat
 import tempfile
-import time
 import weakref
 import zipfile
 from collections.abc import Collection, Iterable, Iterator, Mapping
@@ -107,31 +106,21 @@ def only_writer(path: str | Path) -> Iterator[None]:
     Raises:
         ConfigError: If another one writes it.
     """
+    from filelock import FileLock, Timeout
+
     real = Path(path).resolve()
     real.parent.mkdir(parents=True, exist_ok=True)
-    lock = real.parent / f"{TEMPORARY}{hashlib.blake2b(os.fsencode(real.name), digest_size=8).hexdigest()}.lock"
-    handle, until = None, time.monotonic() + BRIEFLY
-    while handle is None:
-        handle = os.open(lock, os.O_RDONLY | os.O_CREAT, 0o666)
-        try:
-            fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
-            removed = os.fstat(handle).st_nlink == 0
-        except BlockingIOError as error:
-            removed = True
-            if time.monotonic() > until:
-                os.close(handle)
-                raise ConfigError(f"{path}: another process writes it; wait for it, or name another file") from error
-        except OSError:  # a file system without locks
-            removed = False
-        if removed:
-            os.close(handle)
-            handle = None
-            time.sleep(0.01)
+    name = hashlib.blake2b(os.fsencode(real.name), digest_size=8).hexdigest()
+    lock = FileLock(real.parent / f"{TEMPORARY}{name}.lock", timeout=BRIEFLY)
+    try:
+        lock.acquire()
+    except Timeout as error:
+        raise ConfigError(f"{path}: another process writes it; wait for it, or name another file") from error
     try:
         yield
     finally:
-        lock.unlink(missing_ok=True)
-        os.close(handle)
+        Path(lock.lock_file).unlink(missing_ok=True)
+        lock.release()
 
 
 class ScratchFolder:
@@ -271,10 +260,12 @@ def write_stack(
 
 
 def cache_folder() -> Path:
-    """Return the folder of caches: SEMSTAB_CACHE, or semstab below XDG_CACHE_HOME, which is ~/.cache."""
+    """Return the folder of caches: SEMSTAB_CACHE, or semstab below the system's folder, ~/.cache or XDG_CACHE_HOME."""
+    import platformdirs
+
     if path := os.environ.get("SEMSTAB_CACHE"):
         return Path(path)
-    return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "semstab"
+    return platformdirs.user_cache_path("semstab", appauthor=False)
 
 
 def content_key(settings: Mapping[str, Any]) -> str:
