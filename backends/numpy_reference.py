@@ -35,6 +35,9 @@ ONE_IN, MOST = 16, 10_000
 MOST_OF_ALL = 1_000_000
 """The most voxels of a map that the reference fuses as a whole."""
 
+SHARE = 0.5
+"""The most time that it takes, as a share of the fusion that it checks, while it has more than one in ONE_IN."""
+
 ODD = np.array([-0x61C8864680B583EB, -0x3D4D51C2D82B14B1, 0x165667B19E3779F9])
 """The factors, one an axis, that mix an index's bits (odd numbers of Steele and Vigna's splitmix and of xxHash)."""
 
@@ -158,8 +161,9 @@ class NumpyReference(NumpyHistory):
 class NumpySample(NumpyHistory):
     """The reference on one in `one_in` of the voxels, drawn at random by their index, through all frames.
 
-    A `whole` one starts with all voxels, and keeps them as long as that takes less time than the fusion that it checks,
-    and there are at most MOST_OF_ALL. It fuses by the `rule`, with `rule_options`, where these are given.
+    A `whole` one starts with all voxels, and keeps them as long as that takes at most SHARE of the time of the fusion
+    that it checks, and there are at most MOST_OF_ALL. It fuses by the `rule`, with `rule_options`, where these are
+    given.
 
     Each sample holds those of the next thinner one, so that it can become thinner while the map grows: a defect in a
     share p of the voxels is found with probability 1 - (1 - p)^n, and n = MOST voxels find 0.05 % of them in 99 of 100.
@@ -170,7 +174,7 @@ class NumpySample(NumpyHistory):
     ) -> None:
         super().__init__(voxel_size, num_classes, within)
         self.one_in, self._left = 1 if whole else ONE_IN, 0
-        self._ahead: float | None = None  # seconds of fusion less those of the reference; None before the second frame
+        self._ahead: float | None = None  # seconds of fusion times SHARE less those of the reference; None at first
         self._by_rule = NumpyRules(voxel_size, num_classes, **rule) if rule else None
 
     def integrate(self, frame: Frame, allowed: float = math.inf) -> None:
@@ -188,7 +192,7 @@ class NumpySample(NumpyHistory):
         if self._ahead is None:
             self._ahead = 0.0
         elif self.one_in < ONE_IN:
-            self._ahead += allowed - (time.perf_counter() - started)
+            self._ahead += SHARE * allowed - (time.perf_counter() - started)
             if self._ahead < 0:
                 self._thin()
                 self._ahead = 0.0

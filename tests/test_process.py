@@ -38,13 +38,11 @@ def test_memory_of_an_image_is_used_again() -> None:
     assert faults("") > 50
 
 
-@pytest.mark.parametrize(
-    ("name", "default", "other"), [("OMP_WAIT_POLICY", "PASSIVE", "ACTIVE"), ("OPENBLAS_NUM_THREADS", "1", "2")]
-)
-def test_a_choice_of_the_user_is_kept(name: str, default: str, other: str) -> None:
+def test_a_choice_of_the_user_is_kept() -> None:
+    name = "OPENBLAS_NUM_THREADS"
     script = "import os; from semstab.core import process; process.configure_process()"
     script += f"; print(os.environ['{name}'])"
-    for chosen, expected in ({}, default), ({name: other}, other):
+    for chosen, expected in ({}, "1"), ({name: "2"}, "2"):
         environment = {k: v for k, v in os.environ.items() if k != name} | chosen
         result = subprocess.run(
             [sys.executable, "-c", script], check=True, capture_output=True, text=True, env=environment

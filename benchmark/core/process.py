@@ -114,13 +114,11 @@ LARGEST_IMAGE, RETAINED = 64 << 20, 1 << 30
 def configure_process() -> None:
     """Prepare this process; to be called before any thread is started. Changes no result.
 
-    Threads that wait do not spin, for they would take the time of those that decode the next frames. NumPy's products
-    of matrices, which are small, take one thread: the others would be waited for. Memory of a
-    decoded image is used for the next one, instead of being returned to the system, which clears it each time (glibc).
-    Rerun logs nothing of its own to the terminal.
+    NumPy's products of matrices, which are small, take one thread: the others would be waited for. Memory of a decoded
+    image is used for the next one, instead of being returned to the system, which clears it each time (glibc). Rerun
+    logs nothing of its own to the terminal.
     """
     os.environ.setdefault("RUST_LOG", "off")
-    os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # read when NumPy is loaded
     if hasattr(libc := _libc(), "gnu_get_libc_version"):
         for parameter, value in ((MMAP_THRESHOLD, LARGEST_IMAGE), (TRIM_THRESHOLD, RETAINED), (ARENA_MAX, 1)):

@@ -81,8 +81,8 @@ def _finished_unit(live: LiveMap, stream: Stream, files: Files, watch: Stopwatch
     if fused is not None and not len(fused.table):
         raise no_voxels(live.task, config)
     observations, features = live.sampled_observations(), live.sampled_features()
-    if not config.statistics:
-        files.write_ahead(_map_savers(live, fused))
+    ahead = observation_savers(live.task, observations) if work.unit.stored else Savers()
+    files.write_ahead(ahead if config.statistics else ahead | _map_savers(live, fused))
     with watch("statistics"):
         sample, analysis = _sample(live, fused), None
         if sample is not None:
@@ -295,7 +295,7 @@ def _unit_savers(
             places = worst_places((fused.table,), observations, PICTURED_PLACES)
             pictures |= pictures_of_places(task, places, live.config.pixel_stride)
         savers[overview_file(task)] = partial(save_overview, stream.overview | pictures)
-    return savers | unit_savers(task, live.rows, observations, analysis, of_frames) if unit.stored else savers
+    return savers | unit_savers(task, live.rows, analysis, of_frames) if unit.stored else savers
 
 
 def _tile_savers(
@@ -344,15 +344,16 @@ def _map_file(work: Work, folder: str, *, waits: bool) -> str:
     return f"{work.tile.folder}/{folder}/{tile.name}" if waits else f"{folder}/{slug}/{tile.name}"
 
 
-def unit_savers(
-    task: Task, rows: Series, observations: SpotObservations | None, analysis: Analysis | None, of_frames: OfFrames
-) -> Savers:
-    """Return the files of a unit that do not depend on tiles: its time series, and what statistics rest on."""
+def observation_savers(task: Task, observations: SpotObservations | None) -> Savers:
+    """Return the file of what views say of spots, on which statistics rest."""
+    return {} if observations is None else {f"{OBSERVATIONS}/{task.units[0].slug}.parquet": observations.save}
+
+
+def unit_savers(task: Task, rows: Series, analysis: Analysis | None, of_frames: OfFrames) -> Savers:
+    """Return the files of a unit that do not depend on tiles: its time series, and sums of its statistics."""
     slug = task.units[0].slug
     series = partial(rows.save_csv, names=task.scene.frame_name, of_frames=of_frames, maps=task.scene.posed)
     savers: Savers = {f"{FRAMES}/{slug}.csv": series}
-    if observations is not None:
-        savers[f"{OBSERVATIONS}/{slug}.parquet"] = observations.save
     if analysis is not None:
         savers[f"{SUMS}/{slug}.parquet"] = analysis.sums.save
     return savers

@@ -20,6 +20,7 @@ from semstab.engine.folder import Folder
 from semstab.engine.measurement import (
     analyse_sample,
     no_voxels,
+    observation_savers,
     overview_file,
     pictures_of_outlying,
     record_of,
@@ -176,7 +177,7 @@ def _savers(
         savers[overview_file(task)] = partial(_save_with_pictures, folder / overview_file(task), pictures)
     if not unit.stored:
         return savers
-    savers |= unit_savers(task, rows, observations, analysis, of_frames)
+    savers |= observation_savers(task, observations) | unit_savers(task, rows, analysis, of_frames)
     if unit.config.statistics and analysis is not None:
         for tile in tiles:
             savers |= _with_columns(tile, unit.name.slug, analysis, folder)

@@ -20,7 +20,7 @@ from semstab.report.tables import write_tables
 if TYPE_CHECKING:
     from semstab.data.voxels import VoxelTable
     from semstab.engine.units import Unit
-    from semstab.report.figures.topdown import FromAbove
+    from semstab.report.places import ShownMap
 
 __all__ = ["Reporting", "write_report"]
 
@@ -31,16 +31,16 @@ class Reporting(Observer):
     def __init__(self, folder: str | Path) -> None:
         self._folder = Path(folder)
         self._beside = Background("semstab-report", 0)
-        self._above: dict[str, Future[FromAbove]] = {}
+        self._shown: dict[str, Future[ShownMap]] = {}
 
     def unit_finished(
         self, unit: Unit, record: Record | RegionFlicker | None, table: VoxelTable | None, error: str | None
     ) -> None:
-        """Find the voxels that are seen from above beside the run, while the table is in memory."""
+        """Find what the page shows of a map beside the run, while the table is in memory."""
         if table is not None and isinstance(record, Record) and record.up is not None and unit.image_space:
-            from semstab.report.figures.topdown import FromAbove
+            from semstab.report.places import ShownMap
 
-            self._above[unit.name.slug] = self._beside.submit(partial(FromAbove.of, table, record.up))
+            self._shown[unit.name.slug] = self._beside.submit(partial(ShownMap.of, record, table))
 
     def run_finished(self, result: Result) -> None:
         """Write tables and report, or nothing where every unit failed."""
@@ -52,7 +52,7 @@ class Reporting(Observer):
                     return
         if result.select():
             write_tables(result, self._folder)
-            write_report(result, self._folder, {unit: future.result() for unit, future in self._above.items()})
+            write_report(result, self._folder, {unit: future.result() for unit, future in self._shown.items()})
 
 
 HEAD = 1000
@@ -65,16 +65,16 @@ def digest_of(folder: Path) -> str:
     return hashlib.sha256(version("semstab").encode() + (summary.read_bytes() if summary.exists() else b"")).hexdigest()
 
 
-def write_report(result: Result, folder: str | Path, above: Mapping[str, FromAbove] = MappingProxyType({})) -> Path:
+def write_report(result: Result, folder: str | Path, shown: Mapping[str, ShownMap] = MappingProxyType({})) -> Path:
     """Write FOLDER/report.html, from the result and the files that its run left in the folder; return its path.
 
     Args:
         result: The result of the run or study.
         folder: Its folder.
-        above: The voxels that are seen from above, by the unit's slug; the voxels of other units are read.
+        shown: What is shown of a map, by the unit's slug; the voxels of other units are read.
     """
     from semstab.report.page import render
 
     path = Path(folder) / "report.html"
-    write_text(path, render(result, Path(folder), digest_of(Path(folder)), above))
+    write_text(path, render(result, Path(folder), digest_of(Path(folder)), shown))
     return path

@@ -26,12 +26,11 @@ from semstab.metrics.image_space import mean_over_scenes
 from semstab.report.charts import Joint, Line, dot_chart, line_chart, sample, tree_chart
 from semstab.report.figures.located import Located
 from semstab.report.figures.maps import Overview, TopViews
-from semstab.report.figures.topdown import FromAbove
 from semstab.report.filter_study import advice, filter_studies, of_interest
 from semstab.report.html import filled, jpeg, lone_pictures, png, table_block
 from semstab.report.means import ENOUGH, by_model, describe, levels, over_recurrent, pooled, swept
 from semstab.report.narrative import not_assessed, noted, notes, outlying_line, warnings
-from semstab.report.places import described_places, map_frame
+from semstab.report.places import LISTED, ShownMap, described_places, map_frame
 from semstab.report.ranking import order_of_models
 from semstab.report.saved_run import read_series
 from semstab.report.tables import tables
@@ -39,6 +38,7 @@ from semstab.report.tables.table import relations
 from semstab.report.terminal import miou
 from semstab.statistics.correctness import MIOU
 from semstab.statistics.moving import STATE_COLORS, STATE_NAMES, states_of
+from semstab.statistics.places import places_of
 from semstab.statistics.verdict import LIMITS
 
 MOST_NAMED = 3
@@ -55,19 +55,17 @@ UNKNOWN = 255
 """The code of a value that is not defined; as a category, the code of a cell without a voxel."""
 
 
-def render(
-    result: Result, folder: Path, digest: str = "", above: Mapping[str, FromAbove] = MappingProxyType({})
-) -> str:
+def render(result: Result, folder: Path, digest: str = "", shown: Mapping[str, ShownMap] = MappingProxyType({})) -> str:
     """Return the page of the result whose files lie in the folder, with the digest of what it is made from.
 
     Args:
         result: The result of the run or study.
         folder: Its folder.
         digest: Digest of the files that the page is made from.
-        above: The voxels that are seen from above, by the unit's slug; the voxels of other units are read.
+        shown: What is shown of a map, by the unit's slug; the voxels of other units are read.
     """
     everything, result = result, of_interest(result)
-    scenes, views = list(_scenes(result, folder, above)), [table_block(table) for table in tables(everything)]
+    scenes, views = list(_scenes(result, folder, shown)), [table_block(table) for table in tables(everything)]
     return filled(
         "report.html.j2",
         kind="Study of temporal semantic stability" if result.sweeps() else "Temporal semantic stability",
@@ -216,7 +214,7 @@ def _of_images(records: Sequence[Record]) -> Iterator[tuple[str, str, str]]:
 # --- A scene: the map, the time line, the classes ---------------------------------------------------------------------
 
 
-def _scenes(result: Result, folder: Path, above: Mapping[str, FromAbove]) -> Iterator[dict[str, Any]]:
+def _scenes(result: Result, folder: Path, shown: Mapping[str, ShownMap]) -> Iterator[dict[str, Any]]:
     views = TopViews()
     stored = [record for record in result.select() if record.voxels_file is not None]
     share = min(BYTES, ALL_BYTES // max(1, len(stored)))
@@ -235,7 +233,8 @@ def _scenes(result: Result, folder: Path, above: Mapping[str, FromAbove]) -> Ite
             "maps": [
                 _map(
                     record,
-                    above.get(record.unit.slug) or views.above(record, result.up[scene]),
+                    shown.get(record.unit.slug)
+                    or ShownMap(views.above(record, result.up[scene]), places_of(record, LISTED)),
                     overviews.get(record.unit.model),
                     result.georeference.get(scene),
                     share,
@@ -255,12 +254,13 @@ def _scenes(result: Result, folder: Path, above: Mapping[str, FromAbove]) -> Ite
 
 
 def _map(
-    record: Record, above: FromAbove, overview: Overview | None, georeference: Georeference | None, most: int
+    record: Record, shown: ShownMap, overview: Overview | None, georeference: Georeference | None, most: int
 ) -> dict[str, Any]:
     """Return the map as the page's script paints it.
 
     It has images of numbers for the script, and an image of the stability for a page without script.
     """
+    above = shown.above
     step = max(1, math.ceil(math.sqrt(above.rows.size / CELLS)))
     table, names = above.table, above.table.classes or tuple(map(str, range(above.table.K)))
     moved = states_of(record, table.centers)
@@ -293,7 +293,7 @@ def _map(
         "text": f"{size[0]:.3g} m by {size[1]:.3g} m{of_whole}, seen {above.view}",
         "around": map_frame(located),
         "located": {"matrix": located.matrix.tolist(), "size": located.size, "names": located.names},
-        "places": described_places(record, located, overview, names),
+        "places": described_places(shown.places, record, located, overview, names),
         "cell": cell,
         "names": names,
         "palette": palette.tolist(),

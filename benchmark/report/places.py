@@ -3,14 +3,17 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
 from semstab.data.records import Record
+from semstab.data.voxels import VoxelTable
 from semstab.engine.series import read_names
 from semstab.report.figures.located import Located, metres
 from semstab.report.figures.maps import Overview, PlacePictures, scale_length, scale_text
+from semstab.report.figures.topdown import FromAbove
 from semstab.report.html import jpeg, label_picture
 from semstab.statistics.places import Place, places_of
 
@@ -20,6 +23,24 @@ LISTED, NAMED = 10, 12
 
 END = 0.04
 """The share of an edge next to a corner of the map without ticks, whose text would stand out of the page."""
+
+
+@dataclass(frozen=True, eq=False)
+class ShownMap:
+    """What the page shows of a map.
+
+    Attributes:
+        above: Its voxels that are seen from above.
+        places: Its worst places.
+    """
+
+    above: FromAbove
+    places: Sequence[Place]
+
+    @classmethod
+    def of(cls, record: Record, table: VoxelTable) -> ShownMap:
+        """Find both in the voxels of a unit, which are in memory; up must be known."""
+        return cls(FromAbove.of(table, np.asarray(record.up)), places_of(record, LISTED, table))
 
 
 def frame_names(record: Record) -> dict[int, str]:
@@ -42,9 +63,9 @@ def map_frame(located: Located) -> dict[str, Any]:
 
 
 def described_places(
-    record: Record, located: Located, overview: Overview | None, classes: Sequence[str]
+    places: Sequence[Place], record: Record, located: Located, overview: Overview | None, classes: Sequence[str]
 ) -> list[dict[str, Any]]:
-    """Return the worst places of a unit: where each is in the picture and in the coordinates of the exports."""
+    """Return what the page says of the worst places: where each is in the picture and in the coordinates of exports."""
     names, pictures = frame_names(record), None if overview is None else overview.places
     palette = None if overview is None else overview.palette
     return [
@@ -58,7 +79,7 @@ def described_places(
             "frames": _frames(place, names, classes),
             "pictures": [] if pictures is None else list(_pictures(place, pictures, palette, names, classes)),
         }
-        for place in places_of(record, LISTED)
+        for place in places
     ]
 
 

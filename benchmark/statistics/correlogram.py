@@ -148,7 +148,7 @@ def _pairs(spots: SpotObservations, log: Events) -> Iterator[tuple[Int64, Int64,
     lag = 1
     while len(first := np.flatnonzero(log.voxel[lag:] == log.voxel[:-lag])):
         second = first + lag
-        near, far = np.sort([distance[first], distance[second]], axis=0)
+        near, far = np.minimum(distance[first], distance[second]), np.maximum(distance[first], distance[second])
         cosine = (ray[first] * ray[second]).sum(axis=1) / (distance[first] * distance[second])
         angle = np.degrees(np.arccos(np.clip(cosine, -1.0, 1.0)))
         baseline = np.linalg.norm(centre[rank[second]] - centre[rank[first]], axis=1)

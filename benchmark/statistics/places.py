@@ -78,11 +78,11 @@ class Place:
     views: tuple[PlaceView, ...]
 
 
-def places_of(record: Record, most: int = MOST) -> list[Place]:
-    """Return the worst places of a unit whose voxels are stored."""
+def places_of(record: Record, most: int = MOST, table: VoxelTable | None = None) -> list[Place]:
+    """Return the worst places of a unit whose voxels are stored, and read, unless they are given."""
     spots = record.observations_file
     observations = None if spots is None or not spots.exists() else SpotObservations.load(spots)
-    return worst_places(record.tiles(), observations, most)
+    return worst_places(record.tiles() if table is None else (table,), observations, most)
 
 
 def worst_places(tables: Iterable[VoxelTable], spots: SpotObservations | None, most: int = MOST) -> list[Place]:

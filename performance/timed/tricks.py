@@ -1,7 +1,7 @@
 """Settings of the process by what they are worth: CPU time of whole commands without one, over their time with all.
 
 Each command is a process of its own; the ways to start it take turns, and ratios are of medians. The runs, of six
-frames of 640x480 and of 3840x2160, are without check, recording and report.
+frames of 640x480 and of 3840x2160, by `numba` and by `open3d`, are without check, recording and report.
 """
 
 from __future__ import annotations
@@ -22,10 +22,10 @@ configure = process.configure_process
 from semstab.__main__ import main
 main()
 """
-WITHOUT_VARIABLE = """
+WITHOUT_OPENBLAS = """
 def without():
     configure()
-    os.environ.pop("{name}")
+    os.environ.pop("OPENBLAS_NUM_THREADS")
 process.configure_process = without
 """
 WITHOUT_MALLOPT = """
@@ -39,8 +39,7 @@ WAYS = {
     "all": "",
     "gc.freeze before a run": "gc.freeze = lambda: None",
     "mallopt": WITHOUT_MALLOPT,
-    "OMP_WAIT_POLICY": WITHOUT_VARIABLE.format(name="OMP_WAIT_POLICY"),
-    "OPENBLAS_NUM_THREADS": WITHOUT_VARIABLE.format(name="OPENBLAS_NUM_THREADS"),
+    "OPENBLAS_NUM_THREADS": WITHOUT_OPENBLAS,
     "imports where they are used": "import semstab.api, semstab.recording",
 }
 """Changes to the process before the command starts, by what they take away."""
@@ -48,7 +47,7 @@ WAYS = {
 
 def main(
     rounds: int = 7,
-    commands: tuple[str, ...] = ("help", "list", "six frames", "large frames"),
+    commands: tuple[str, ...] = ("help", "list", "six frames", "large frames", "large frames open3d"),
     ways: tuple[str, ...] = tuple(WAYS),
 ) -> Any:
     with tempfile.TemporaryDirectory() as name:
@@ -56,9 +55,10 @@ def main(
         words: dict[str, tuple[str | Path, ...]] = {"help": ("--help",), "list": ("list",)}
         if "six frames" in commands:
             words["six frames"] = ("--data", write_scene(folder / "six", 6, (640, 480)), "--voxel-size", "0.02", *OFF)
-        if "large frames" in commands:
+        if any(command.startswith("large") for command in commands):
             large = write_scene(folder / "large", 6, (3840, 2160))
             words["large frames"] = ("--data", large, "--voxel-size", "0.05", *OFF)
+            words["large frames open3d"] = (*words["large frames"], "--backend", "open3d")
         table = measuring.Table(without="", **dict.fromkeys((c.replace(" ", "_") for c in commands), ".2f"))
         ratios: dict[str, dict[str, float]] = {way: {} for way in ways}
         for command in commands:
