@@ -175,10 +175,12 @@ def color_of(frame: Frame) -> bytes | None:
     try:
         with Image.open(file) if frame.color is None else Image.fromarray(frame.color) as image:
             image.draft("RGB", (W, H))  # JPEG decodes to 1/2, 1/4 and 1/8 of its size in less time
-            small = image.convert("RGB").resize((W, H), Image.Resampling.BOX)
+            image.load()
+            colour = image if image.mode == "RGB" else image.convert("RGB")
+            small = colour if colour.size == (W, H) else colour.resize((W, H), Image.Resampling.BOX)
+            small.save(buffer, "JPEG", quality=JPEG_QUALITY)
     except (OSError, Image.DecompressionBombError) as error:
         raise DataError(f"{file}: the image cannot be decoded") from error
-    small.save(buffer, "JPEG", quality=JPEG_QUALITY)
     return buffer.getvalue()
 
 

@@ -39,7 +39,7 @@ from semstab.recording.camera import COARSE_SIDE, SceneLog, over_camera, stride_
 from semstab.recording.drift import DriftLog, FrameChanges, log_points
 from semstab.recording.layout import VERDICT, blueprint, drawn
 from semstab.recording.target import DEFAULT_URL, Target, flush, is_whole
-from semstab.recording.timeline import Clock, FrameJobs, path
+from semstab.recording.timeline import Clock, FrameJobs, SeriesLog, path
 from semstab.recording.voxel_maps import (
     PENDING,
     VoxelLogger,
@@ -78,7 +78,7 @@ class GroupLog:
 
     def log(
         self, stream: rr.RecordingStream, frame: Frame, rows: Mapping[UnitName, FrameRow], voxels: int,
-        background: FrameJobs,
+        series: SeriesLog, background: FrameJobs,
     ) -> None:  # fmt: skip
         """Log the rows of a fused frame, its labels, the changes that it made to the map, and the map of its voxels."""
         self.last = frame.index, frame.timestamp
@@ -90,7 +90,7 @@ class GroupLog:
 
         def job() -> None:
             for unit, row in rows.items():
-                timeline.log_row(stream, unit, self.task, row.cells())
+                series.add(unit, self.task, frame.index, frame.timestamp, row.cells())
             if frame.is_scan:
                 log_points(stream, path(self._scene, "camera", self.task.model), frame, drift)
             else:
@@ -195,6 +195,7 @@ class Recording(Observer):
         self._stream: rr.RecordingStream | None = None
         self._background: FrameJobs | None = None
         self._clock = Clock()
+        self._series: SeriesLog
         self._fused: FusionBackend | None = None  # the map that is drawn
         self._group: GroupLog | None = None  # the model on a scene that is being fused
         self._unfinished: set[UnitName] = set()  # of the group
@@ -232,7 +233,7 @@ class Recording(Observer):
         if group is None or group.task.model != task.model:  # the models of a video take turns
             group = self._begin(task, frame.T_wc[:3, 3])
         self._scenes[task.scene.name].log(stream, frame, background)
-        group.log(stream, frame, rows, voxels, background)
+        group.log(stream, frame, rows, voxels, self._series, background)
 
     def unit_finished(
         self, unit: Unit, record: Record | RegionFlicker | None, table: VoxelTable | None, error: str | None
@@ -317,6 +318,7 @@ class Recording(Observer):
         try:
             if self._background is not None:
                 self._background.close()
+                self._series.send()
             if self._outdated:
                 self._send_layout(stream)
         finally:
@@ -335,6 +337,7 @@ class Recording(Observer):
         if self._stream is None or self._background is None:
             self._stream = self.target.open()
             self._background = FrameJobs(self._stream, self._clock)
+            self._series = SeriesLog(self._stream, self._clock)
             for scene in self._scenes.values():
                 scene.log_static(self._stream)
                 self._stream.log(path(scene.name, VERDICT), rr.TextDocument(PENDING), static=True)
@@ -390,6 +393,7 @@ class Recording(Observer):
         tolerance = self._plan.config.tolerance
 
         def job() -> None:
+            self._series.send()
             group.log_unit(stream, record, table, tolerance, factor, moved)
             self._scenes[unit.scene].see(stream, group.task, table)
             self._outdated = True

@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+import time
+from collections import defaultdict
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import rerun as rr
 
 from semstab.core.background import Background
@@ -36,14 +39,27 @@ class Clock:
         """Set the time of all later logs to that frame."""
         stream.reset_time()
         stream.set_time("frame", sequence=frame)
+        if timestamp is not None and self.shows(timestamp):
+            if self._dated:
+                stream.set_time("time", timestamp=timestamp)
+            else:
+                stream.set_time("time", duration=timestamp)
+
+    def shows(self, timestamp: float | None) -> bool:
+        """Return whether a frame has its timestamp on a timeline, too."""
         if timestamp is None or not abs(timestamp) <= LAST_DATE:
-            return
+            return False
         if self._dated is None:
             self._dated = timestamp >= FIRST_DATE
-        if self._dated:
-            stream.set_time("time", timestamp=timestamp)
-        else:
-            stream.set_time("time", duration=timestamp)
+        return True
+
+    def columns(self, frames: Sequence[int], timestamps: Sequence[float | None]) -> list[rr.TimeColumn]:
+        """Return the times of several frames, all of which have a timestamp that is shown, or none."""
+        times = [rr.TimeColumn("frame", sequence=frames)]
+        if self.shows(timestamps[0]):
+            kind = "timestamp" if self._dated else "duration"
+            times.append(rr.TimeColumn("time", **{kind: np.array(timestamps, np.float64)}))
+        return times
 
 
 MOST_PENDING = 4
@@ -102,14 +118,40 @@ def columns(unit: UnitName, task: Task) -> list[str]:
     return [name for name in SERIES if name not in OF_VIDEOS or unit.backend == task.backends[0]]
 
 
-def log_row(stream: rr.RecordingStream, unit: UnitName, task: Task, cells: Mapping[str, Any]) -> None:
-    """Log the defined values of a row of the CSV at the stream's time."""
-    row = {**cells}
-    if task.scene.posed:
-        row["updated_voxels"] = float(cells["voxels"]) - float(cells["new_voxels"])
-    for name in columns(unit, task):
-        if row.get(name) not in (None, ""):
-            stream.log(entity(name, unit), rr.Scalars(float(row[name])))
+SECONDS = 0.3
+"""Rows of time series that come within that time are sent together: a call for each number would take longer."""
+
+
+class SeriesLog:
+    """Rows of time series, which are sent as columns.
+
+    Args:
+        stream: Where to.
+        clock: Its clock.
+    """
+
+    def __init__(self, stream: rr.RecordingStream, clock: Clock) -> None:
+        self._stream, self._clock, self._sent = stream, clock, time.monotonic()
+        self._values: defaultdict[tuple[str, bool], list[tuple[int, float | None, float]]] = defaultdict(list)
+
+    def add(self, unit: UnitName, task: Task, frame: int, timestamp: float | None, cells: Mapping[str, Any]) -> None:
+        """Take the defined values of a row of the CSV; send them with those before if it is time."""
+        row, dated = {**cells}, self._clock.shows(timestamp)
+        if task.scene.posed:
+            row["updated_voxels"] = float(cells["voxels"]) - float(cells["new_voxels"])
+        for name in columns(unit, task):
+            if row.get(name) not in (None, ""):
+                self._values[entity(name, unit), dated].append((frame, timestamp, float(row[name])))
+        if time.monotonic() - self._sent >= SECONDS:
+            self.send()
+
+    def send(self) -> None:
+        """Send the rows that wait."""
+        for (name, _), rows in self._values.items():
+            frames, timestamps, values = zip(*rows, strict=True)
+            self._stream.send_columns(name, self._clock.columns(frames, timestamps), rr.Scalars.columns(scalars=values))
+        self._values.clear()
+        self._sent = time.monotonic()
 
 
 def read_rows(file: Path) -> list[tuple[int, float | None, dict[str, str]]]:
@@ -133,12 +175,13 @@ def log_file(
     Raises:
         DataError: If it is damaged.
     """
-    for frame, timestamp, cells in read_rows(file):
-        try:
-            clock.set(stream, frame, timestamp)
-            log_row(stream, unit, task, {name: cells[name] for name in only} if only else cells)
-        except (LookupError, TypeError, ValueError, OverflowError) as error:
-            raise _damaged(file, error) from error
+    series = SeriesLog(stream, clock)
+    try:
+        for frame, timestamp, cells in read_rows(file):
+            series.add(unit, task, frame, timestamp, {name: cells[name] for name in only} if only else cells)
+        series.send()
+    except (LookupError, TypeError, ValueError, OverflowError) as error:
+        raise _damaged(file, error) from error
 
 
 def _damaged(file: Path, error: Exception) -> DataError:
