@@ -103,26 +103,14 @@ def group_bytes(proc: Path, cgroups: Path) -> int | None:
     return min(available, default=None)
 
 
-TRIM_THRESHOLD, MMAP_THRESHOLD, ARENA_MAX = -1, -3, -8
-"""The parameters' numbers in glibc's malloc.h; see mallopt(3)."""
-
-LARGEST_IMAGE, RETAINED = 64 << 20, 1 << 30
-"""Bytes up to which freed memory is used again (the depth of a 3840x2160 frame has 33 million), and that are retained.
-"""
-
-
 def configure_process() -> None:
     """Prepare this process; to be called before any thread is started. Changes no result.
 
-    NumPy's products of matrices, which are small, take one thread: the others would be waited for. Memory of a decoded
-    image is used for the next one, instead of being returned to the system, which clears it each time (glibc). Rerun
-    logs nothing of its own to the terminal.
+    NumPy's products of matrices, which are small, take one thread: the others would be waited for. Rerun logs nothing
+    of its own to the terminal.
     """
     os.environ.setdefault("RUST_LOG", "off")
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # read when NumPy is loaded
-    if hasattr(libc := _libc(), "gnu_get_libc_version"):
-        for parameter, value in ((MMAP_THRESHOLD, LARGEST_IMAGE), (TRIM_THRESHOLD, RETAINED), (ARENA_MAX, 1)):
-            libc.mallopt(parameter, value)
 
 
 def trim_malloc(*, least: int = 0) -> None:

@@ -27,7 +27,7 @@ END = 0.04
 
 @dataclass(frozen=True, eq=False)
 class ShownMap:
-    """What the page shows of a map.
+    """A map as the page shows it.
 
     Attributes:
         above: Its voxels that are seen from above.

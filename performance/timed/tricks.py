@@ -28,17 +28,9 @@ def without():
     os.environ.pop("OPENBLAS_NUM_THREADS")
 process.configure_process = without
 """
-WITHOUT_MALLOPT = """
-def without():
-    libc, process._libc = process._libc, lambda: None
-    configure()
-    process._libc = libc
-process.configure_process = without
-"""
 WAYS = {
     "all": "",
     "gc.freeze before a run": "gc.freeze = lambda: None",
-    "mallopt": WITHOUT_MALLOPT,
     "OPENBLAS_NUM_THREADS": WITHOUT_OPENBLAS,
     "imports where they are used": "import semstab.api, semstab.recording",
 }
