@@ -74,7 +74,7 @@ def measured(scene: Path, out: Path, memory: MapMemory, backend: str, K: int, ki
         stage = max((name for name in stages if name not in ("beside", "all")), key=stages.__getitem__)
         (unit,) = semstab.load_result(out).runs
         taken = (stages["all"] - stages["digest"]) * GB
-        return {"run": run, "voxels": unit.table.voxels, "MB": taken / 1e6, "stage": stage}, unit.table
+        return {"run": run, "voxels": unit.map_summary.voxels, "MB": taken / 1e6, "stage": stage}, unit.map_summary
 
     def said(row: dict[str, Any], estimate: float) -> dict[str, Any]:
         megabytes = (process + estimate) / 1e6
