@@ -137,6 +137,26 @@ def verify(path: Path) -> None:
     assert done.returncode == 0, done.stderr
 
 
+@pytest.mark.parametrize("start", [0.0, 1.4e9])
+def test_numbers_that_are_sent_together_have_the_times_of_their_pictures(tmp_path, start) -> None:
+    stamps = (start + np.random.default_rng(0).uniform(0, 1e4, 200)).tolist()
+    stream, clock, frames = rr.RecordingStream("times"), Clock(), [*range(len(stamps))]
+    stream.save(tmp_path / "times.rrd")
+    for frame, stamp in zip(frames, stamps, strict=True):
+        clock.set(stream, frame, stamp)
+        stream.log("/alone", rr.Scalars(0.0))
+    stream.send_columns("/together", clock.columns(frames, stamps), rr.Scalars.columns(scalars=stamps))
+    stream.flush()
+    stream.disconnect()
+    reader = rr.chunk.RrdReader(tmp_path / "times.rrd")
+    times: dict[str, list[int]] = {"/alone": [], "/together": []}
+    for chunk in reader.stream(store=reader.recordings()[0]):
+        if chunk.entity_path in times:
+            times[chunk.entity_path] += chunk.to_record_batch().column("time").cast("int64").to_pylist()
+    assert len(times["/alone"]) == len(stamps)
+    assert sorted(times["/alone"]) == sorted(times["/together"])
+
+
 @pytest.mark.parametrize("model", ["a", "b"])
 def test_every_series_is_a_column_of_the_frame_csv(run, model) -> None:
     rows = read(run / "recording.rrd")

@@ -116,6 +116,8 @@ def only_writer(path: str | Path) -> Iterator[None]:
         lock.acquire()
     except Timeout as error:
         raise ConfigError(f"{path}: another process writes it; wait for it, or name another file") from error
+    except OSError:  # a file system without locks; what else there is, writing the file says
+        pass
     try:
         yield
     finally:

@@ -81,8 +81,10 @@ def _finished_unit(live: LiveMap, stream: Stream, files: Files, watch: Stopwatch
     if fused is not None and not len(fused.table):
         raise no_voxels(live.task, config)
     observations, features = live.sampled_observations(), live.sampled_features()
-    ahead = observation_savers(live.task, observations) if work.unit.stored else Savers()
-    files.write_ahead(ahead if config.statistics else ahead | _map_savers(live, fused))
+    if work.unit.stored:
+        files.write_ahead(observation_savers(live.task, observations))
+    if not config.statistics:
+        files.write_ahead(_map_savers(live, fused))
     with watch("statistics"):
         sample, analysis = _sample(live, fused), None
         if sample is not None:

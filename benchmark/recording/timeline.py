@@ -8,7 +8,6 @@ from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import rerun as rr
 
 from semstab.core.background import Background
@@ -57,8 +56,10 @@ class Clock:
         """Return the times of several frames, all of which have a timestamp that is shown, or none."""
         times = [rr.TimeColumn("frame", sequence=frames)]
         if self.shows(timestamps[0]):
-            kind = "timestamp" if self._dated else "duration"
-            times.append(rr.TimeColumn("time", **{kind: np.array(timestamps, np.float64)}))
+            stamps = [stamp for stamp in timestamps if stamp is not None]  # a list: rerun rounds an array otherwise
+            times.append(
+                rr.TimeColumn("time", timestamp=stamps) if self._dated else rr.TimeColumn("time", duration=stamps)
+            )
         return times
 
 

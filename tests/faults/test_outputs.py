@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import errno
+import fcntl
 import json
+import os
 import shutil
 import signal
 import subprocess
@@ -106,6 +109,18 @@ def test_two_exports_to_one_file_are_refused(run, tmp_path) -> None:
     assert (tmp_path / "m.csv").read_bytes() == (tmp_path / "other.csv").read_bytes()
     assert not list(tmp_path.glob(".semstab-*"))
     assert not (tmp_path / "a.ply").exists()
+
+
+@pytest.mark.parametrize("code", [errno.ENOLCK, errno.EOPNOTSUPP])
+def test_an_export_works_on_a_file_system_without_locks(tmp_path, monkeypatch, code) -> None:
+    def no_lock(*_: object) -> None:
+        raise OSError(code, os.strerror(code))
+
+    monkeypatch.setattr(fcntl, "flock", no_lock)
+    with only_writer(tmp_path / "m.csv"):
+        (tmp_path / "m.csv").write_text("whole")
+    assert [path.name for path in tmp_path.iterdir() if path.name.startswith(".")] == []
+    assert (tmp_path / "m.csv").read_text() == "whole"
 
 
 def test_the_lock_of_a_killed_export_holds_nobody_up(run, tmp_path) -> None:
