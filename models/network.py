@@ -8,7 +8,6 @@ from typing import Any, Literal
 
 import cv2
 import numpy as np
-import PIL.Image
 from pydantic import Field, PositiveInt, field_validator
 
 from semstab.config import Settings
@@ -207,6 +206,8 @@ def resized(image: Image, size: tuple[int, int], how: str) -> Array:
         return image
     if how == "bilinear":
         return np.asarray(cv2.resize(image.astype(np.float32), size[::-1], interpolation=cv2.INTER_LINEAR))
+    import PIL.Image
+
     if how == "antialias":
         planes = (PIL.Image.fromarray(np.ascontiguousarray(image[..., c], dtype=np.float32)) for c in range(3))
         return np.dstack([np.asarray(plane.resize(size[::-1], PIL.Image.Resampling.BILINEAR)) for plane in planes])

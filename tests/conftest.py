@@ -43,7 +43,7 @@ os.environ["SEMSTAB_CACHE"] = tempfile.mkdtemp(prefix="semstab-cache-")
 atexit.register(shutil.rmtree, os.environ["SEMSTAB_CACHE"], ignore_errors=True)
 style.DPI = 60  # of the 300 that an installed command writes (test_cli): half of a report's time
 typer.testing._get_command = functools.cache(typer.testing._get_command)  # else made from hints at each call
-configure_process()
+configure_process()  # threads that spin would take the time of the other workers' tests
 
 
 EARLY = (

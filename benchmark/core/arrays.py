@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any, TypeVar, Union, cast, get_args, get_origi
 import numpy as np
 import numpy.typing as npt
 
-from semstab.core.types import Float64, Int64
+from semstab.core.types import Float64, Int64, Mask
 
 if TYPE_CHECKING:
     import pyarrow as pa
@@ -140,20 +140,27 @@ def column(values: npt.NDArray[Any]) -> pa.Array:
     """
     import pyarrow as pa
 
-    if values.dtype.kind not in "iuf":
+    if values.dtype.kind not in "iufb":
         return pa.array(values)
-    values = np.ascontiguousarray(values)
-    return pa.Array.from_buffers(pa.from_numpy_dtype(values.dtype), len(values), [None, pa.py_buffer(values)])
+    stored = np.packbits(values, bitorder="little") if values.dtype == bool else np.ascontiguousarray(values)
+    return pa.Array.from_buffers(pa.from_numpy_dtype(values.dtype), len(values), [None, pa.py_buffer(stored)])
 
 
 def values_of(column: pa.ChunkedArray) -> npt.NDArray[Any]:
     """Return a column as numpy has it (n,), numbers in one piece without a copy; `to_numpy` imports pandas as well."""
     import pyarrow as pa
 
+    if not column.null_count and pa.types.is_boolean(column.type):
+        return np.concatenate([np.zeros(0, np.bool_), *map(_truth_values, column.chunks)])
     if column.null_count or not (pa.types.is_integer(column.type) or pa.types.is_floating(column.type)):
         return cast(npt.NDArray[Any], column.to_numpy())
     parts = [np.from_dlpack(part) for part in column.chunks]
     return parts[0] if len(parts) == 1 else np.concatenate([np.zeros(0, column.type.to_pandas_dtype()), *parts])
+
+
+def _truth_values(part: pa.BooleanArray) -> Mask:
+    bits = np.frombuffer(part.buffers()[1], np.uint8)
+    return np.unpackbits(bits, count=part.offset + len(part), bitorder="little")[part.offset :].astype(np.bool_)
 
 
 def evenly(length: int, count: int) -> list[int]:

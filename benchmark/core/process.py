@@ -106,10 +106,12 @@ def group_bytes(proc: Path, cgroups: Path) -> int | None:
 def configure_process() -> None:
     """Prepare this process; to be called before any thread is started. Changes no result.
 
-    NumPy's products of matrices, which are small, take one thread: the others would be waited for. Rerun logs nothing
-    of its own to the terminal.
+    Threads of compiled loops sleep while they wait: threads that spin take the cores from this and from other
+    processes. NumPy's products of matrices, which are small, take one thread: the others would be waited for. Rerun
+    logs nothing of its own to the terminal.
     """
     os.environ.setdefault("RUST_LOG", "off")
+    os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")  # read when OpenMP is loaded
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # read when NumPy is loaded
 
 
