@@ -177,6 +177,20 @@ def test_colour_of_any_format_is_encoded_as_a_small_jpeg(tmp_path, kind) -> None
     np.testing.assert_allclose(decoded.mean(axis=(0, 1)), (10, 20, 200), atol=12 if kind == "cmyk" else 4)
 
 
+def test_a_small_jpeg_of_that_size_is_recorded_as_it_is_and_a_damaged_one_refused(tmp_path) -> None:
+    written = cv2.imencode(".jpg", np.full((90, 120, 3), (10, 20, 200), np.uint8))[1].tobytes()
+    noise = cv2.imencode(".jpg", np.random.default_rng(0).integers(0, 255, (90, 120, 3), np.uint8))[1].tobytes()
+    file = tmp_path / "color.jpg"
+    view = frame(0, np.zeros((90, 120)), {"color": str(file)})
+    file.write_bytes(written)
+    assert camera.color_of(view) == written
+    file.write_bytes(noise)
+    assert len(camera.color_of(view) or b"") < len(noise)
+    file.write_bytes(written[:-9])
+    with pytest.raises(DataError, match=r"color\.jpg: the image cannot be decoded"):
+        camera.color_of(view)
+
+
 def cmyk(picture: np.ndarray) -> bytes:
     """As JPEG in the colours of printers, which browsers and viewers show wrongly or not at all."""
     buffer = io.BytesIO()

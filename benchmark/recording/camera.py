@@ -27,7 +27,9 @@ from semstab.task import Task
 IMAGE_SIDE, COARSE_SIDE = 640, 320
 """The most pixels a side: of colour and labels; of depth and of pictures that need a lookup for each pixel."""
 
-JPEG_QUALITY = 80
+JPEG_QUALITY, MOST_BYTES = 80, 0.25
+"""Quality of a colour image, and the most bytes a pixel of a JPEG file that is recorded as it is, in a picture's size.
+"""
 
 
 def stride_of(shape: tuple[int, int], side: int = IMAGE_SIDE) -> int:
@@ -162,10 +164,12 @@ class SceneLog:
 def color_of(frame: Frame) -> bytes | None:
     """Return the colour as JPEG, in the size of the labels; None if the frame has no colour.
 
+    A JPEG file of that size is taken as it is if it has at most MOST_BYTES a pixel.
+
     Raises:
         DataError: If its file cannot be read.
     """
-    from PIL import Image
+    from PIL import ExifTags, Image
 
     stride, file = stride_of(frame.shape), Path(frame.files.get("color", ""))
     if frame.color is None and not file.is_file():
@@ -174,6 +178,11 @@ def color_of(frame: Frame) -> bytes | None:
     buffer = io.BytesIO()
     try:
         with Image.open(file) if frame.color is None else Image.fromarray(frame.color) as image:
+            upright = image.getexif().get(ExifTags.Base.Orientation, 1) == 1
+            if (image.format, image.mode, image.size) == ("JPEG", "RGB", (W, H)) and upright:
+                stored = file.read_bytes()
+                if len(stored) <= MOST_BYTES * W * H and stored.endswith(b"\xff\xd9"):  # the end of a whole image
+                    return stored
             image.draft("RGB", (W, H))  # JPEG decodes to 1/2, 1/4 and 1/8 of its size in less time
             image.load()
             colour = image if image.mode == "RGB" else image.convert("RGB")

@@ -28,9 +28,9 @@ def draw_changes(
     - `index`, `before`, `moved`: (n, 3) indices of each voxel, (n,) the map's class, (n,) its drift, bits
     - `edges`: see `level_of`
     """
-    key, rows = np.empty(len(index), np.int64), make_table(len(index))
+    key, level, rows = np.empty(len(index), np.int64), np.empty(len(index), np.uint8), make_table(len(index))
     for row in range(len(index)):
-        key[row] = key_of(index[row, 0], index[row, 1], index[row, 2])
+        key[row], level[row] = key_of(index[row, 0], index[row, 1], index[row, 2]), level_of(moved[row], edges)
         rows[find(key[row], key, rows)] = row
     H, W = depth.shape
     for v in range(H):
@@ -48,7 +48,7 @@ def draw_changes(
             row = rows[find(key_of(np.int64(a), np.int64(b), np.int64(c)), key, rows)]
             if row >= 0:
                 contradictions[v, u] = CONTRADICTS if labels[v, u] != before[row] else AGREES
-                drift[v, u] = level_of(moved[row], edges)
+                drift[v, u] = level[row]
 
 
 @serial
