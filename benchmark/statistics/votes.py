@@ -425,10 +425,10 @@ class SpotVotes:
         return float(moved @ count / count.sum())
 
     def by_neighbours(self, point: Float64, spacing: float) -> Mask:
-        """Return which spots (n,) at `point` (n, 3) moved by those around: suspect ones first, then unknown ones."""
+        """Return which spots (n,) at `point` (n, 3) moved by those around: suspect ones, and unknown ones."""
         suspect = is_suspect(self.through, self.votes) & ~self.moved
         told = confirmed(point, suspect, self.moved, self.static, spacing)
-        return told | next_to_moved(point, self.moved | told, self.static & ~told, spacing)
+        return told | next_to_moved(point, self.moved, self.static, spacing)
 
     def take(self, rows: Any) -> SpotVotes:
         """Return the votes on some of the spots."""
