@@ -14,7 +14,7 @@ from semstab.data.statistics import MisplacedFrame, poses_that_do_not_fit
 from semstab.statistics import Sampler, SpotObservations
 from semstab.statistics.loops.moving import tally
 from semstab.statistics.moving import moving_percent, static_spots
-from semstab.statistics.votes import MOST_KEPT, SpotVotes, next_to_moved
+from semstab.statistics.votes import MOST_KEPT, DepthMemory, KeptDepth, SpotVotes, confirmed, next_to_moved
 
 H, W, FOCAL, HEIGHT = 120, 160, 120.0, 20.0
 CAMERA = Intrinsics(FOCAL, FOCAL, (W - 1) / 2, (H - 1) / 2)
@@ -156,8 +156,6 @@ def test_votes_are_kept_in_files_and_go_with_their_spots(tmp_path) -> None:  # t
 
 
 def test_of_long_flights_every_so_many_views_are_kept() -> None:
-    from semstab.statistics.votes import DepthMemory, KeptDepth
-
     memory, depth = DepthMemory(), np.ones((4, 4), np.float32)
     for view in range(5 * MOST_KEPT):
         if memory.wants(view):
@@ -235,6 +233,73 @@ def test_spots_next_to_spots_that_moved_are_told_in_two_steps() -> None:
     assert told.tolist() == (column == 1).tolist()
     told = next_to_moved(point, column == 0, (column == 1) & (y.ravel() < 4), 1.0)
     assert not told[column > 1].any()
+
+
+@pytest.mark.parametrize(("around", "spacing", "told"), [
+    ("??", 1.0, True), ("?", 1.0, False), ("mm", 1.0, True), ("?m", 1.0, True), ("??ss", 1.0, True),
+    ("??sss", 1.0, False), ("??", 0.5, False), ("", 1.0, False),
+])  # fmt: skip
+def test_a_suspect_spot_is_confirmed_by_two_more_around_it(around: str, spacing: float, told: bool) -> None:
+    """Suspect, moved and static spots lie 1.2 m around a suspect one; a suspect one far away has no others around."""
+    angle = np.arange(len(around))
+    point = np.concatenate(
+        [np.zeros((1, 3)), np.full((1, 3), 9.0), 1.2 * np.stack([np.cos(angle), np.sin(angle), 0 * angle], axis=1)]
+    )
+    suspect, moved, static = (np.array([each == "?"] * 2 + [kind == each for kind in around]) for each in "?ms")
+    assert confirmed(point, suspect, moved, static, spacing)[:2].tolist() == [told, False]
+    assert not confirmed(point, suspect, moved, static, spacing)[~suspect].any()
+
+
+def test_one_vote_of_four_makes_a_spot_suspect_and_with_others_it_has_moved_not_stayed() -> None:
+    """Spots in a row, 1 m apart: of the first three one view of four sees through, of a lone one, too."""
+    seen, through = np.array([3, 3, 3, 9, 9, 3], np.uint16), np.array([1, 1, 1, 0, 0, 1], np.uint16)
+    point, none = np.arange(6.0)[:, None] * [1, 0, 0], np.zeros(0)
+    votes = SpotVotes(seen, 0 * seen, through, 0 * seen, seen > 100, none, none > 0, np.array([1000, 3]), 0.01)
+    assert votes.static.all()
+    told = dataclasses.replace(votes, next_to=votes.by_neighbours(point, 2.0))
+    assert told.moved.tolist() == [True] * 3 + [False] * 3
+    assert (told.static == ~told.moved).all()
+    q, by_votes = 3.5 / 1001, 4 * 6 * (3.5 / 1001) ** 2 / 6
+    suspect = 4 * 4 * q / 6  # of the mean spot: four of six have four votes, the others need three of nine
+    assert told.false_share == pytest.approx(by_votes + suspect * 15 * suspect**2, rel=0.1)
+
+
+@pytest.mark.parametrize(("ground", "beside", "kind"), [
+    (10.2, 10.05, 3), (10.2, 10.01, 0), (10.05, 10.2, 0), (10.0, 10.2, 1), (9.0, 10.2, 2),
+])  # fmt: skip
+def test_a_view_sees_through_a_spot_if_its_block_is_far_behind_and_those_around_are_not_its_surface(
+    ground: float, beside: float, kind: int
+) -> None:
+    """A spot 10 m away; depth in its block, and in the block next to it."""
+    depth = np.full((9, 9), 10.2)
+    depth[4, 4], depth[4, 5] = ground, beside
+    view = KeptDepth.of_image(0, np.eye(4), (9.0, 9.0, 4.0, 4.0), depth)
+    assert view.stride == 1
+    assert (view.votes(np.array([[0.0, 0.0, 10.0]]), 1e-4) & 3).tolist() == [kind]
+
+
+@pytest.mark.parametrize(("behind", "at", "shown"), [
+    (30.0, 10.02, True), (30.0, 29.98, True), (30.0, 18.0, False), (14.0, 12.0, True), (14.0, 15.0, False),
+])  # fmt: skip
+def test_a_spot_between_points_of_two_surfaces_lies_on_neither(behind: float, at: float, shown: bool) -> None:
+    """Two points of a LiDAR in one block, the nearer one 10 m away."""
+    points = np.array([4.0, 4.4]), np.array([4.0, 4.4]), 1 / np.array([10.0, behind])
+    view = KeptDepth.of_points(0, np.eye(4), (9.0, 9.0, 0.0, 0.0), False, 1.0, (9, 9), points)
+    spot = np.array([[4.2 / 9 * at, 4.2 / 9 * at, at]])
+    assert view.shows(spot, 0.001).tolist() == [shown]
+
+
+def test_a_spot_at_an_edge_that_other_views_see_is_not_told_by_spots_that_moved() -> None:
+    """Two views before and two after see through the first spots; the others, at an edge, are of floor and thing."""
+    point = np.array([[-0.2, 0.0, 10.0], [0.0, 0.0, 10.0], [0.2, 0.0, 10.0], [0.0, 0.1, 12.0], [0.0, 0.1, 10.0]])
+    memory = DepthMemory()
+    for k in range(5):
+        depth = np.full((90, 90), 10.0 if k == 2 else 12.0)
+        memory.add(KeptDepth.of_image(k, np.eye(4), (90.0, 90.0, 44.5, 44.5), depth))
+    firm = np.array([True, True, True, False, False])
+    votes = memory.votes_on(point, np.full(5, 2, np.int32), firm, 5, 0.0, 5.0)
+    assert votes.moved.tolist() == [True, True, True, False, True]
+    assert not votes.known[3]
 
 
 def test_an_oncoming_car_is_found_in_scans_by_what_it_left_behind() -> None:

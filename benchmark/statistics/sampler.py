@@ -24,7 +24,7 @@ from semstab.data.frames import Frame
 from semstab.data.labels import fixed
 from semstab.statistics.feature_spots import FeatureObservations, FeatureStore
 from semstab.statistics.observations import COLUMNS, TYPES, VIEW, SpotObservations, Views
-from semstab.statistics.votes import DepthMemory, KeptDepth, SpotVotes, firm
+from semstab.statistics.votes import NEAR_BY_SIGMAS, DepthMemory, KeptDepth, SpotVotes, firm
 
 BUDGET = 1 << 19
 """Most answers (spot, view)."""
@@ -268,7 +268,8 @@ class Sampler:
     def _remember(self, view: int, frame: Frame, T: Float64, sparse: Sparse | None) -> None:
         """Keep depth of a view, and of the new spots which view found them and which lie at no edge of depth.
 
-        A point of a LiDAR lies on a surface, at an edge, too: it has no depth between two of them, as a pixel may have.
+        A point of a LiDAR lies on a surface, at an edge, too; but a spot between points may lie between two surfaces.
+        In a first view, which no other one differs from, depth differs by MOST at most.
         """
         if self._memory is None:
             return
@@ -279,10 +280,11 @@ class Sampler:
             if self._memory.wants(view):
                 self._memory.add(KeptDepth.of_image(view, T.copy(), _camera(frame), fixed(frame.depth)))
             return
-        self._firm[new] = True
+        points, place = (sparse.u, sparse.v, sparse.w), (sparse.camera, sparse.around, sparse.spacing)
+        depth = KeptDepth.of_points(view, T.copy(), *place, sparse.grid.shape, points)
+        self._firm[new] = depth.shows(self._point[new], self._sigma if self._errors else MOST / NEAR_BY_SIGMAS)
         if self._memory.wants(view):
-            points, place = (sparse.u, sparse.v, sparse.w), (sparse.camera, sparse.around, sparse.spacing)
-            self._memory.add(KeptDepth.of_points(view, T.copy(), *place, sparse.grid.shape, points))
+            self._memory.add(depth)
 
     def _rebuilt(self, size: int) -> Int64:
         """Return a table of the coarse cells of all spots."""

@@ -19,6 +19,7 @@ import numpy.typing as npt
 
 from semstab.core.types import Float64, Int64, Mask, UInt16
 from semstab.data.frames import Frame
+from semstab.statistics.misplaced import fitting
 
 MOST_KEPT = 256
 """Most views whose depth is kept; of more views, every second, fourth, ... one is."""
@@ -30,15 +31,23 @@ POINTS = 3.0
 """Distances of the points of sparse depth along the edge of a block."""
 
 GAP, GAP_SIGMAS = 0.01, 5.0
-"""A surface is farther than a spot if it is by more than GAP, relative, and by more than GAP_SIGMAS standard deviations
-of how depth differs between views."""
+"""The surface in a spot's own block is farther than the spot if it is by more than GAP, relative, and by more than
+GAP_SIGMAS standard deviations of how depth differs between views."""
 
 AROUND = 2
 """Blocks to each side of a spot that a view must show farther away to see through it: errors of poses and of edges of
 depth move things sidewards in an image. Holes count as near in the next blocks."""
 
+ASIDE, ASIDE_SIGMAS = 0.003, 4.0
+"""In the blocks around, what is farther by more than ASIDE, relative, and by more than ASIDE_SIGMAS standard deviations
+is not the spot's surface. The ground at which a thing stands comes near to the thing there."""
+
 AROUND_OF_POINTS = 1
 """The same for the points of a LiDAR: its blocks are larger, and it has no edges of depth that errors displace."""
+
+SPAN = 1.0
+"""A spot between points of a LiDAR whose depths differ by more than SPAN, relative, and far from both, lies on neither
+surface: it is between a thing and what is behind it."""
 
 REACH = 0.25
 """Blocks to each side, a pixel at least, in which the view that found a spot must see a smooth surface."""
@@ -70,18 +79,16 @@ NEXT_TO, LEAST_NEXT_TO, STEPS = 1.5, 2, 2
 that are known; then so did unknown spots next to it, STEPS steps in all. Most such spots lie at an edge of the depth of
 a thing that moved, which no view tells."""
 
+SHARE_OF_SUSPECTS = 1 / 4
+"""A spot is suspect if a view sees through it, and at least this share of the views that see it or through it. With
+LEAST_NEXT_TO spots within NEXT_TO spacings that are suspect, too, or moved, and at least as many as are static, it
+moved: what errors do to one spot they seldom do to the spots next to it."""
+
+NEIGHBOURS = round(math.pi * NEXT_TO**2) - 1
+"""Spots, about, within NEXT_TO spacings of a spot."""
+
 OF_SPOTS = ("seen", "hidden", "through", "at_end", "next_to")
 """Votes on each spot, and whether it is next to spots that moved, by name."""
-
-CONTRADICTS, MANY = 0.04, 50
-"""Two views contradict each other if one sees through more than this share of the spots, MANY or more, of the other."""
-
-MISPLACED, SPREAD = 0.1, 0.05
-"""A frame of a group that contradicts a larger one is misplaced if more than MISPLACED of its spots are seen through,
-and if it shows another surface at more than SPREAD of them in a third of its image."""
-
-MOST_OF_PAIRS = 1 << 13
-"""Spots, about, by which each two views are held against each other."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -140,14 +147,23 @@ class KeptDepth:
         blocks_of_points(*points, stride, near, far)
         return cls(view, T_wc, camera, around, stride, AROUND_OF_POINTS, near, far)
 
+    def shows(self, point: Float64, sigma: float) -> Mask:
+        """Return which points (n, 3) that this view of a LiDAR found lie on a surface, and not between two."""
+        from semstab.statistics.loops.moving import at_points
+
+        shown = np.empty(len(point), np.bool_)
+        limits = _codes(near_by_of(sigma)), _codes(SPAN)
+        at_points(point, self.T_wc, self.camera, self.around, self.stride, self.near, self.far, *limits, shown)
+        return shown
+
     def votes(self, point: Float64, sigma: float) -> npt.NDArray[np.uint8]:
         """Return the vote (n,) on points (n, 3); depth of a surface differs by `sigma`, relative, between views."""
-        from semstab.statistics.loops.moving import STEP, vote
+        from semstab.statistics.loops.moving import vote
 
         votes = np.empty(len(point), np.uint8)
-        gap, near_by = (math.ceil(math.log1p(limit_of(sigma)) / STEP) for limit_of in (gap_of, near_by_of))
+        limits = (_codes(limit_of(sigma)) for limit_of in (gap_of, aside_of, near_by_of))
         place = self.T_wc, self.camera, self.around, self.stride
-        vote(point, *place, self.near, self.far, self.margin, gap, near_by, votes)
+        vote(point, *place, self.near, self.far, self.margin, *limits, votes)
         return votes
 
 
@@ -177,23 +193,27 @@ class DepthMemory:
         Args:
             point: (n, 3) spots in metres.
             found: (n,) the view that found each spot.
-            firm: (n,) spots that lie at no edge of depth; the others have no votes.
+            firm: (n,) spots that lie at no edge of depth. The others have no votes; but if LEAST_VOTES views see one
+                and none sees through it, the spots next to it do not tell that it moved.
             views: Number of views.
             sigma: Standard deviation of how depth differs between views, relative.
             spacing: Distance of spots in metres; with 0 no spot is told by those next to it.
         """
         votes = np.zeros((len(self.kept), len(point)), np.uint8)
         for view_votes, depth in zip(votes, self.kept, strict=True):
-            view_votes[firm] = depth.votes(point[firm], sigma)
+            view_votes[:] = depth.votes(point, sigma)
+        at_edge, votes = votes * ~firm, votes * firm
         depth_views = np.array([depth.view for depth in self.kept], np.int64)
-        fits, shares = _fitting(votes, depth_views, found, views)
+        fits, shares = fitting(votes, depth_views, found, views)
         counts, at_end, between = _tallied(votes, fits[depth_views])
         counts[~fits[found]] = at_end[~fits[found]] = 0
         num_seen, hidden, through = counts.T.copy()
         nothing = np.zeros(len(point), np.bool_)
         alone = SpotVotes(num_seen, hidden, through, at_end, nothing, shares, ~fits, between, gap_of(sigma))
-        rows, next_to = np.flatnonzero(fits[found]), np.zeros(len(point), np.bool_)
-        next_to[rows] = next_to_moved(point[rows], alone.moved[rows], alone.static[rows], spacing)
+        seen_at_edge, _, through_at_edge = _tallied(at_edge, fits[depth_views])[0].T
+        stays = (seen_at_edge >= LEAST_VOTES) & (through_at_edge == 0)
+        rows, next_to = np.flatnonzero(fits[found] & ~stays), nothing.copy()
+        next_to[rows] = alone.take(rows).by_neighbours(point[rows], spacing)
         return dataclasses.replace(alone, next_to=next_to)
 
     def moving_pixels(self, frame: Frame, sigma: float, misplaced: Mask, *, sparse: bool = False) -> Mask:
@@ -252,6 +272,22 @@ def has_moved(through: npt.NDArray[Any], votes: npt.NDArray[Any], at_end: npt.ND
     return np.asarray(many | (at_end >= LEAST_AT_END), np.bool_)
 
 
+def is_suspect(through: npt.NDArray[Any], votes: npt.NDArray[Any]) -> Mask:
+    """Return what a view sees through, and SHARE_OF_SUSPECTS of all votes at least."""
+    return np.asarray((through >= 1) & (through >= SHARE_OF_SUSPECTS * votes), np.bool_)
+
+
+def confirmed(point: Float64, suspect: Mask, moved: Mask, static: Mask, spacing: float) -> Mask:
+    """Return which suspect spots (n,) have enough spots around that moved or are suspect, too."""
+    from scipy.spatial import cKDTree
+
+    trees = cKDTree(point[moved | suspect]), cKDTree(point[static & ~suspect])
+    near, stayed = (tree.query_ball_point(point[suspect], NEXT_TO * spacing, return_length=True) for tree in trees)
+    confirmed: Mask = np.zeros(len(point), np.bool_)
+    confirmed[suspect] = (near - 1 >= LEAST_NEXT_TO) & (near - 1 >= stayed)  # without the spot itself
+    return confirmed
+
+
 def next_to_moved(point: Float64, moved: Mask, static: Mask, spacing: float) -> Mask:
     """Return which spots (n,) are neither moved nor static, and next to spots that moved, in up to STEPS steps."""
     from scipy.spatial import cKDTree
@@ -273,9 +309,21 @@ def gap_of(sigma: float) -> float:
     return max(GAP, GAP_SIGMAS * sigma)
 
 
+def aside_of(sigma: float) -> float:
+    """Return how much farther than a spot, relative, a surface is at least that is not the spot's."""
+    return max(ASIDE, ASIDE_SIGMAS * sigma)
+
+
 def near_by_of(sigma: float) -> float:
     """Return how much nearer or farther than a spot, relative, a surface is at most that is the spot's."""
     return max(NEAR_BY, NEAR_BY_SIGMAS * sigma)
+
+
+def _codes(farther: float) -> int:
+    """Return by how many codes depth differs that is farther by this, relative."""
+    from semstab.statistics.loops.moving import STEP
+
+    return math.ceil(math.log1p(farther) / STEP)
 
 
 @dataclass(frozen=True, eq=False)
@@ -286,7 +334,7 @@ class SpotVotes:
         seen, hidden, through: (n,) uint16 views of each spot, without those that are misplaced; 0 of a spot that was
             found in one of these.
         at_end: (n,) uint16 of those that see through it, the ones before the first that sees it, or after the last.
-        next_to: (n,) spots of which too few views tell, next to spots that moved.
+        next_to: (n,) spots of which too few views tell, next to spots that moved, or suspect ones.
         through_of_view: (V,) share of the spots of other views that a view sees through, of those that it sees or sees
             through; NaN of views whose depth was not kept.
         misplaced: (V,) views that see through many spots all over the image.
@@ -344,7 +392,7 @@ class SpotVotes:
     def static(self) -> Mask:
         """(n,) spots that did not move: at most SHARE_THROUGH of enough votes see through it, and few at an end."""
         few = (self.through <= SHARE_THROUGH * self.votes) & (self.at_end < LEAST_AT_END)
-        return np.asarray((self.votes >= LEAST_VOTES) & few, np.bool_)
+        return np.asarray((self.votes >= LEAST_VOTES) & few & ~self.next_to, np.bool_)
 
     @property
     def known(self) -> Mask:
@@ -361,17 +409,26 @@ class SpotVotes:
         """Largest share of the spots known by votes that errors alone call moved, if they meet views independently.
 
         Of n votes, r see through the spot with the probability b(r; n, q), where q is `false_rate`; the first or the
-        last LEAST_AT_END of them with at most 2 q^LEAST_AT_END.
+        last LEAST_AT_END of them with at most 2 q^LEAST_AT_END. A spot is suspect with the probability s(n, q), and
+        LEAST_NEXT_TO of NEIGHBOURS other spots are, too, with that of their mean.
         """
         from scipy import special
 
-        n, count = np.unique(self.votes[self.known & ~self.next_to], return_counts=True)
+        n, count = np.unique(self.votes[self.known & (self.votes >= LEAST_VOTES)], return_counts=True)
         if not len(n):
             return math.nan
         least = np.maximum(LEAST_THROUGH, np.floor(SHARE_THROUGH * n + 1e-9) + 1)
         at_end = np.where(least > LEAST_AT_END, 2 * self.false_rate**LEAST_AT_END, 0.0)  # fewer need no such run
-        moved = np.minimum(special.bdtrc(least - 1, n, self.false_rate) + at_end, 1.0)
+        suspect = special.bdtrc(np.maximum(np.ceil(SHARE_OF_SUSPECTS * n), 1) - 1, n, self.false_rate)
+        around = special.bdtrc(LEAST_NEXT_TO - 1, NEIGHBOURS, suspect @ count / count.sum())
+        moved = np.minimum(special.bdtrc(least - 1, n, self.false_rate) + at_end + suspect * around, 1.0)
         return float(moved @ count / count.sum())
+
+    def by_neighbours(self, point: Float64, spacing: float) -> Mask:
+        """Return which spots (n,) at `point` (n, 3) moved by those around: suspect ones, and unknown ones."""
+        suspect = is_suspect(self.through, self.votes) & ~self.moved
+        told = confirmed(point, suspect, self.moved, self.static, spacing)
+        return told | next_to_moved(point, self.moved, self.static, spacing)
 
     def take(self, rows: Any) -> SpotVotes:
         """Return the votes on some of the spots."""
@@ -389,76 +446,3 @@ def firm(
     limits = EDGE + EDGE_SIGMAS * noise, SAME + SAME_SIGMAS * noise
     on_one_surface(point, T_wc, camera, depth, reach, *limits, firm)
     return firm
-
-
-# Poses that do not fit.
-
-
-def _fitting(
-    votes: npt.NDArray[np.uint8], depth_views: Int64, finding_view: npt.NDArray[np.int32], views: int
-) -> tuple[Mask, Float64]:
-    """Return which views (V,) fit the others, and the share (V,) of their spots that each sees through.
-
-    Views that fit one another are a group, of which each fits another one at least. Groups that contradict a larger one
-    are misplaced, but for views that see through little of what the others see, or in few parts of the image alone: a
-    large thing that moves is there.
-    """
-    from semstab.statistics.loops.moving import HIDDEN, SEEN, SIDES, THROUGH
-
-    parts, (trusted, against) = SIDES * SIDES, _trusted(votes)
-    num_seen, through = np.zeros((2, votes.shape[1]), np.int32)
-    for view_votes in votes[trusted]:
-        num_seen += view_votes & 3 == SEEN
-        through += view_votes & 3 == THROUGH
-    usual = (num_seen >= np.maximum(through, LEAST_VOTES)) & np.isin(finding_view, depth_views[~trusted], invert=True)
-    counts = np.zeros((len(depth_views), parts, 4), np.int64)
-    for k, view_votes in enumerate(votes):
-        votes_on_others = view_votes[usual & (finding_view != depth_views[k])]
-        counts[k] = np.bincount(votes_on_others, minlength=4 * parts).reshape(parts, 4)
-    away, seen_there = counts[..., THROUGH], counts[..., SEEN]
-    shares, fits = np.full(views, np.nan), np.ones(views, np.bool_)
-    with np.errstate(invalid="ignore"):
-        shares[depth_views] = np.fmax(away.sum(axis=1) / (away + seen_there).sum(axis=1), against)
-    spread = _is_spread(away + counts[..., HIDDEN], counts[..., 1:].sum(axis=2))
-    fits[depth_views] = trusted | ~(spread & (shares[depth_views] > MISPLACED))
-    return fits, shares
-
-
-def _trusted(votes: npt.NDArray[np.uint8]) -> tuple[Mask, Float64]:
-    """Return which views (k,) are in a group that contradicts no larger one, by their votes (k, n).
-
-    With it, the share (k,) of the spots of these views and of each view that one sees and the other sees through.
-    """
-    from scipy.sparse.csgraph import connected_components
-
-    away, num_decided = _of_pairs(votes)
-    enough = num_decided >= MANY
-    contradicts = enough & (away > CONTRADICTS * num_decided)
-    _, group = connected_components(enough & ~contradicts, directed=False)
-    trusted = np.zeros(len(votes), np.bool_)
-    for number in np.argsort(-np.bincount(group, minlength=1), kind="stable"):
-        members = group == number
-        against = contradicts[members][:, trusted]
-        if 2 * np.count_nonzero(against) <= np.count_nonzero(enough[members][:, trusted]):
-            trusted |= members
-    with np.errstate(invalid="ignore"):
-        return trusted, away[:, trusted].sum(axis=1) / num_decided[:, trusted].sum(axis=1)
-
-
-def _of_pairs(votes: npt.NDArray[np.uint8]) -> tuple[Int64, Int64]:
-    """Return of how many spots, of some, that one of two views sees the other sees through (k, k), and tells at all."""
-    from semstab.statistics.loops.moving import SEEN, THROUGH
-
-    sample = votes[:, :: max(1, votes.shape[1] // MOST_OF_PAIRS)] & 3
-    is_seen, through = ((sample == kind).astype(np.float32) for kind in (SEEN, THROUGH))
-    away = through @ is_seen.T
-    away += away.T
-    return away.astype(np.int64), (away + 2 * (is_seen @ is_seen.T)).astype(np.int64)
-
-
-def _is_spread(other: Int64, num_decided: Int64) -> Mask:
-    """Return which views (n,) show another surface than that of the spots in a third of the image, by counts (n, p)."""
-    total = num_decided.sum(axis=1)
-    counts = num_decided >= np.maximum(MANY, total[:, None]) / (10 * other.shape[1])
-    spread = (other > SPREAD * num_decided) & counts
-    return np.asarray((total >= MANY) & (3 * spread.sum(axis=1) >= counts.sum(axis=1)), np.bool_)

@@ -138,12 +138,29 @@ def block_of(point, i, T, camera, around, stride, shape):
 
 
 @serial
-def vote(point, T, camera, around, stride, near, far, reach, gap, near_by, votes):
+def at_points(point, T, camera, around, stride, near, far, near_by, span, shown):
+    """Write for each point (n, 3) whether the points that a view has in its block lie there.
+
+    The nearest or the farthest of them does, but for `near_by` codes; or the point is between these, and they are at
+    most `span` codes apart. A plane through points of two surfaces has other points, at which there is nothing.
+    """
+    for i in range(len(point)):
+        row, column, distance = block_of(point, i, T, camera, around, stride, near.shape)
+        shown[i] = row >= 0 and far[row, column] > 0
+        if shown[i]:
+            here = code_of(distance)
+            nearest, farthest = np.int64(near[row, column] & LARGEST), np.int64(far[row, column])
+            at_one = abs(here - nearest) <= near_by or abs(here - farthest) <= near_by
+            shown[i] = at_one or (nearest <= here <= farthest and farthest - nearest <= span)
+
+
+@serial
+def vote(point, T, camera, around, stride, near, far, reach, gap, aside, near_by, votes):
     """Write the vote of a view on each point (n, 3), by the blocks of its depth.
 
-    A view sees through a point if all depth in the blocks up to `reach` from the point's own is farther by more than
-    `gap`, in codes, and known in its own block and the 8 around it. It sees a point if depth in its own block is on
-    both sides of it, but for `near_by` codes.
+    A view sees through a point if all depth in the point's own block is farther by more than `gap`, in codes, all in
+    the blocks up to `reach` from it by more than `aside`, and depth is known in its own block and the 8 around it. It
+    sees a point if depth in its own block is on both sides of it, but for `near_by` codes.
     """
     rows, columns = near.shape
     for i in range(len(point)):
@@ -151,13 +168,13 @@ def vote(point, T, camera, around, stride, near, far, reach, gap, near_by, votes
         row, column, distance = block_of(point, i, T, camera, around, stride, near.shape)
         if row < 0 or far[row, column] == 0:
             continue
-        here = code_of(distance)
+        here, nearest = code_of(distance), np.int64(near[row, column] & LARGEST)
         part = np.uint8(4 * (SIDES * (SIDES * row // rows) + SIDES * column // columns))
         if here > far[row, column] + gap:
             votes[i] = HIDDEN + part
-        elif here >= np.int64(near[row, column] & LARGEST) - near_by:
+        elif here >= nearest - near_by:
             votes[i] = SEEN + part
-        elif is_farther(near, row, column, around, reach, here + gap):
+        elif nearest > here + gap and is_farther(near, row, column, around, reach, here + aside):
             votes[i] = THROUGH + part
 
 
