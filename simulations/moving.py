@@ -31,7 +31,6 @@ import semstab
 from semstab.data.frames import Frame, Intrinsics
 from semstab.datasets import Scene
 from semstab.statistics import Sampler, SpotObservations
-from semstab.statistics.accumulate import sums_of_spots
 from semstab.statistics.moving import share_of_disagreement
 from semstab.task import open_scenes
 
@@ -214,11 +213,6 @@ class Counts:
 HEADS = ["spots on movers", "precision", "recall", "of told", "static called moved"]
 
 
-def disagreement(spots: SpotObservations, moved: np.ndarray) -> float:
-    """The share of the disagreement that is at spots (n,)."""
-    return share_of_disagreement(sums_of_spots(spots), sums_of_spots(spots.only(~moved[spots.spot])))
-
-
 def made(scenes: int, seed: int, noises: tuple[float, ...], movers: int) -> None:
     cases.head(["made scenes", "noise", *HEADS, "share"])
     by_speed: dict[tuple[str, float], list[int]] = {}
@@ -235,7 +229,8 @@ def made(scenes: int, seed: int, noises: tuple[float, ...], movers: int) -> None
             )
             counts.add(spots, mover, far, on >= 0)
             if movers:
-                error = disagreement(spots, spots.votes.moved) - disagreement(spots, mover)
+                told = share_of_disagreement(spots, spots.votes.moved, spots.votes.static)
+                error = told - share_of_disagreement(spots, mover, ~mover)
                 counts.errors.append(abs(error))
             for number, box in enumerate(street.boxes, 1):
                 if box.speed and noise == noises[0]:

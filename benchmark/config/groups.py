@@ -24,7 +24,7 @@ V = TypeVar("V")
 class Settings(BaseModel):
     """A group of settings: frozen, and closed to unknown keys."""
 
-    model_config = ConfigDict(extra="forbid", frozen=True, defer_build=True)
+    model_config = ConfigDict(extra="forbid", frozen=True)
 
 
 def read_yaml(path: str | Path) -> dict[str, Any]:

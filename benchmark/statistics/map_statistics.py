@@ -276,7 +276,7 @@ def _of_spots(
         "outlying_frames": outlying,
         "ranges": range_agreement(spots, scope, limits),
         "groupings": groupings(spots, sums, scope, limits),
-        "moved": moved_spots(spots, sums, alpha, scope, frame_name),
+        "moved": moved_spots(spots, alpha, scope, frame_name),
     }
 
 

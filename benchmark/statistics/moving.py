@@ -12,7 +12,7 @@ from semstab.data.events import accumulated
 from semstab.data.records import Record
 from semstab.data.statistics import Interval, MisplacedFrame, MovedClass, MovedSpots
 from semstab.statistics.accumulate import sums_of_spots
-from semstab.statistics.cluster_sums import ClusterSums, chance_of, value
+from semstab.statistics.cluster_sums import chance_of, value
 from semstab.statistics.intervals import estimate, scope_of
 from semstab.statistics.observations import SpotObservations
 
@@ -25,7 +25,6 @@ STATE_NAMES = ("not told", "stayed", "moved")
 
 def moved_spots(
     spots: SpotObservations,
-    sums: ClusterSums,
     alpha: Interval,
     scope: Scope = THIS_SCENE,
     frame_name: Callable[[int], str] = str,
@@ -34,7 +33,6 @@ def moved_spots(
 
     Args:
         spots: Labels that views give spots.
-        sums: Sums of these spots.
         alpha: Alpha of all spots.
         scope: Scope of the interval, if there are enough views for it.
         frame_name: Returns the name of a frame's file by its index.
@@ -46,8 +44,8 @@ def moved_spots(
     decided, moved = asked & votes.known, asked & votes.moved
     share, static = 0.0, alpha
     if moved.any():
-        rest = sums_of_spots(static_spots(spots))
-        share, static = share_of_disagreement(sums, rest), estimate(rest, "alpha", scope=scope_of(rest, scope))
+        share, rest = share_of_disagreement(spots, moved, decided & ~moved), sums_of_spots(static_spots(spots))
+        static = estimate(rest, "alpha", scope=scope_of(rest, scope))
     return MovedSpots(
         spots=int(decided.sum()),
         unknown=1 - float(decided.sum() / asked.sum()),
@@ -97,15 +95,20 @@ def states_of(record: Record, point: Float64) -> UInt8 | None:
     return states_at(SpotObservations.load(file), point)
 
 
-def share_of_disagreement(sums: ClusterSums, rest: ClusterSums) -> float:
-    """Return the share of all disagreement that is not at the rest of the spots, by their sums; NaN without any."""
+def share_of_disagreement(spots: SpotObservations, moved: Mask, static: Mask) -> float:
+    """Return the share of the disagreement at spots (n,) that moved, of that at these and at static ones; NaN without.
 
-    def disagreement(of: ClusterSums) -> float:
-        first = of.answers[0]
-        return float(first["observations"].sum()) * (1 - value(of, "alpha")) * (1 - chance_of(first))
+    Spots that are neither, as those of which it is not told whether they moved, do not count.
+    """
+    at_moved, at_static = (_disagreement(spots.only(of_kind[spots.spot])) for of_kind in (moved, static))
+    return at_moved / (at_moved + at_static) if at_moved + at_static > 0 else math.nan
 
-    everywhere = disagreement(sums)
-    return min(max(1 - disagreement(rest) / everywhere, 0.0), 1.0) if everywhere > 0 else math.nan
+
+def _disagreement(spots: SpotObservations) -> float:
+    """Return how many observations disagree: those of spots, times the share of their pairs that does."""
+    first = (sums := sums_of_spots(spots)).answers[0]
+    by_chance = float(first["observations"].sum()) * (1 - chance_of(first))
+    return max(by_chance * (1 - value(sums, "alpha")), 0.0) if by_chance > 0 else 0.0
 
 
 def _classes(spots: SpotObservations, decided: Mask, moved: Mask) -> tuple[MovedClass, ...]:

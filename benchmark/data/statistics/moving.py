@@ -53,7 +53,7 @@ class MovedSpots:
         spots: Spots of which it is known whether they moved.
         unknown: Share of the spots of which it is not known.
         moved: Share of the known spots that moved.
-        disagreement: Share of all disagreement that is at moved spots.
+        disagreement: Share of the disagreement at known spots that is at those that moved.
         alpha: Alpha of the others, 'alpha (static)'.
         gap: How much farther than a spot, relative, all is that a view shows which sees through it.
         false_rate: Share of the votes on what stayed that see through it.
