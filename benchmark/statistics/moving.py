@@ -96,16 +96,16 @@ def states_of(record: Record, point: Float64) -> UInt8 | None:
 
 
 def share_of_disagreement(spots: SpotObservations, moved: Mask, static: Mask) -> float:
-    """Return the share of the disagreement at spots (n,) that moved, of that at these and at static ones; NaN without.
+    """Return which share of the disagreement at spots (n,) that moved or are static is at the former; NaN without any.
 
-    Spots that are neither, as those of which it is not told whether they moved, do not count.
+    Spots that are neither do not count: it is not known whether they moved.
     """
     at_moved, at_static = (_disagreement(spots.only(of_kind[spots.spot])) for of_kind in (moved, static))
     return at_moved / (at_moved + at_static) if at_moved + at_static > 0 else math.nan
 
 
 def _disagreement(spots: SpotObservations) -> float:
-    """Return how many observations disagree: those of spots, times the share of their pairs that does."""
+    """Return how many observations disagree: all observations of spots, times the share of pairs that disagree."""
     first = (sums := sums_of_spots(spots)).answers[0]
     by_chance = float(first["observations"].sum()) * (1 - chance_of(first))
     return max(by_chance * (1 - value(sums, "alpha")), 0.0) if by_chance > 0 else 0.0

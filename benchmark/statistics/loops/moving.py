@@ -158,9 +158,9 @@ def at_points(point, T, camera, around, stride, near, far, near_by, span, shown)
 def vote(point, T, camera, around, stride, near, far, reach, gap, aside, near_by, votes):
     """Write the vote of a view on each point (n, 3), by the blocks of its depth.
 
-    A view sees through a point if all depth in the point's own block is farther by more than `gap`, in codes, all in
-    the blocks up to `reach` from it by more than `aside`, and depth is known in its own block and the 8 around it. It
-    sees a point if depth in its own block is on both sides of it, but for `near_by` codes.
+    A view sees through a point if all depth in the point's own block is farther by more than `gap`, in codes, and all
+    depth in the blocks up to `reach` from it by more than `aside`. Depth must be known in its own block and the 8
+    around it. A view sees a point if depth in its own block is on both sides of it, but for `near_by` codes.
     """
     rows, columns = near.shape
     for i in range(len(point)):
