@@ -18,6 +18,7 @@ CASES = {
     "start": "timed.start",
     "tricks": "timed.tricks",
     "fusion": "timed.fusion",
+    "threads": "timed.threads",
     "random-scenes": "timed.random_scenes",
     "scores": "timed.scores",
     "by-hand": "timed.by_hand",

@@ -40,6 +40,7 @@ SMALL = {
                "--figure growth.png"),
     "filters": ("ms", "--size 32x24 --classes 3 --frames 5"),
     "tiles": ("the same", "--frames 3 --tile-size 64"),
+    "threads": ("faster", "--sizes 96x54 --backends numba --threads 1 --rounds 1"),
 }  # fmt: skip
 
 
@@ -51,7 +52,7 @@ def run_here(*words: object, **variables: str) -> measuring.Process:
     return measuring.Process(time.perf_counter() - started, time.process_time() - cpu, resident_bytes() / 1e9)
 
 
-LONG = ("tiles", "end-to-end", "growth", "scores", "recording")
+LONG = ("tiles", "end-to-end", "growth", "scores", "recording", "threads")
 """Cases that start processes or runs: each takes seconds at any size."""
 
 
