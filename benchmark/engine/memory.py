@@ -15,8 +15,9 @@ from semstab.statistics.sample import MOST_VOXELS
 
 GB = 1e9
 
-LOADED = 210e6
-"""Bytes of code that a run loads once it is planned, and of the sample of observations and its statistics."""
+LOADED, OF_CLASS, MANY_CLASSES = 240e6, 0.6e6, 256
+"""Bytes of code that a run loads once it is planned, and of the sample of observations and its statistics: in all, and
+for each class, up to MANY_CLASSES."""
 
 FRAMES_AT_WORK = 3
 """Frames that are in memory in addition to those which are read ahead."""
@@ -114,7 +115,9 @@ def table_bytes(voxels: int, num_classes: int, *, soft: bool) -> int:
 def process_bytes(first: Frame, K: int, threads: int | None, *, soft: bool) -> float:
     """Return the bytes that a process takes without its maps: code, and frames like the first one."""
     threads = default_threads() if threads is None else threads
-    return LOADED + (threads + FRAMES_AT_WORK) * first.shape[0] * first.shape[1] * (6 + (4 * K if soft else 0))
+    pixel_bytes = 6 + (4 * K if soft else 0)
+    frames = (threads + FRAMES_AT_WORK) * first.shape[0] * first.shape[1] * pixel_bytes
+    return LOADED + OF_CLASS * min(K, MANY_CLASSES) + frames
 
 
 def available_for_maps(config: Config, width: int, taken: float) -> float:

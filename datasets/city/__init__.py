@@ -10,6 +10,7 @@ from __future__ import annotations
 import hashlib
 import json
 import threading
+from collections import defaultdict
 from collections.abc import Mapping
 from functools import cached_property
 
@@ -88,6 +89,7 @@ class CityScene(Scene):
         self.rendered: dict[int, Rendered] = {}
         """The rendered frames by index; those that fit into memory."""
         self._lock = threading.Lock()
+        self._of_frame: defaultdict[int, threading.Lock] = defaultdict(threading.Lock)
 
     def __len__(self) -> int:
         return self._options.frames
@@ -163,7 +165,7 @@ class CityScene(Scene):
 
     @cached_property
     def still(self) -> CityCaster:
-        """Return the still part of the town, at which rays are cast."""
+        """The still part of the town, at which rays are cast."""
         return CityCaster(self.town.still)
 
     def _share(self, index: int) -> float:
@@ -173,8 +175,7 @@ class CityScene(Scene):
     def _pose(self, index: int) -> Float64:
         if not 0 <= index < len(self):
             raise DataError(f"city/{self.name}: there is no frame {index}; the scene has {len(self)} frames, from 0")
-        with self._lock:  # the town is built once, by whoever asks first
-            land = self.town.ground
+        land = self._built().ground
         ground = float(land.height(*self._flight.path(np.linspace(0, 1, 50))).mean())
         return self._flight.pose(self._share(index), ground, self._options.altitude)
 
@@ -183,16 +184,24 @@ class CityScene(Scene):
 
         A pass over all frames would drop old ones too early.
         """
-        with self._lock:
-            if index in self.rendered:
-                return self.rendered[index]
-            moving = CityCaster(self.town.moving(self._share(index) * self._flight.seconds, T[:3, 3]))
+        town = self._built()
+        with self._of_frame[index]:  # of all that ask for a frame, one renders it
+            if (known := self.rendered.get(index)) is not None:
+                return known
+            moving = CityCaster(town.moving(self._share(index) * self._flight.seconds, T[:3, 3]))
             size = (self._options.height, self._options.width)
             rendered = render((self.still, moving), T, self.camera, size, LIGHTS[self._options.light])
-            stored = sum(other.nbytes for other in self.rendered.values())
-            if stored + rendered.nbytes <= self._options.cache_megabytes * 1_000_000:
-                self.rendered[index] = rendered
+            with self._lock:
+                stored = sum(other.nbytes for other in self.rendered.values())
+                if stored + rendered.nbytes <= self._options.cache_megabytes * 1_000_000:
+                    self.rendered[index] = rendered
             return rendered
+
+    def _built(self) -> Town:
+        """Return the town; whoever asks first builds it, and the still part at which rays are cast."""
+        with self._lock:
+            _ = self.still
+            return self.town
 
     def _simulated(self, model: str) -> SimulatedModel | None:
         """Return the errors of a simulated model, None for the ground truth."""

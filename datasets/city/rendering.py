@@ -90,6 +90,7 @@ class CityCaster:
         if len(surface.faces):
             mesh = trimesh.Trimesh(surface.vertices, surface.faces, process=False, validate=False)
             self._intersector: Any = RayMeshIntersector(mesh)
+            self.first(np.zeros((1, 3)), np.ones((1, 3)))  # builds its tree: threads share it
 
     def first(self, origins: Float64, directions: Float64) -> Int64:
         """Return the triangle that each ray (n, 3) hits first, -1 for none."""
