@@ -22,7 +22,8 @@ from semstab.datasets.files.options import FileOptions, FrameSource, TruthSource
 from semstab.datasets.files.reader import FileDataset, frames_of
 from semstab.datasets.formats.disk import files_named, read_text, subfolders
 from semstab.datasets.formats.hdf5 import numbers, opened
-from semstab.datasets.formats.images import MAX_PIXELS, Read
+from semstab.datasets.formats.image_sizes import MAX_PIXELS
+from semstab.datasets.formats.images import Read
 from semstab.datasets.geometry.cameras import CAMERA_AXES, Camera
 from semstab.datasets.geometry.lenses import Labels
 from semstab.errors import DataError

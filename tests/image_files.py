@@ -11,7 +11,7 @@ import pytest
 from PIL import Image
 
 from semstab import LabelSpace
-from semstab.datasets.formats.images import PNG_SIGNATURE
+from semstab.datasets.formats.decoders import PNG_SIGNATURE
 from semstab.errors import DataError
 
 SHAPE = (6, 8)

@@ -14,14 +14,15 @@ from posed_config import configure
 import semstab
 from semstab.comparison.opening import open_run
 from semstab.comparison.small_summary import save_summary
-from semstab.datasets.formats.images import FrameSize, read_color, read_depth, read_labels, read_mask, read_scores
+from semstab.datasets.formats.image_sizes import FrameSize
+from semstab.datasets.formats.images import read_color, read_depth, read_labels, read_mask, read_scores
 
 SETUP = """
 from pathlib import Path
-from semstab.datasets.formats import images
+from semstab.datasets.formats import decoders, images
 from semstab.datasets.posed_folder import PosedFolder
 import cv2, pyarrow.parquet
-images._opencv()
+decoders.opencv()
 """
 
 
@@ -97,8 +98,8 @@ def scene(tmp_path):
 def test_a_file_of_another_size_than_its_frame_is_refused_first(scene, name, match, monkeypatch):
     file = next(scene.glob(f"{name}.*"))
     bombs.png(file, 3000, 3000, 16 if "depth" in name else 8)
-    monkeypatch.setattr("semstab.datasets.formats.images.ORDINARY", 2**20)
-    monkeypatch.setattr("semstab.datasets.formats.images._imdecode", _fails_on(file))
+    monkeypatch.setattr("semstab.datasets.formats.image_sizes.ORDINARY", 2**20)
+    monkeypatch.setattr("semstab.datasets.formats.decoders.imdecode", _fails_on(file))
     action = frame_of(scene)
     with pytest.raises(semstab.SemstabError, match=match):
         action()
@@ -109,7 +110,7 @@ def test_labels_of_the_same_view_are_looked_up_unless_they_are_far_larger(scene,
     bombs.png(file, 80, 60, 8)
     assert frame_of(scene)().labels.shape == (6, 8)
     bombs.png(file, 4000, 3000, 8)
-    monkeypatch.setattr("semstab.datasets.formats.images._imdecode", _fails_on(file))
+    monkeypatch.setattr("semstab.datasets.formats.decoders.imdecode", _fails_on(file))
     action = frame_of(scene)
     with pytest.raises(semstab.DataError, match=r"claims 4000x3000 pixels, but depth is 8x6 .* to one size") as error:
         action()
@@ -117,9 +118,9 @@ def test_labels_of_the_same_view_are_looked_up_unless_they_are_far_larger(scene,
 
 
 def _fails_on(file):
-    from semstab.datasets.formats import images
+    from semstab.datasets.formats import decoders
 
-    decode = images._imdecode
+    decode = decoders.imdecode
 
     def decoded(path, data, mode):
         assert path != file, "it was decoded before it was refused"
@@ -149,7 +150,7 @@ def test_a_large_photograph_is_read(tmp_path, monkeypatch):
     image = np.random.default_rng(0).integers(0, 255, (300, 400, 3), dtype=np.uint8)
     for suffix in (".png", ".jpg", ".tif"):
         cv2.imwrite(str(tmp_path / f"c{suffix}"), image)
-    monkeypatch.setattr("semstab.datasets.formats.images.MAX_IMAGE_BYTES", 1000)
+    monkeypatch.setattr("semstab.datasets.formats.image_sizes.MAX_IMAGE_BYTES", 1000)
     for suffix in (".png", ".jpg", ".tif"):
         assert read_color(tmp_path / f"c{suffix}").shape == image.shape
 

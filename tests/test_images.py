@@ -32,8 +32,8 @@ from image_files import (
 )
 
 from semstab import LabelSpace
-from semstab.datasets.formats import images
-from semstab.datasets.formats.images import PNG_SIGNATURE, read_color, read_depth, read_labels, read_scores
+from semstab.datasets.formats.decoders import PNG_SIGNATURE, reads_exr
+from semstab.datasets.formats.images import read_color, read_depth, read_labels, read_scores
 from semstab.errors import ConfigError, DataError
 
 # --- depth
@@ -101,7 +101,7 @@ def test_depth_of_another_type_is_refused(tmp_path, name, content, match):
 
 def test_exr_says_what_to_convert_to_where_opencv_cannot_read_it(tmp_path):
     path = written(tmp_path / "d.exr", exr_header(7, 5))
-    refused(read_depth, path, match="damaged" if images.reads_exr() else r"convert the depth to \.npy")
+    refused(read_depth, path, match="damaged" if reads_exr() else r"convert the depth to \.npy")
 
 
 # --- labels

@@ -15,8 +15,9 @@ import numpy as np
 import numpy.typing as npt
 
 from semstab.core.types import Float32
+from semstab.datasets.formats.decoders import PNG_SIGNATURE
 from semstab.datasets.formats.disk import AGAIN
-from semstab.datasets.formats.images import MAX_PIXELS, PNG_SIGNATURE
+from semstab.datasets.formats.image_sizes import MAX_PIXELS
 from semstab.errors import DataError
 
 JPEG_SIGNATURE = b"\xff\xd8"

@@ -17,7 +17,8 @@ from semstab.core.types import Float32
 from semstab.data.frames import Intrinsics
 from semstab.datasets.files.options import DepthReader, FileOptions, FrameSource
 from semstab.datasets.formats.disk import AGAIN, read_bytes
-from semstab.datasets.formats.images import ANY_SIZE, MAX_PIXELS, MILLIMETRES, FrameSize, Read, color_size, read_depth
+from semstab.datasets.formats.image_sizes import ANY_SIZE, MAX_PIXELS, FrameSize
+from semstab.datasets.formats.images import MILLIMETRES, Read, color_size, read_depth
 from semstab.datasets.geometry.cameras import planar
 from semstab.datasets.geometry.lenses import undistorted
 from semstab.errors import DataError

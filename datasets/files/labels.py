@@ -27,7 +27,8 @@ from semstab.datasets.files.options import (
 )
 from semstab.datasets.formats import images
 from semstab.datasets.formats.disk import natural, subfolders
-from semstab.datasets.formats.images import ANY_SIZE, FrameSize, Read, Size
+from semstab.datasets.formats.image_sizes import ANY_SIZE, FrameSize, Size
+from semstab.datasets.formats.images import Read
 from semstab.datasets.geometry.lenses import Labels, Scores
 from semstab.datasets.scene import GROUND_TRUTH, listed
 from semstab.errors import ConfigError, DataError

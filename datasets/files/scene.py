@@ -25,19 +25,8 @@ from semstab.datasets.files.options import NO_TRUTH, FileOptions, Folders, Frame
 from semstab.datasets.files.surfaces import CameraView, Surface
 from semstab.datasets.formats import disk
 from semstab.datasets.formats.disk import read_pose
-from semstab.datasets.formats.images import (
-    DENSEST,
-    MAX_PHOTOGRAPH,
-    MAX_PIXELS,
-    FrameSize,
-    Read,
-    Size,
-    color_size,
-    depth_size,
-    read_color,
-    read_confidence,
-    read_features,
-)
+from semstab.datasets.formats.image_sizes import DENSEST, MAX_PHOTOGRAPH, MAX_PIXELS, FrameSize, Size
+from semstab.datasets.formats.images import Read, color_size, depth_size, read_color, read_confidence, read_features
 from semstab.datasets.geometry.cameras import UP_AXES, Camera, Poses, to_camera_to_world
 from semstab.datasets.geometry.lenses import (
     Labels,

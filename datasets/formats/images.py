@@ -1,23 +1,13 @@
-"""Depth, labels, scores and colour of image files: of the right kind and unit, or one DataError with the file.
-
-Checksums and claimed sizes are checked before a decoder reads the bytes, because decoders may return half an image for
-a truncated file, or allocate what a damaged header claims.
-"""
+"""Depth, labels, scores and colour of image files: of the right kind and unit, or one DataError with the file."""
 
 from __future__ import annotations
 
 import functools
-import io
 import math
-import os
 import re
-import struct
-from collections.abc import Callable, Collection, Iterator, Mapping
-from contextlib import contextmanager
-from dataclasses import dataclass
+from collections.abc import Callable, Collection
 from pathlib import Path
-from types import MappingProxyType, ModuleType
-from typing import TYPE_CHECKING, Any, Literal
+from typing import Any, Literal
 
 import numpy as np
 import numpy.typing as npt
@@ -25,12 +15,29 @@ import numpy.typing as npt
 from semstab.core.types import Float32, Mask, UInt8, UInt16, UInt32
 from semstab.data.features import Features
 from semstab.data.labels import IGNORE_8BIT, IGNORE_16BIT, LabelSpace
-from semstab.datasets.formats.disk import AGAIN, NPY_SHAPE, Claimed, decode_array, names_in, read_bytes
+from semstab.datasets.formats.decoders import (
+    PFM_HEADER,
+    decode_color_tiff,
+    decode_exr,
+    decode_jpeg,
+    decode_pfm,
+    decode_tiff,
+    in_one_line,
+    whole_png,
+)
+from semstab.datasets.formats.disk import NPY_SHAPE, decode_array, names_in, read_bytes
+from semstab.datasets.formats.image_sizes import (
+    ANY_SIZE,
+    DENSEST,
+    MAX_IMAGE_BYTES,
+    FrameSize,
+    Size,
+    check_photograph,
+    check_pixels,
+    claimed_by,
+)
 from semstab.datasets.geometry.lenses import Labels
-from semstab.errors import ConfigError, DataError, summarize_error
-
-if TYPE_CHECKING:
-    from PIL.ImageFile import ImageFile
+from semstab.errors import ConfigError, DataError
 
 DEPTH_SUFFIXES = (".png", ".npy", ".npz", ".exr", ".tiff", ".tif", ".pfm")
 LABEL_SUFFIXES = (".png", ".npy", ".npz")
@@ -46,53 +53,7 @@ HEADER_BYTES = 256
 MOST_SCORES = 4096
 """Most classes of scores whose classes are not known."""
 
-MAX_PIXELS = 2**26
-"""Most pixels of depth, labels and masks of a frame whose image is not larger."""
-
-MAX_IMAGE_BYTES = 3 * 2**27
-"""Most bytes at once that an image may take while it is decoded: 16-bit depth of 67 megapixels, RGB labels of 44."""
-
-ORDINARY = 2**22
-"""Pixels up to which a file may be larger than its frame's image."""
-
-BEYOND_IMAGE = 4
-"""Times the pixels of its frame's image that a larger file may have."""
-
-BEYOND_DEPTH = 16
-"""Times the pixels of its frame's depth that a label map, scores or mask may have without an image."""
-
-MAX_PHOTOGRAPH = 2**28
-"""Most pixels of a colour image."""
-
-DENSEST = 64
-"""Pixels that a byte of a colour image may stand for, if that takes more than `MAX_IMAGE_BYTES`: of photographs ten.
-
-As many bytes of scores, of another size than the depth, that a byte of their file may stand for.
-"""
-
-MAX_SIDE = 2**16
-"""Most pixels of a side: a few bytes of a damaged header can claim 16 x 8,388,364, which takes seconds to unpack."""
-
-Size = tuple[int, int]
 Read = Callable[[Path], bytes]
-
-
-@dataclass(frozen=True)
-class FrameSize:
-    """Bounds of a frame on the sizes of its files, before a file is decoded.
-
-    Attributes:
-        pixels: Returns the number of pixels of its image, 0 if unknown; called if a file claims many pixels.
-        require: Raises DataError for a size (H, W) that the frame's view cannot have.
-        depth: Shape (H, W) of its depth, for other files; None if depth does not bound the other files.
-    """
-
-    pixels: Callable[[], int] = lambda: 0
-    require: Callable[[Size], None] = lambda size: None
-    depth: Size | None = None
-
-
-ANY_SIZE = FrameSize()
 
 
 def read_depth(path: Path, scale: float | None = None, read: Read = read_bytes, own: FrameSize = ANY_SIZE) -> Float32:
@@ -106,7 +67,7 @@ def read_depth(path: Path, scale: float | None = None, read: Read = read_bytes, 
     data = read(path)
     suffix = path.suffix.lower()
     if suffix == ".png":
-        with _whole_png(path, data, own, {"grey": 4, "RGBA": 16}) as png:
+        with whole_png(path, data, own, {"grey": 4, "RGBA": 16}) as png:
             packed = _unpacked(png.samples()) if (png.kind, png.bits) == ("RGBA", 8) else None
             if packed is None and (png.kind != "grey" or png.bits != 16):
                 raise DataError(
@@ -116,13 +77,13 @@ def read_depth(path: Path, scale: float | None = None, read: Read = read_bytes, 
             depth = png.samples() if packed is None else packed
             scale = scale or (MILLIMETRES if packed is None else 1.0)
     elif suffix in (".tiff", ".tif"):
-        depth = _decode_tiff(path, data, own)
+        depth = decode_tiff(path, data, own)
     elif suffix == ".exr":
-        depth = _decode_exr(path, data, own)
+        depth = decode_exr(path, data, own)
     elif suffix == ".pfm":
-        depth = _decode_pfm(path, data, own)
+        depth = decode_pfm(path, data, own)
     else:
-        depth = decode_array(path, data, "depth", _claimed(path, own, 4))
+        depth = decode_array(path, data, "depth", claimed_by(path, own, 4))
     if depth.ndim != 2 or depth.dtype.kind not in "fui":
         raise DataError(f"{path}: depth is {depth.dtype} of shape {depth.shape}; store float32 metres (H, W)")
     if scale is None and depth.dtype.kind != "f":
@@ -160,8 +121,8 @@ def read_labels(
     """
     data = read(path)
     if path.suffix.lower() != ".png":
-        return _narrow(path, decode_array(path, data, "labels", _claimed(path, own, 4)), space, void)
-    with _whole_png(path, data, own, {"grey": 1, "palette": 1, "RGB": 6, "RGBA": 8}) as png:
+        return _narrow(path, decode_array(path, data, "labels", claimed_by(path, own, 4)), space, void)
+    with whole_png(path, data, own, {"grey": 1, "palette": 1, "RGB": 6, "RGBA": 8}) as png:
         if png.kind not in ("grey", "palette") and (png.kind not in ("RGB", "RGBA") or png.bits != 8):
             raise DataError(
                 f"{path}: a {png.bits}-bit {png.kind} PNG cannot hold labels; save ids as 8- or 16-bit grey"
@@ -200,7 +161,7 @@ def read_scores(
         (H, W), K = sizes[layout], shape[0 if layout == "KHW" else 2]
         if (classes or MOST_SCORES) < K:
             raise DataError(f"{path}: has scores of {K} classes, but there are {classes or f'at most {MOST_SCORES}'}")
-        _check_pixels(path, W, H, sizes=own)
+        check_pixels(path, W, H, sizes=own)
         taken = math.prod(shape) * dtype.itemsize
         if sizes[layout] != size and taken > max(MAX_IMAGE_BYTES // 2, DENSEST * len(data)):
             raise DataError(
@@ -249,7 +210,7 @@ def read_confidence(path: Path, read: Read = read_bytes, own: FrameSize = ANY_SI
     Raises:
         DataError: If it is no one-channel PNG, or damaged.
     """
-    with _whole_png(path, read(path), own, {"grey": 1}) as png:
+    with whole_png(path, read(path), own, {"grey": 1}) as png:
         if png.kind != "grey":
             raise DataError(f"{path}: a {png.bits}-bit {png.kind} PNG is no image of confidence; export it again")
         return png.samples()
@@ -261,7 +222,7 @@ def read_mask(path: Path, read: Read = read_bytes, own: FrameSize = ANY_SIZE) ->
     Raises:
         DataError: If it is no one-channel PNG, or damaged.
     """
-    with _whole_png(path, read(path), own, {"grey": 1, "palette": 1}) as png:
+    with whole_png(path, read(path), own, {"grey": 1, "palette": 1}) as png:
         if png.kind not in ("grey", "palette"):
             raise DataError(f"{path}: a {png.bits}-bit {png.kind} PNG is no mask; save it as grey, 0 where left out")
         mask: Mask = png.samples() == 0
@@ -282,13 +243,13 @@ def read_color(path: Path, read: Read = read_bytes) -> UInt8:
             raise DataError(f"{path}: colour is {color.dtype} of shape {color.shape}; store uint8 RGB (H, W, 3)")
         return color
     if suffix == ".png":
-        with _whole_png(path, data) as png:
-            _check_photograph(path, data, *png.image.size)
+        with whole_png(path, data) as png:
+            check_photograph(path, data, *png.image.size)
             if png.kind == "grey" and png.bits == 16:
                 return np.repeat((png.samples() >> 8).astype(np.uint8)[..., None], 3, axis=2)
             png.image.info.pop("transparency", None)  # Pillow warns of it
             return np.array(png.image if png.image.mode == "RGB" else png.image.convert("RGB"))
-    return _decode_color_tiff(path, data) if suffix in (".tif", ".tiff") else _decode_jpeg(path, data)
+    return decode_color_tiff(path, data) if suffix in (".tif", ".tiff") else decode_jpeg(path, data)
 
 
 def color_size(path: Path) -> Size:
@@ -299,7 +260,7 @@ def color_size(path: Path) -> Size:
     """
     from PIL import Image
 
-    with _one_line(path, "colour"), Image.open(path) as image:
+    with in_one_line(path, "colour"), Image.open(path) as image:
         return image.size
 
 
@@ -420,245 +381,3 @@ def _packed(rgb: UInt8) -> UInt32:
     """Return RGB, or RGB and more, (..., 3) as one 24-bit number each."""
     r, g, b = (rgb[..., channel].astype(np.uint32) for channel in range(3))
     return (r << np.uint32(16)) | (g << np.uint32(8)) | b
-
-
-# --- PNG and JPEG by Pillow, because OpenCV fills the rest of a truncated image with grey -----------------------------
-
-PNG_SIGNATURE = b"\x89PNG\r\n\x1a\n"
-PNG_CHANNELS: Mapping[int, int] = {0: 1, 2: 3, 3: 1, 4: 2, 6: 4}
-PNG_KINDS: Mapping[int, str] = {0: "grey", 2: "RGB", 3: "palette", 4: "grey+alpha", 6: "RGBA"}
-
-
-@dataclass(frozen=True)
-class Png:
-    """A PNG whose checksums hold: its kind, the bits of a sample, and the image, which is not decoded yet."""
-
-    path: Path
-    data: bytes
-    kind: str
-    bits: int
-    image: ImageFile
-
-    def samples(self) -> npt.NDArray[Any]:
-        """Return the stored samples (H, W) or (H, W, channels), uint8 or uint16; of a palette the indices."""
-        if self.kind in ("RGB", "RGBA") or (self.kind == "grey" and self.bits >= 8):
-            image: npt.NDArray[Any] = _imdecode(
-                self.path, _critical_chunks(self.data), "IMREAD_UNCHANGED"
-            )  # a fifth faster than Pillow
-            return image if self.kind == "grey" else image[..., [2, 1, 0, 3][: len(self.kind)]]
-        samples = np.array(self.image)
-        if self.kind != "grey":
-            return samples
-        # Pillow reads one bit as bool and stretches two and four to 0..255
-        return samples.astype(np.uint8) if self.bits == 1 else samples // np.uint8(255 // (2**self.bits - 1))
-
-
-def _critical_chunks(data: bytes) -> bytes:
-    """Return a whole PNG without ancillary chunks, of which OpenCV complains on stderr."""
-    parts, start = [PNG_SIGNATURE], len(PNG_SIGNATURE)
-    while start < len(data):
-        end = start + 12 + int.from_bytes(data[start : start + 4], "big")
-        parts += [data[start:end]] if data[start + 4 : start + 5].isupper() else []
-        start = end
-    return b"".join(parts)
-
-
-@contextmanager
-def _whole_png(
-    path: Path, data: bytes, sizes: FrameSize | None = None, more: Mapping[str, int] = MappingProxyType({})
-) -> Iterator[Png]:
-    """Yield a PNG that is whole; it is decoded within the context.
-
-    The size of a frame's file is checked first; `more` has the bytes that a pixel takes beyond the file's, by kind.
-    """
-    from PIL import PngImagePlugin
-
-    if not data.startswith(PNG_SIGNATURE) or data[12:16] != b"IHDR":
-        raise DataError(f"{path}: not a PNG image (it begins with {data[:8]!r}); {AGAIN}")
-    with _one_line(path, "PNG"):
-        if sizes is not None and len(data) > 26:
-            width, height, bits, colors = struct.unpack_from(">IIBB", data, 16)
-            stored = PNG_CHANNELS.get(colors, 4) * max(1, bits // 8)
-            _check_pixels(path, width, height, stored + more.get(PNG_KINDS.get(colors, ""), 0), sizes)
-        PngImagePlugin.PngImageFile(io.BytesIO(data)).verify()  # while it decodes, Pillow leaves out the checksums
-        image = PngImagePlugin.PngImageFile(io.BytesIO(data))
-        yield Png(path, data, PNG_KINDS[data[25]], data[24], image)
-
-
-@contextmanager
-def _one_line(path: Path, what: str) -> Iterator[None]:
-    """Turn the exceptions of Pillow for damaged files into DataError."""
-    try:
-        yield
-    except DataError:
-        raise
-    except Exception as error:
-        raise DataError(f"{path}: not a whole {what} image ({summarize_error(error)}); {AGAIN}") from error
-
-
-def _decode_jpeg(path: Path, data: bytes) -> UInt8:
-    from PIL import JpegImagePlugin
-
-    with _one_line(path, "JPEG"):
-        image = JpegImagePlugin.JpegImageFile(io.BytesIO(data))
-        _check_photograph(path, data, *image.size)
-        return np.array(image.convert("RGB"))
-
-
-# --- TIFF and EXR by OpenCV, twice as fast as Pillow ------------------------------------------------------------------
-
-
-def _decode_color_tiff(path: Path, data: bytes) -> UInt8:
-    """Return RGB (H, W, 3) of an 8-bit image, or of a deeper one its upper bits."""
-    tags = _tags(path, data)
-    _check_photograph(path, data, tags[256], tags[257])
-    channels = tags.get(277, 1)
-    if channels not in (1, 3, 4):
-        raise DataError(f"{path}: {channels} channels are no colour; save RGB")
-    return np.ascontiguousarray(_imdecode(path, data, "IMREAD_COLOR")[..., ::-1])
-
-
-def _decode_tiff(path: Path, data: bytes, sizes: FrameSize) -> npt.NDArray[Any]:
-    """Return one channel (H, W), of the type it was stored in."""
-    tags = _tags(path, data)
-    bits, channels, sample = tags.get(258, 1), tags.get(277, 1), tags.get(339, 1)
-    if channels != 1:
-        raise DataError(f"{path}: expected one channel of 32-bit float, got {channels} channels")
-    if (sample, bits) not in ((3, 32), (3, 64), (1, 16)):
-        kind = {1: "unsigned", 2: "signed", 3: "float"}.get(sample, "other")
-        raise DataError(f"{path}: expected 32-bit float metres, got {bits}-bit {kind}; convert it")
-    _check_pixels(path, tags[256], tags[257], bits // 8 + (0 if bits == 32 else 4), sizes)
-    return _imdecode(path, data, "IMREAD_UNCHANGED")
-
-
-def _tags(path: Path, data: bytes) -> dict[int, int]:
-    """Return the first value of each short or long tag of the first image of a TIFF, its size among them."""
-    tags = {}
-    try:
-        order = {b"II*\0": "<", b"MM\0*": ">"}[data[:4]]
-        (start,) = struct.unpack_from(order + "I", data, 4)
-        (count,) = struct.unpack_from(order + "H", data, start)
-        for entry in range(start + 2, start + 2 + 12 * count, 12):
-            tag, kind, _, value = struct.unpack_from(order + "HHII", data, entry)
-            (short,) = struct.unpack_from(order + "H", data, entry + 8)
-            tags[tag] = short if kind == 3 else value
-    except (struct.error, KeyError) as error:
-        raise DataError(f"{path}: not a whole TIFF image; {AGAIN}") from error
-    if not {256, 257} <= tags.keys():
-        raise DataError(f"{path}: a TIFF image without a size; {AGAIN}")
-    return tags
-
-
-def _decode_exr(path: Path, data: bytes, sizes: FrameSize) -> npt.NDArray[Any]:
-    """Return one channel (H, W), where the installed OpenCV reads EXR at all (the wheels of OpenCV 5 do not)."""
-    window = data.find(b"dataWindow\0box2i\0")
-    if not data.startswith(b"v/1\x01") or window < 0 or len(data) < window + 37:
-        raise DataError(f"{path}: not a whole EXR image; {AGAIN}")
-    left, top, right, bottom = struct.unpack_from("<4i", data, window + 21)
-    _check_pixels(path, right - left + 1, bottom - top + 1, 4, sizes)
-    if not reads_exr():
-        raise DataError(
-            f"{path}: the installed OpenCV cannot read EXR; convert the depth to .npy (float32 metres),"
-            ' or pip install "opencv-python-headless<5"'
-        )
-    depth = _imdecode(path, data, "IMREAD_UNCHANGED")
-    if depth.ndim == 3 and (depth[..., :1] == depth[..., :3]).all():  # Blender writes depth as three equal channels
-        depth = depth[..., 0]
-    if depth.ndim != 2:
-        raise DataError(f"{path}: expected one channel, got {depth.shape[2]}; export the depth channel alone")
-    return depth
-
-
-PFM_HEADER = re.compile(rb"P([Ff])\s+(\d{1,9})\s+(\d{1,9})\s+([-+.\deE]{1,40})\s")
-
-
-def _decode_pfm(path: Path, data: bytes, sizes: FrameSize) -> npt.NDArray[Any]:
-    """Return one channel (H, W) of a portable float map, whose rows go from the bottom to the top."""
-    header = PFM_HEADER.match(data)
-    if header is None:
-        raise DataError(f"{path}: not a PFM image (it begins with {data[:8]!r}); {AGAIN}")
-    width, height, channels = int(header[2]), int(header[3]), 1 if header[1] == b"f" else 3
-    _check_pixels(path, width, height, 4 * channels + 4, sizes)
-    try:
-        order = "<" if float(header[4]) < 0 else ">"
-    except ValueError as error:
-        raise DataError(f"{path}: not a whole PFM image; {AGAIN}") from error
-    needed, available = 4 * width * height * channels, len(data) - header.end()
-    if available < needed:
-        raise DataError(f"{path}: truncated: {width}x{height} pixels need {needed} bytes, it has {available}; {AGAIN}")
-    stored = np.frombuffer(data, f"{order}f4", width * height * channels, header.end())
-    bits = stored.view(np.uint32).reshape(-1, channels)  # NaN, too, is what it is in the other channels
-    if channels > 1 and (bits != bits[:, :1]).any():
-        raise DataError(f"{path}: expected one channel, got {channels} that differ; export the depth channel alone")
-    return stored.reshape(height, width, channels)[::-1, :, 0]
-
-
-@functools.cache
-def reads_exr() -> bool:
-    """Return whether the installed OpenCV was built with EXR."""
-    return re.search(r"OpenEXR:\s+(?!NO)\S", _opencv().getBuildInformation()) is not None
-
-
-@functools.cache
-def _opencv() -> ModuleType:
-    os.environ.setdefault("OPENCV_IO_ENABLE_OPENEXR", "1")
-    import cv2
-
-    cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)  # a damaged file becomes a DataError
-    return cv2
-
-
-def _imdecode(path: Path, data: bytes, mode: str) -> npt.NDArray[Any]:
-    cv2 = _opencv()
-    try:
-        image: npt.NDArray[Any] | None = cv2.imdecode(np.frombuffer(data, np.uint8), getattr(cv2, mode))
-    except cv2.error as error:
-        raise DataError(f"{path}: the image cannot be decoded ({summarize_error(error)}); {AGAIN}") from error
-    if image is None:
-        raise DataError(f"{path}: the image is damaged; {AGAIN}")
-    return image
-
-
-def _claimed(path: Path, sizes: FrameSize, more: int) -> Claimed:
-    """Check the size of an array (H, W) before it is unpacked; a pixel takes `more` bytes beyond the file's."""
-
-    def check(shape: tuple[int, ...], dtype: np.dtype[Any]) -> None:
-        if len(shape) == 2:  # others are refused by what they are for
-            _check_pixels(path, shape[1], shape[0], dtype.itemsize + more, sizes)
-        elif math.prod(shape) * dtype.itemsize > MAX_IMAGE_BYTES:
-            raise DataError(f"{path}: claims an array of shape {shape}; expected (H, W)")
-
-    return check
-
-
-def _check_pixels(path: Path, width: int, height: int, pixel_bytes: int = 1, sizes: FrameSize = ANY_SIZE) -> None:
-    """Check an image's size before memory is allocated for the size that a header claims, by its frame's image."""
-    pixels = width * height
-    _check_sides(path, width, height)
-    most = min(MAX_PIXELS, MAX_IMAGE_BYTES // pixel_bytes)
-    if pixels > ORDINARY and (image := sizes.pixels()):
-        most = max(ORDINARY, image, min(most, BEYOND_IMAGE * image))
-        if pixels > most:
-            raise DataError(f"{path}: claims {width}x{height} pixels, but the image has {image}; export them again")
-    if pixels > most:
-        raise DataError(f"{path}: claims {width}x{height} pixels (at most {most} are read); is it damaged?")
-    sizes.require((height, width))
-    if sizes.depth is not None and pixels > max(ORDINARY, BEYOND_DEPTH * math.prod(sizes.depth)) and not sizes.pixels():
-        H, W = sizes.depth
-        raise DataError(
-            f"{path}: claims {width}x{height} pixels, but depth is {W}x{H} (without an image, {BEYOND_DEPTH} times the"
-            " pixels of the depth are read at most); bring them to one size"
-        )
-
-
-def _check_photograph(path: Path, data: bytes, width: int, height: int) -> None:
-    """Check a colour image's size: one that takes much memory has the bytes of a photograph."""
-    _check_sides(path, width, height)
-    pixels, free = width * height, MAX_IMAGE_BYTES // 10  # Pillow's four bytes, and two copies of three
-    if pixels > max(free, min(MAX_PHOTOGRAPH, DENSEST * len(data))):
-        raise DataError(f"{path}: claims {width}x{height} pixels in {len(data)} bytes; is it damaged?")
-
-
-def _check_sides(path: Path, width: int, height: int) -> None:
-    if not (0 < width <= MAX_SIDE and 0 < height <= MAX_SIDE):
-        raise DataError(f"{path}: claims {width}x{height} pixels (at most {MAX_SIDE} on a side); is it damaged?")

@@ -19,7 +19,7 @@ import yaml
 from image_files import png_chunk
 
 from semstab.core.sealed_zip import DIGESTS, packed
-from semstab.datasets.formats.images import PNG_SIGNATURE
+from semstab.datasets.formats.decoders import PNG_SIGNATURE
 
 Damage = Callable[[bytes, random.Random], bytes]
 

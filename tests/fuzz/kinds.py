@@ -39,15 +39,8 @@ from semstab.data.records import Record
 from semstab.datasets import open_dataset
 from semstab.datasets.files.depth import read_depth_map, read_dmap, read_mvei
 from semstab.datasets.files.surfaces import Surface
-from semstab.datasets.formats.images import (
-    color_size,
-    read_color,
-    read_depth,
-    read_labels,
-    read_mask,
-    read_scores,
-    reads_exr,
-)
+from semstab.datasets.formats.decoders import reads_exr
+from semstab.datasets.formats.images import color_size, read_color, read_depth, read_labels, read_mask, read_scores
 from semstab.datasets.scannet import read_class_table
 from semstab.engine import load_result
 from semstab.exports import export
