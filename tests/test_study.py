@@ -21,7 +21,8 @@ from semstab.api import run_study
 from semstab.config import BACKENDS, Config
 from semstab.configure import resolve
 from semstab.core.json_form import to_json
-from semstab.data.records import ImageSpace, Variation
+from semstab.data.image_measures import ImageSpace
+from semstab.data.records import Variation
 from semstab.data.results import UnitName
 from semstab.datasets.files.scene import FileScene
 from semstab.engine import load_result

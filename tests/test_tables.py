@@ -23,8 +23,9 @@ from wall_study import MODELS, STEPS, wall_study
 from semstab import Result
 from semstab.config import BACKENDS, SHARED
 from semstab.core.files import write_text
+from semstab.data.image_measures import ImageSpace
 from semstab.data.measures import SBD, VSS
-from semstab.data.records import ImageSpace, RegionFlicker
+from semstab.data.records import RegionFlicker
 from semstab.errors import ConfigError
 from semstab.metrics import entropy, op, sbd, vss
 from semstab.report.means import ENOUGH, RepeatSpread, complete_scenes, describe, levels, pooled, swept

@@ -16,7 +16,7 @@ from command_line import bench
 from PIL import Image
 
 from semstab import LabelSpace, datasets
-from semstab.data.records import ClipMean, WarpedOverlap
+from semstab.data.image_measures import ClipMean, WarpedOverlap
 from semstab.engine import load_result
 from semstab.errors import DataError
 from semstab.metrics import (

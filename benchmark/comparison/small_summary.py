@@ -19,7 +19,8 @@ from semstab.core.json_form import from_json, to_json
 from semstab.core.sealed_zip import packed, unpacked
 from semstab.data import parquet
 from semstab.data.georeference import Georeference
-from semstab.data.records import ImageSpace, Record
+from semstab.data.image_measures import ImageSpace
+from semstab.data.records import Record
 from semstab.errors import DataError, sanitize, summarize_error
 from semstab.statistics.cluster_sums import ClusterSums
 

@@ -30,6 +30,7 @@ from semstab.core.files import (
 )
 from semstab.core.json_form import from_json, to_json
 from semstab.data.digests import DIGESTS, write_digests
+from semstab.data.image_measures import ImageSpace
 from semstab.data.records import (
     EVENTS,
     FRAMES,
@@ -40,7 +41,6 @@ from semstab.data.records import (
     TRUTH,
     UNITS,
     VOXELS,
-    ImageSpace,
     Record,
     RegionFlicker,
     Result,

@@ -19,20 +19,10 @@ from semstab.core.process import Stopwatch, trim_malloc
 from semstab.core.types import Float64
 from semstab.data.features import OF_FEATURES
 from semstab.data.frames import LeftOut
+from semstab.data.image_measures import FrameQuality, PixelStatistics
 from semstab.data.measures import dominant, mean, measures
 from semstab.data.parquet import Tile
-from semstab.data.records import (
-    EVENTS,
-    FRAMES,
-    OBSERVATIONS,
-    OVERVIEW,
-    SUMS,
-    TRUTH,
-    VOXELS,
-    FrameQuality,
-    PixelStatistics,
-    Record,
-)
+from semstab.data.records import EVENTS, FRAMES, OBSERVATIONS, OVERVIEW, SUMS, TRUTH, VOXELS, Record
 from semstab.data.results import STAGES, ReducedScores, slug
 from semstab.data.voxels import VoxelTable
 from semstab.datasets import Scene

@@ -18,7 +18,7 @@ from semstab.core.files import parse_json, read_arrays, write_arrays
 from semstab.core.json_form import from_json, to_json
 from semstab.core.types import Float64, Int32
 from semstab.data.frames import Frame
-from semstab.data.records import FrameQuality, VideoMeasures
+from semstab.data.image_measures import FrameQuality, VideoMeasures
 from semstab.data.results import Agreement
 from semstab.engine.series import NUMBERS, Series
 from semstab.errors import DataError

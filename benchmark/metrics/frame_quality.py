@@ -10,7 +10,7 @@ import numpy.typing as npt
 
 from semstab.core.types import Mask
 from semstab.data.frames import Frame
-from semstab.data.records import FrameQuality
+from semstab.data.image_measures import FrameQuality
 from semstab.metrics.correctness import mean_iou
 from semstab.pixels.warp import Correspondence, correspond
 

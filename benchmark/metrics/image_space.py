@@ -14,8 +14,8 @@ import numpy.typing as npt
 from semstab.core.arrays import GrowingRows
 from semstab.core.types import Mask, UInt8
 from semstab.data.frames import Frame
+from semstab.data.image_measures import ImageSpace
 from semstab.data.measures import mean
-from semstab.data.records import ImageSpace
 from semstab.metrics.flicker import (
     CompensatedFlicker,
     SelfConsistency,

@@ -8,7 +8,7 @@ import numpy.typing as npt
 from semstab.config import FlowName
 from semstab.core.types import Mask, UInt8
 from semstab.data.frames import Frame
-from semstab.data.records import ClipMean, VideoMeasures, WarpedOverlap
+from semstab.data.image_measures import ClipMean, VideoMeasures, WarpedOverlap
 from semstab.errors import DataError
 from semstab.metrics.flicker import SelfConsistency, VideoConsistency
 from semstab.metrics.image_space import CLIPS

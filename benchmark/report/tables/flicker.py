@@ -4,7 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 
-from semstab.data.records import ImageSpace, Result
+from semstab.data.image_measures import ImageSpace
+from semstab.data.records import Result
 from semstab.metrics.image_space import mean_over_scenes
 from semstab.report.tables.table import Column, Group, Row, Table
 

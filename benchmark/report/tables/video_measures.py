@@ -7,7 +7,8 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from semstab.data.records import ClipMean, Result, VideoMeasures, WarpedOverlap
+from semstab.data.image_measures import ClipMean, VideoMeasures, WarpedOverlap
+from semstab.data.records import Result
 from semstab.metrics import macro_mean
 from semstab.metrics.temporal_consistency import pooled_tc
 from semstab.metrics.video_measures import CLIP_FIELDS
