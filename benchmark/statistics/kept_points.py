@@ -98,7 +98,7 @@ class KeptPoints:
     def _votes(
         self, point: Float64, distances: float, gap: float, near_by: float, span: float
     ) -> npt.NDArray[np.uint8]:
-        """Return the vote (n,) on points (n, 3), by the points within so many distances of the points."""
+        """Return the vote (n,) on points (n, 3), by the points within `distances` distances of points."""
         from semstab.statistics.loops.moving_points import vote_by_points
 
         votes = np.empty(len(point), np.uint8)

@@ -79,8 +79,8 @@ NEXT_TO_OF_POINTS = 2.5
 """Spacings of spots within which an unknown spot is next to others, of points: more of these are unknown."""
 
 LONE, LEAST_OF_LONE, SHARE_OF_LONE = 2.5, 2, 1 / 3
-"""Of points, a spot that moved is lone if fewer than LEAST_OF_LONE other spots within LONE spacings moved, or less than
-SHARE_OF_LONE of the known ones there: few rays meet leaves and wires. Views that see through it do not count."""
+"""A spot that moved, by points, is lone if fewer than LEAST_OF_LONE other spots within LONE spacings moved, or less
+than SHARE_OF_LONE of the known ones there: few rays meet leaves and wires. Views that see through it do not count."""
 
 NEIGHBOURS = round(math.pi * NEXT_TO**2) - 1
 """Spots, about, within NEXT_TO spacings of a spot."""
@@ -191,7 +191,7 @@ class DepthMemory:
 
     @property
     def _of_points(self) -> bool:
-        """Whether the depth is of the points of a LiDAR."""
+        """True if the depth is of the points of a LiDAR."""
         return bool(self.kept) and isinstance(self.kept[0], KeptPoints)
 
     def _gap(self, sigma: float) -> float:
@@ -419,7 +419,7 @@ class SpotVotes:
     def by_neighbours(self, point: Float64, spacing: float, within: float = NEXT_TO) -> Mask:
         """Return which spots (n,) at `point` (n, 3) moved by those around: suspect ones, and unknown ones.
 
-        Unknown ones are asked about spots within so many spacings.
+        Unknown ones are next to spots that are within `within` spacings.
         """
         suspect = is_suspect(self.through, self.votes) & ~self.moved
         told = confirmed(point, suspect, self.moved, self.static, spacing)

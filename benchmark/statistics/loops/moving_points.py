@@ -67,7 +67,7 @@ def side_of(dx, dy):
 
 @serial
 def vote_by_points(point, T, camera, around, stride, top, near, reach, gap, near_by, span, votes):
-    """Write the vote of a view on each point (n, 3), by its points within `reach` pixels from where it shows the point.
+    """Write the vote of a view on each point (n, 3), by its own points within `reach` pixels of the place in the image.
 
     A view sees through a point if all of these are farther by more than `gap`, in codes, and some lie to each of the
     four sides. It sees the point if one has its depth, but for `near_by` codes, or if they are on both sides of it and
