@@ -23,8 +23,9 @@ from semstab.core.types import Float64, Int32, Int64, Mask, UInt16
 from semstab.data.frames import Frame
 from semstab.data.labels import fixed
 from semstab.statistics.feature_spots import FeatureObservations, FeatureStore
+from semstab.statistics.kept_points import KeptPoints
 from semstab.statistics.observations import COLUMNS, TYPES, VIEW, SpotObservations, Views
-from semstab.statistics.votes import NEAR_BY_SIGMAS, DepthMemory, KeptDepth, SpotVotes, firm
+from semstab.statistics.votes import DepthMemory, KeptDepth, SpotVotes, firm
 
 BUDGET = 1 << 19
 """Most answers (spot, view)."""
@@ -269,7 +270,6 @@ class Sampler:
         """Keep depth of a view, and of the new spots which view found them and which lie at no edge of depth.
 
         A point of a LiDAR lies on a surface, at an edge, too; but a spot between points may lie between two surfaces.
-        In a first view, which no other one differs from, depth differs by MOST at most.
         """
         if self._memory is None:
             return
@@ -281,8 +281,8 @@ class Sampler:
                 self._memory.add(KeptDepth.of_image(view, T.copy(), _camera(frame), fixed(frame.depth)))
             return
         points, place = (sparse.u, sparse.v, sparse.w), (sparse.camera, sparse.around, sparse.spacing)
-        depth = KeptDepth.of_points(view, T.copy(), *place, sparse.grid.shape, points)
-        self._firm[new] = depth.shows(self._point[new], self._sigma if self._errors else MOST / NEAR_BY_SIGMAS)
+        depth = KeptPoints.of(view, T.copy(), *place, sparse.grid.shape, points)
+        self._firm[new] = depth.at_points(self._point[new], self._sigma)
         if self._memory.wants(view):
             self._memory.add(depth)
 
@@ -419,7 +419,7 @@ class Sampler:
         if self._memory is None:
             raise ValueError("no depth of views is kept; make the sampler with moving=True")
         sparse = _of_points(_sparse(frame, self.K))
-        return self._memory.moving_pixels(frame, self._sigma, votes.misplaced, sparse=sparse)
+        return self._memory.moving_pixels(frame, self._sigma, votes.misplaced, self._edge, sparse=sparse)
 
     def _votes(self) -> SpotVotes | None:
         """Return what views say of the spots; None without depth of views."""

@@ -19,6 +19,7 @@ import numpy.typing as npt
 
 from semstab.core.types import Float64, Int64, Mask, UInt16
 from semstab.data.frames import Frame
+from semstab.statistics.kept_points import KeptPoints, codes
 from semstab.statistics.misplaced import fitting
 
 MOST_KEPT = 256
@@ -26,9 +27,6 @@ MOST_KEPT = 256
 
 BLOCKS = 20_000
 """Blocks of pixels, about, of a view's depth."""
-
-POINTS = 3.0
-"""Distances of the points of sparse depth along the edge of a block."""
 
 GAP, GAP_SIGMAS = 0.01, 5.0
 """The surface in a spot's own block is farther than the spot if it is by more than GAP, relative, and by more than
@@ -41,13 +39,6 @@ depth move things sidewards in an image. Holes count as near in the next blocks.
 ASIDE, ASIDE_SIGMAS = 0.003, 4.0
 """In the blocks around, what is farther by more than ASIDE, relative, and by more than ASIDE_SIGMAS standard deviations
 is not the spot's surface. The ground at which a thing stands comes near to the thing there."""
-
-AROUND_OF_POINTS = 1
-"""The same for the points of a LiDAR: its blocks are larger, and it has no edges of depth that errors displace."""
-
-SPAN = 1.0
-"""A spot between points of a LiDAR whose depths differ by more than SPAN, relative, and far from both, lies on neither
-surface: it is between a thing and what is behind it."""
 
 REACH = 0.25
 """Blocks to each side, a pixel at least, in which the view that found a spot must see a smooth surface."""
@@ -84,6 +75,13 @@ SHARE_OF_SUSPECTS = 1 / 4
 LEAST_NEXT_TO spots within NEXT_TO spacings that are suspect, too, or moved, and at least as many as are static, it
 moved: what errors do to one spot they seldom do to the spots next to it."""
 
+NEXT_TO_OF_POINTS = 2.5
+"""Spacings of spots within which an unknown spot is next to others, of points: more of these are unknown."""
+
+LONE, LEAST_OF_LONE, SHARE_OF_LONE = 2.5, 2, 1 / 3
+"""A spot that moved, by points, is lone if fewer than LEAST_OF_LONE other spots within LONE spacings moved, or less
+than SHARE_OF_LONE of the known ones there: few rays meet leaves and wires. Views that see through it do not count."""
+
 NEIGHBOURS = round(math.pi * NEXT_TO**2) - 1
 """Spots, about, within NEXT_TO spacings of a spot."""
 
@@ -93,24 +91,20 @@ OF_SPOTS = ("seen", "hidden", "through", "at_end", "next_to")
 
 @dataclass(frozen=True, eq=False)
 class KeptDepth:
-    """The depth of a view in blocks of pixels.
+    """The dense depth of a view in blocks of pixels.
 
     Attributes:
         view: Its number.
         T_wc: (4, 4) its pose.
-        camera: Focal lengths and principal point in pixels; of a scan, pixels in a radian.
-        around: Whether columns close a circle.
+        camera: Focal lengths and principal point in pixels.
         stride: Edge of a block in pixels.
-        margin: Blocks to each side of a spot that must be farther for a view to see through it.
         near, far: (rows, columns) uint16 codes of the nearest and the farthest depth.
     """
 
     view: int
     T_wc: Float64
     camera: tuple[float, float, float, float]
-    around: bool
     stride: float
-    margin: int
     near: UInt16
     far: UInt16
 
@@ -118,52 +112,25 @@ class KeptDepth:
     def of_image(
         cls, view: int, T_wc: Float64, camera: tuple[float, float, float, float], depth: npt.NDArray[Any]
     ) -> KeptDepth:
-        """Keep dense depth (H, W)."""
+        """Keep depth (H, W)."""
         from semstab.statistics.loops.moving import blocks_of_image
 
         stride = max(1, round(math.sqrt(depth.size / BLOCKS)))
         near, far = np.empty((2, depth.shape[0] // stride, depth.shape[1] // stride), np.uint16)
         blocks_of_image(depth, stride, *np.empty((3, depth.shape[1]), depth.dtype), near, far)
-        return cls(view, T_wc, camera, False, float(stride), AROUND, near, far)
+        return cls(view, T_wc, camera, float(stride), near, far)
 
-    @classmethod
-    def of_points(
-        cls,
-        view: int,
-        T_wc: Float64,
-        camera: tuple[float, float, float, float],
-        around: bool,
-        spacing: float,
-        shape: tuple[int, int],
-        points: tuple[Float64, Float64, Float64],
-    ) -> KeptDepth:
-        """Keep sparse depth: points by image coordinates and inverse depth, `spacing` pixels apart, of an image."""
-        from semstab.statistics.loops.moving import blocks_of_points
-
-        stride = max(POINTS * spacing, 1.0)
-        columns = max(1, round(shape[1] / stride)) if around else math.ceil(shape[1] / stride)
-        stride = shape[1] / columns if around else stride
-        near, far = np.empty((2, math.ceil(shape[0] / stride), columns), np.uint16)
-        blocks_of_points(*points, stride, near, far)
-        return cls(view, T_wc, camera, around, stride, AROUND_OF_POINTS, near, far)
-
-    def shows(self, point: Float64, sigma: float) -> Mask:
-        """Return which points (n, 3) that this view of a LiDAR found lie on a surface, and not between two."""
-        from semstab.statistics.loops.moving import at_points
-
-        shown = np.empty(len(point), np.bool_)
-        limits = _codes(near_by_of(sigma)), _codes(SPAN)
-        at_points(point, self.T_wc, self.camera, self.around, self.stride, self.near, self.far, *limits, shown)
-        return shown
+    def gap(self, sigma: float) -> float:
+        """Return how much farther than a spot a surface is at least, relative, if a view sees through the spot."""
+        return gap_of(sigma)
 
     def votes(self, point: Float64, sigma: float) -> npt.NDArray[np.uint8]:
         """Return the vote (n,) on points (n, 3); depth of a surface differs by `sigma`, relative, between views."""
         from semstab.statistics.loops.moving import vote
 
         votes = np.empty(len(point), np.uint8)
-        limits = (_codes(limit_of(sigma)) for limit_of in (gap_of, aside_of, near_by_of))
-        place = self.T_wc, self.camera, self.around, self.stride
-        vote(point, *place, self.near, self.far, self.margin, *limits, votes)
+        limits = (codes(limit_of(sigma)) for limit_of in (gap_of, aside_of, near_by_of))
+        vote(point, self.T_wc, self.camera, self.stride, self.near, self.far, AROUND, *limits, votes)
         return votes
 
 
@@ -171,14 +138,14 @@ class DepthMemory:
     """The depth of some of the views of a flight, evenly over it."""
 
     def __init__(self) -> None:
-        self.kept: list[KeptDepth] = []
+        self.kept: list[KeptDepth | KeptPoints] = []
         self._step = 1
 
     def wants(self, view: int) -> bool:
         """Return whether the depth of a view is to be kept: it is new, and its number is a multiple of the step."""
         return view % self._step == 0 and (not self.kept or view > self.kept[-1].view)
 
-    def add(self, depth: KeptDepth) -> None:
+    def add(self, depth: KeptDepth | KeptPoints) -> None:
         """Keep the depth of a view; of more than MOST_KEPT every second one is dropped."""
         self.kept.append(depth)
         while len(self.kept) > MOST_KEPT:
@@ -194,7 +161,7 @@ class DepthMemory:
             point: (n, 3) spots in metres.
             found: (n,) the view that found each spot.
             firm: (n,) spots that lie at no edge of depth. The others have no votes; but if LEAST_VOTES views see one
-                and none sees through it, the spots next to it do not tell that it moved.
+                and none sees through it, the spots next to it do not tell that it moved, and of points it is static.
             views: Number of views.
             sigma: Standard deviation of how depth differs between views, relative.
             spacing: Distance of spots in metres; with 0 no spot is told by those next to it.
@@ -208,19 +175,36 @@ class DepthMemory:
         counts, at_end, between = _tallied(votes, fits[depth_views])
         counts[~fits[found]] = at_end[~fits[found]] = 0
         num_seen, hidden, through = counts.T.copy()
-        nothing = np.zeros(len(point), np.bool_)
-        alone = SpotVotes(num_seen, hidden, through, at_end, nothing, shares, ~fits, between, gap_of(sigma))
         seen_at_edge, _, through_at_edge = _tallied(at_edge, fits[depth_views])[0].T
         stays = (seen_at_edge >= LEAST_VOTES) & (through_at_edge == 0)
-        rows, next_to = np.flatnonzero(fits[found] & ~stays), nothing.copy()
-        next_to[rows] = alone.take(rows).by_neighbours(point[rows], spacing)
-        return dataclasses.replace(alone, next_to=next_to)
+        next_to = np.zeros(len(point), np.bool_)
+        alone = SpotVotes(num_seen, hidden, through, at_end, next_to, shares, ~fits, between, self._gap(sigma))
+        rows = np.flatnonzero(fits[found] & ~stays)
+        within = NEXT_TO_OF_POINTS if self._of_points else NEXT_TO
+        next_to[rows] = alone.take(rows).by_neighbours(point[rows], spacing, within)
+        if self._of_points and spacing > 0:
+            counted = ~lone(point, alone.moved, alone.static, spacing)
+            through, at_end, next_to = through * counted, at_end * counted, next_to & counted
+        if self._of_points:
+            num_seen = np.where(stays & fits[found], seen_at_edge, num_seen)
+        return dataclasses.replace(alone, seen=num_seen, through=through, at_end=at_end, next_to=next_to)
 
-    def moving_pixels(self, frame: Frame, sigma: float, misplaced: Mask, *, sparse: bool = False) -> Mask:
+    @property
+    def _of_points(self) -> bool:
+        """True if the depth is of the points of a LiDAR."""
+        return bool(self.kept) and isinstance(self.kept[0], KeptPoints)
+
+    def _gap(self, sigma: float) -> float:
+        """Return how much farther than a spot a surface is at least, relative, that shows that a view sees through."""
+        return self.kept[0].gap(sigma) if self.kept else gap_of(sigma)
+
+    def moving_pixels(
+        self, frame: Frame, sigma: float, misplaced: Mask, spacing: float, *, sparse: bool = False
+    ) -> Mask:
         """Return the pixels (H, W) of a frame whose surface moved: the kept views, but for misplaced ones, tell.
 
-        Places in blocks of pixels are asked, of sparse depth all pixels that have it; pixels next to such blocks move,
-        too, if they go on at the same depth.
+        Places in blocks of pixels are asked, of sparse depth all pixels that have it, but for lone ones by the spacing
+        of spots, metres; pixels next to such blocks move, too, if they go on at the same depth.
         """
         step = 1 if sparse else max(1, round(math.sqrt(frame.depth.size / BLOCKS)))
         depth = frame.depth[step // 2 :: step, step // 2 :: step].astype(np.float64)
@@ -236,8 +220,11 @@ class DepthMemory:
         counts, at_end, _ = _tallied(votes, np.ones(len(kept), np.bool_))
         num_seen, _, through = counts.astype(np.int64).T
         moves = np.zeros(depth.shape, np.bool_)
-        moves[valid] = has_moved(through, num_seen + through, at_end)
-        small = _grown(moves, np.where(valid, depth, np.nan), gap_of(sigma))
+        moved = has_moved(through, num_seen + through, at_end)
+        if self._of_points:
+            moved &= ~lone(point, moved, (num_seen + through >= LEAST_VOTES) & ~moved, spacing)
+        moves[valid] = moved
+        small = _grown(moves, np.where(valid, depth, np.nan), self._gap(sigma))
         mask = small.repeat(step, axis=0).repeat(step, axis=1)
         bottom, right = (max(0, n - m) for n, m in zip(frame.depth.shape, mask.shape, strict=True))
         mask = np.pad(mask, ((0, bottom), (0, right)), mode="edge")
@@ -288,7 +275,7 @@ def confirmed(point: Float64, suspect: Mask, moved: Mask, static: Mask, spacing:
     return confirmed
 
 
-def next_to_moved(point: Float64, moved: Mask, static: Mask, spacing: float) -> Mask:
+def next_to_moved(point: Float64, moved: Mask, static: Mask, spacing: float, within: float = NEXT_TO) -> Mask:
     """Return which spots (n,) are neither moved nor static, and next to spots that moved, in up to STEPS steps."""
     from scipy.spatial import cKDTree
 
@@ -299,9 +286,21 @@ def next_to_moved(point: Float64, moved: Mask, static: Mask, spacing: float) -> 
         if not len(unknown) or len(of_moved) < LEAST_NEXT_TO:
             break
         trees = cKDTree(of_moved), stayed
-        near = [tree.query_ball_point(point[unknown], NEXT_TO * spacing, return_length=True) for tree in trees]
+        near = [tree.query_ball_point(point[unknown], within * spacing, return_length=True) for tree in trees]
         next_to[unknown] = (near[0] >= LEAST_NEXT_TO) & (near[0] >= near[1])
     return next_to
+
+
+def lone(point: Float64, moved: Mask, static: Mask, spacing: float) -> Mask:
+    """Return which spots (n,) that moved have too few around that moved, too, by number or by share of the known."""
+    from scipy.spatial import cKDTree
+
+    lone, of_moved = moved.copy(), point[moved]
+    trees = cKDTree(of_moved), cKDTree(point[static])
+    near, stayed = (tree.query_ball_point(of_moved, LONE * spacing, return_length=True) for tree in trees)
+    near = near - 1  # without the spot itself
+    lone[moved] = (near < LEAST_OF_LONE) | (near < SHARE_OF_LONE * (near + stayed))
+    return lone
 
 
 def gap_of(sigma: float) -> float:
@@ -317,13 +316,6 @@ def aside_of(sigma: float) -> float:
 def near_by_of(sigma: float) -> float:
     """Return how much nearer or farther than a spot, relative, a surface is at most that is the spot's."""
     return max(NEAR_BY, NEAR_BY_SIGMAS * sigma)
-
-
-def _codes(farther: float) -> int:
-    """Return by how many codes depth differs that is farther by this, relative."""
-    from semstab.statistics.loops.moving import STEP
-
-    return math.ceil(math.log1p(farther) / STEP)
 
 
 @dataclass(frozen=True, eq=False)
@@ -424,11 +416,14 @@ class SpotVotes:
         moved = np.minimum(special.bdtrc(least - 1, n, self.false_rate) + at_end + suspect * around, 1.0)
         return float(moved @ count / count.sum())
 
-    def by_neighbours(self, point: Float64, spacing: float) -> Mask:
-        """Return which spots (n,) at `point` (n, 3) moved by those around: suspect ones, and unknown ones."""
+    def by_neighbours(self, point: Float64, spacing: float, within: float = NEXT_TO) -> Mask:
+        """Return which spots (n,) at `point` (n, 3) moved by those around: suspect ones, and unknown ones.
+
+        Unknown ones are next to spots that are within `within` spacings.
+        """
         suspect = is_suspect(self.through, self.votes) & ~self.moved
         told = confirmed(point, suspect, self.moved, self.static, spacing)
-        return told | next_to_moved(point, self.moved, self.static, spacing)
+        return told | next_to_moved(point, self.moved, self.static, spacing, within)
 
     def take(self, rows: Any) -> SpotVotes:
         """Return the votes on some of the spots."""

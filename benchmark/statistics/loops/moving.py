@@ -95,67 +95,24 @@ def on_one_surface(point, T, camera, depth, reach, most, near_by, firm):
 
 
 @serial
-def blocks_of_points(u, v, w, stride, near, far):
-    """Write the codes of the nearest and the farthest of the points, by image coordinates and inverse depth, in blocks.
-
-    A block without points is a hole.
-    """
-    near[:], far[:] = HOLE, 0
-    for i in range(len(w)):
-        row, column = np.int64(np.floor((v[i] + 0.5) / stride)), np.int64(np.floor((u[i] + 0.5) / stride))
-        if not w[i] > 0.0 or row < 0 or column < 0 or row >= near.shape[0] or column >= near.shape[1]:
-            continue
-        code = code_of(1.0 / w[i])
-        if near[row, column] == HOLE or code < near[row, column]:
-            near[row, column] = code
-        far[row, column] = max(far[row, column], code)
-
-
-@serial
-def block_of(point, i, T, camera, around, stride, shape):
-    """Return the row and the column of the block that a point falls into, and its depth; -1 if it is outside.
-
-    `around` is True if columns close a circle, as in a scan, whose depth is the distance.
-    """
+def block_of(point, i, T, camera, stride, shape):
+    """Return the row and the column of the block that a point falls into, and its depth; -1 if it is outside."""
     fx, fy, cx, cy = camera
     rows, columns = shape
     right, down, z = in_sensor(point[i, 0], point[i, 1], point[i, 2], T)
-    distance = np.sqrt(right * right + down * down + z * z) if around else z
-    if not distance > 1e-9:
-        return np.int64(-1), np.int64(-1), distance
-    if around:
-        u, v = (np.arctan2(down, right) + np.pi) * fx, (np.arcsin(z / distance) + 0.5 * np.pi) * fy
-    else:
-        u, v = right / z * fx + cx, down / z * fy + cy
-    if not (-0.5 <= u < (columns + 1) * stride and -0.5 <= v < rows * stride):
-        return np.int64(-1), np.int64(-1), distance
+    if not z > 1e-9:
+        return np.int64(-1), np.int64(-1), z
+    u, v = right / z * fx + cx, down / z * fy + cy
+    if not (-0.5 <= u < columns * stride and -0.5 <= v < rows * stride):
+        return np.int64(-1), np.int64(-1), z
     row, column = np.int64(np.floor((v + 0.5) / stride)), np.int64(np.floor((u + 0.5) / stride))
-    if around and column >= columns:
-        column -= columns
     if row >= rows or column >= columns:
-        return np.int64(-1), np.int64(-1), distance
-    return row, column, distance
+        return np.int64(-1), np.int64(-1), z
+    return row, column, z
 
 
 @serial
-def at_points(point, T, camera, around, stride, near, far, near_by, span, shown):
-    """Write for each point (n, 3) whether the points that a view has in its block lie there.
-
-    The nearest or the farthest of them does, but for `near_by` codes; or the point is between these, and they are at
-    most `span` codes apart. A plane through points of two surfaces has other points, at which there is nothing.
-    """
-    for i in range(len(point)):
-        row, column, distance = block_of(point, i, T, camera, around, stride, near.shape)
-        shown[i] = row >= 0 and far[row, column] > 0
-        if shown[i]:
-            here = code_of(distance)
-            nearest, farthest = np.int64(near[row, column] & LARGEST), np.int64(far[row, column])
-            at_one = abs(here - nearest) <= near_by or abs(here - farthest) <= near_by
-            shown[i] = at_one or (nearest <= here <= farthest and farthest - nearest <= span)
-
-
-@serial
-def vote(point, T, camera, around, stride, near, far, reach, gap, aside, near_by, votes):
+def vote(point, T, camera, stride, near, far, reach, gap, aside, near_by, votes):
     """Write the vote of a view on each point (n, 3), by the blocks of its depth.
 
     A view sees through a point if all depth in the point's own block is farther by more than `gap`, in codes, and all
@@ -165,27 +122,26 @@ def vote(point, T, camera, around, stride, near, far, reach, gap, aside, near_by
     rows, columns = near.shape
     for i in range(len(point)):
         votes[i] = UNKNOWN
-        row, column, distance = block_of(point, i, T, camera, around, stride, near.shape)
+        row, column, depth = block_of(point, i, T, camera, stride, near.shape)
         if row < 0 or far[row, column] == 0:
             continue
-        here, nearest = code_of(distance), np.int64(near[row, column] & LARGEST)
+        here, nearest = code_of(depth), np.int64(near[row, column] & LARGEST)
         part = np.uint8(4 * (SIDES * (SIDES * row // rows) + SIDES * column // columns))
         if here > far[row, column] + gap:
             votes[i] = HIDDEN + part
         elif here >= nearest - near_by:
             votes[i] = SEEN + part
-        elif nearest > here + gap and is_farther(near, row, column, around, reach, here + aside):
+        elif nearest > here + gap and is_farther(near, row, column, reach, here + aside):
             votes[i] = THROUGH + part
 
 
 @serial
-def is_farther(near, row, column, around, reach, code):
+def is_farther(near, row, column, reach, code):
     """Return whether depth in the blocks up to `reach` from one is farther than a code, and known in the next ones."""
     rows, columns = near.shape
     for b in range(row - reach, row + reach + 1):
-        for aside in range(column - reach, column + reach + 1):
-            is_next = abs(b - row) <= 1 and abs(aside - column) <= 1
-            a = (aside + columns) % columns if around else aside
+        for a in range(column - reach, column + reach + 1):
+            is_next = abs(b - row) <= 1 and abs(a - column) <= 1
             if b < 0 or a < 0 or b >= rows or a >= columns:
                 if is_next:
                     return False
