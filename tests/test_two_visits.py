@@ -17,7 +17,7 @@ from semstab import Frame, Intrinsics
 from semstab.data.georeference import Georeference
 from semstab.errors import ConfigError, DataError
 from semstab.statistics.visit_agreement import two_visits
-from semstab.statistics.visits import GONE, NEW, STAYED, VisitedSpots, VisitSampler, by_turns
+from semstab.statistics.visits import GONE, MOVED, NEW, STAYED, VisitedSpots, VisitSampler, by_turns
 from semstab.two_visits import Alignment
 from semstab.two_visits.alignment import between
 
@@ -49,6 +49,17 @@ def visited(first: list[Frame], second: list[Frame]) -> VisitedSpots:
     for visit, frame in by_turns(first, second, (len(first), len(second))):
         sampler.add_of(visit, frame)
     return sampler.visits(("floor", "box", "wet"))
+
+
+def test_what_a_visit_sees_and_sees_through_moved_within_it() -> None:
+    """It is neither gone nor new, though the other visit sees the surface there."""
+    found = visited(flown([]), flown([]))
+    first, second = (
+        dataclasses.replace(votes, seen=np.full_like(votes.seen, 5), through=np.full_like(votes.through, through))
+        for votes, through in zip(found.votes, (0, 4), strict=True)
+    )
+    for votes in ((first, second), (second, first)):
+        assert set(dataclasses.replace(found, votes=votes).change) == {MOVED}
 
 
 @pytest.mark.parametrize(("error", "share"), [("blobs", 0.0), ("none", 0.3), ("border", 0.1)])

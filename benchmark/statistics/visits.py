@@ -138,11 +138,11 @@ class VisitedSpots:
         """
         first, second = self.votes
         change = np.full(len(self.spots.point), UNKNOWN)
-        for votes in self.votes:
-            change[(votes.seen > 0) & votes.moved] = MOVED
         change[first.static & second.static] = STAYED
         change[first.static & second.moved] = GONE
         change[first.moved & second.static] = NEW
+        for votes in self.votes:
+            change[(votes.seen > 0) & votes.moved] = MOVED
         return change
 
     @cached_property
