@@ -12,10 +12,11 @@ from street import DRIVES, Street
 from semstab import Frame, Intrinsics
 from semstab.data.statistics import MisplacedFrame, poses_that_do_not_fit
 from semstab.statistics import Sampler, SpotObservations
+from semstab.statistics.kept_depth import MOST_KEPT, DepthMemory, KeptDepth
 from semstab.statistics.kept_points import KeptPoints
 from semstab.statistics.loops.moving import HIDDEN, SEEN, THROUGH, UNKNOWN, tally
 from semstab.statistics.moving import moving_percent, static_spots
-from semstab.statistics.votes import MOST_KEPT, DepthMemory, KeptDepth, SpotVotes, confirmed, lone, next_to_moved
+from semstab.statistics.votes import SpotVotes, confirmed, lone, next_to_moved
 
 H, W, FOCAL, HEIGHT = 120, 160, 120.0, 20.0
 CAMERA = Intrinsics(FOCAL, FOCAL, (W - 1) / 2, (H - 1) / 2)

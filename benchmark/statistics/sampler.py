@@ -23,9 +23,10 @@ from semstab.core.types import Float64, Int32, Int64, Mask, UInt16
 from semstab.data.frames import Frame
 from semstab.data.labels import fixed
 from semstab.statistics.feature_spots import FeatureObservations, FeatureStore
+from semstab.statistics.kept_depth import DepthMemory, KeptDepth, firm
 from semstab.statistics.kept_points import KeptPoints
 from semstab.statistics.observations import COLUMNS, TYPES, VIEW, SpotObservations, Views
-from semstab.statistics.votes import DepthMemory, KeptDepth, SpotVotes, firm
+from semstab.statistics.votes import SpotVotes
 
 BUDGET = 1 << 19
 """Most answers (spot, view)."""

@@ -19,9 +19,10 @@ import numpy.typing as npt
 from semstab.core.types import Float64, Int64, Mask
 from semstab.data.frames import Frame
 from semstab.statistics.cluster_sums import distinct_rows
+from semstab.statistics.kept_depth import DepthMemory
 from semstab.statistics.observations import SpotObservations
 from semstab.statistics.sampler import BUDGET, STILL, Anchor, Sampler
-from semstab.statistics.votes import DepthMemory, SpotVotes
+from semstab.statistics.votes import SpotVotes
 
 VISITS = 2
 
