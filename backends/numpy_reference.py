@@ -132,7 +132,7 @@ class NumpyReference(NumpyHistory):
 
         An observation is in the history, and sorted for a table.
         """
-        return voxels * (200 + 9 * num_classes) + observations * (90 + (25 * num_classes if soft else 0))
+        return voxels * (180 + 9 * num_classes) + observations * (90 + (25 * num_classes if soft else 0))
 
     def integrate(self, frame: Frame) -> FrameReport:
         """Append the frame's observations to the history, and add them to the evidence so far."""

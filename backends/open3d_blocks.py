@@ -96,15 +96,13 @@ class Open3DBlocks(FusionBackend):
         _device(device)
 
     @staticmethod
-    def expected_bytes(voxels: int, observations: int, num_classes: int, soft: bool = False) -> int:
+    def expected_bytes(voxels: int, observations: int, num_classes: int) -> int:
         """Return the bytes of the attributes of all voxels of a block; frames see a larger share the more there are.
 
-        A grid has room for more; it grows into another one, of two maps, of scores and of labels, one after the other.
-        An empty one has blocks.
+        A grid has room for more, and grows into another one. An empty one has blocks.
         """
-        room = SPARE + (GROWING / 2 if soft else GROWING)
         voxel_bytes = 8 * (num_classes + mask_words(num_classes)) + 48
-        return int(max(room * voxels / (OFTEN * FILLED), LEAST_BLOCKS * 4**3) * voxel_bytes)
+        return int(max((SPARE + GROWING) * voxels / (OFTEN * FILLED), LEAST_BLOCKS * 4**3) * voxel_bytes)
 
     def integrate(self, frame: Frame) -> FrameReport:
         """Fuse one frame: aggregate its pixels to voxels, activate the blocks, update the touched voxels."""
