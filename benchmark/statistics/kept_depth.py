@@ -143,17 +143,22 @@ class DepthMemory:
         num_seen, hidden, through = counts.T.copy()
         seen_at_edge, _, through_at_edge = _tallied(at_edge, fits[depth_views])[0].T
         stays = (seen_at_edge >= LEAST_VOTES) & (through_at_edge == 0)
-        next_to = np.zeros(len(point), np.bool_)
-        alone = SpotVotes(num_seen, hidden, through, at_end, next_to, shares, ~fits, between, self._gap(sigma))
-        rows = np.flatnonzero(fits[found] & ~stays)
+        nothing = np.zeros(len(point), np.bool_)
+        alone = SpotVotes(num_seen, hidden, through, at_end, nothing, shares, ~fits, between, self._gap(sigma))
+        rows, next_to = np.flatnonzero(fits[found] & ~stays), nothing.copy()
         within = NEXT_TO_OF_POINTS if self._of_points else NEXT_TO
         next_to[rows] = alone.take(rows).by_neighbours(point[rows], spacing, within)
-        if self._of_points and spacing > 0:
-            counted = ~lone(point, alone.moved, alone.static, spacing)
-            through, at_end, next_to = through * counted, at_end * counted, next_to & counted
-        if self._of_points:
-            num_seen = np.where(stays & fits[found], seen_at_edge, num_seen)
-        return dataclasses.replace(alone, seen=num_seen, through=through, at_end=at_end, next_to=next_to)
+        told = dataclasses.replace(alone, next_to=next_to)
+        if not self._of_points:
+            return told
+        counted = ~(lone(point, told.moved, told.static, spacing) if spacing > 0 else nothing)
+        return dataclasses.replace(
+            told,
+            seen=np.where(stays & fits[found], seen_at_edge, num_seen),
+            through=through * counted,
+            at_end=at_end * counted,
+            next_to=next_to & counted,
+        )
 
     @property
     def _of_points(self) -> bool:
