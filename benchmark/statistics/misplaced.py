@@ -1,4 +1,4 @@
-"""Views whose poses do not fit those of the others, by their votes on the spots that the others found."""
+"""Views whose poses do not fit the other views, by their votes on the spots that these found."""
 
 from __future__ import annotations
 
@@ -84,7 +84,7 @@ def _of_pairs(votes: npt.NDArray[np.uint8]) -> tuple[Int64, Int64]:
 
 
 def _is_spread(other: Int64, num_decided: Int64) -> Mask:
-    """Return which views (n,) show another surface than that of the spots in a third of the image, by counts (n, p)."""
+    """Return which views (n,) show other surfaces than the spots do in a third of the image, by counts (n, p)."""
     total = num_decided.sum(axis=1)
     counts = num_decided >= np.maximum(MANY, total[:, None]) / (10 * other.shape[1])
     spread = (other > SPREAD * num_decided) & counts

@@ -182,7 +182,7 @@ class SpotVotes:
 
         Of n votes, r see through the spot with the probability b(r; n, q), where q is `false_rate`; the first or the
         last LEAST_AT_END of them with at most 2 q^LEAST_AT_END. A spot is suspect with the probability s(n, q), and
-        LEAST_NEXT_TO of NEIGHBOURS other spots are, too, with that of their mean.
+        LEAST_NEXT_TO of NEIGHBOURS other spots are, too, with the mean of these probabilities.
         """
         from scipy import special
 

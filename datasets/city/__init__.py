@@ -10,7 +10,6 @@ from __future__ import annotations
 import hashlib
 import json
 import threading
-from collections import defaultdict
 from collections.abc import Mapping
 from functools import cached_property
 
@@ -89,7 +88,7 @@ class CityScene(Scene):
         self.rendered: dict[int, Rendered] = {}
         """The rendered frames by index; those that fit into memory."""
         self._lock = threading.Lock()
-        self._of_frame: defaultdict[int, threading.Lock] = defaultdict(threading.Lock)
+        self._of_frame: dict[int, threading.Lock] = {}
 
     def __len__(self) -> int:
         return self._options.frames
@@ -185,7 +184,9 @@ class CityScene(Scene):
         A pass over all frames would drop old ones too early.
         """
         town = self._built()
-        with self._of_frame[index]:  # of all that ask for a frame, one renders it
+        with self._lock:
+            of_frame = self._of_frame.setdefault(index, threading.Lock())
+        with of_frame:  # of all that ask for a frame, one renders it
             if (known := self.rendered.get(index)) is not None:
                 return known
             moving = CityCaster(town.moving(self._share(index) * self._flight.seconds, T[:3, 3]))

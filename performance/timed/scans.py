@@ -99,5 +99,5 @@ def main(
     table = measuring.Table(implementation="", CPU_ms=".1f", faster=".2f")
     ms = {name: float(np.median(np.median(np.array(own), axis=0))) for name, own in taken.items()}
     for name in works:
-        table.add(implementation=name, CPU_ms=ms[name], faster=ms["numpy"] / ms[name])
+        table.add(implementation=name, CPU_ms=ms[name], faster=ms["numpy"] / max(ms[name], 1e-6))
     return table.rows
