@@ -15,7 +15,7 @@ import numpy as np
 from semstab.backends.shared.beliefs import observe_few, observe_row, plogp
 from semstab.backends.shared.keys import PARTITIONS, bounds_of, mix, partition_of
 from semstab.backends.shared.pixel_keys import AHEAD, touch
-from semstab.core.compiled import compiled, parallel, serial
+from semstab.core.compiled import compiled, helper, parallel, serial
 from semstab.data.measures import RECURRENT
 
 ALONE, DENSE = -1, -2
@@ -88,7 +88,7 @@ def enter(records, slots):
         _enter_one(records[row].key, row, slots[partition_of(records[row].key)])
 
 
-@compiled(forceinline=True)
+@compiled(helper=True, forceinline=True)
 def _enter_one(key, row, slots):
     mask = np.uint64(slots.shape[0] - 1)
     at = np.int64(mix(key) & mask)
@@ -124,14 +124,14 @@ def begin(record, key, label, frame):
     record.first_frame = record.last_frame = frame
 
 
-@serial
+@helper
 def observe_dense(record, evidence, sums, pixels, out):
     """Add one observation to a voxel with a dense row; see `observe_row`."""
     observe_row(evidence, sums, pixels, record.op, record.label, np.float64(record.value), out)
     record.label, record.value = np.uint16(out[4]), out[7]
 
 
-@serial
+@helper
 def _observe_dense(record, evidence, s, label, weight, first, last, pixels, out):
     for e in range(first, last):
         s[label[e]] = weight[e]
@@ -140,7 +140,7 @@ def _observe_dense(record, evidence, s, label, weight, first, last, pixels, out)
         s[label[e]] = 0.0
 
 
-@compiled(forceinline=True)
+@compiled(helper=True, forceinline=True)
 def _observe_voxel(record, nodes, ranges, s, few, node, label, weight, first, last, pixels, op, out):
     """Add one observation to a voxel that disagrees with itself, or with the frame; see `observe_row`.
 
@@ -189,7 +189,7 @@ def _observe_voxel(record, nodes, ranges, s, few, node, label, weight, first, la
     out[4] = dominant
 
 
-@compiled(forceinline=True)
+@compiled(helper=True, forceinline=True)
 def _touch_ahead(v, last, row, records, nodes, dense):
     """Ask for the records of later voxels, which lie across two lines of the cache, and for the nodes that follow."""
     soon = max(row[min(v + 2 * AHEAD, last)], 0)
@@ -368,7 +368,7 @@ def update_dense(
         sums[p, 0], sums[p, 1], sums[p, 2], sums[p, 3] = vss, entropy, drift, reached
 
 
-@serial
+@helper
 def _touch_ahead_dense(v, last, row, records, flat, stride, seen, seen_sums):
     later = max(row[min(v + AHEAD, last)], 0)
     touch(records, later)
@@ -380,7 +380,7 @@ def _touch_ahead_dense(v, last, row, records, flat, stride, seen, seen_sums):
         touch(flat, start + k)
 
 
-@serial
+@helper
 def _unroll(record, nodes, evidence):
     """Write the evidence of a voxel without a dense row into an unused one; its nodes are not used again."""
     evidence[:] = 0.0

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 import os
 import shutil
 import subprocess
@@ -9,9 +10,11 @@ import sys
 from collections.abc import Sequence
 from pathlib import Path
 
+import numba
 import pytest
 
 import semstab
+from semstab.core.compiled import helper, serial
 
 IMPORT = """
 from semstab.backends.numba_hash import NumbaHash
@@ -164,3 +167,31 @@ def test_code_is_compiled_again_where_what_it_takes_in_has_changed_or_is_damaged
         file.write_bytes(file.read_bytes()[:40])
     assert called() == "62 0"
     assert called() == "62 1"
+
+
+@helper
+def three_times(x):
+    return 3 * x
+
+
+@serial
+def six_times(x):
+    return 2 * three_times(x)
+
+
+def test_python_cannot_call_a_helper_of_compiled_functions():
+    for _ in range(2):  # before and after it is compiled
+        with pytest.raises(TypeError, match="helper of compiled functions"):
+            three_times(4)
+        assert six_times(4) == 24
+
+
+def test_the_garbage_collector_runs_again_after_a_function_was_compiled_or_failed_to_compile():
+    @serial
+    def cannot_be_compiled(x):
+        return x.nothing_of_this_name
+
+    assert gc.isenabled()
+    with pytest.raises(numba.TypingError):
+        cannot_be_compiled(4)
+    assert gc.isenabled()

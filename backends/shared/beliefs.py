@@ -11,7 +11,7 @@ from numba.core import cgutils, types
 from numba.extending import intrinsic
 
 from semstab.backends.shared.score_loops import DOUBLE, DOUBLES, INT, INT32, INTS, LANES, NUMBERS, spread
-from semstab.core.compiled import compiled, serial
+from semstab.core.compiled import compiled, helper
 
 # A binary logarithm of eight numbers at a time, as instructions for compiled loops: a table and a short series.
 
@@ -183,13 +183,13 @@ def _over_lanes(builder: Any, what: str, kind: Any, values: list[Any], flags: li
     return builder.call(reduce, values, fastmath=flags)
 
 
-@serial
+@helper
 def plogp(p):
     """Return p log2 p, 0 for 0."""
     return p * np.log2(p) if p > 0.0 else 0.0
 
 
-@serial
+@helper
 def js_term(p, q):
     """Return one class's part of the Jensen-Shannon divergence, bits."""
     m = 0.5 * (p + q)
@@ -201,7 +201,7 @@ def js_term(p, q):
     return 0.5 * term
 
 
-@compiled(forceinline=True)
+@compiled(helper=True, forceinline=True)
 def observe_row(evidence, sums, pixels, op, dominant, plogp_before, out):
     """Add one observation to a voxel's dense evidence, seen `op` times before.
 
@@ -229,7 +229,7 @@ def observe_row(evidence, sums, pixels, op, dominant, plogp_before, out):
     out[3], out[4], out[5], out[6], out[7] = dominant, then, squares, -plogp_seen, plogp_after
 
 
-@compiled(forceinline=True)
+@compiled(helper=True, forceinline=True)
 def observe_few(evidence, shares, n, op, most_before, out):
     """Add one observation to a voxel's evidence of the n classes that it or the frame has seen, in any order.
 

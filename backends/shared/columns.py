@@ -52,7 +52,7 @@ def update_rows(rows: Int64, seen: Observed, frame: int, **columns: Any) -> tupl
     return Change.of((seen.pixels.sum(), len(rows), new, drift, vss, entropy, recurrent)), changed
 
 
-@compiled(forceinline=True)
+@compiled(helper=True, forceinline=True)
 def _touch_evidence(flat, masks, r, K, words, label, first, end):
     """Ask for the evidence of a row: of the classes that it has seen, and of those that the frame has seen there."""
     for e in range(first, end):
@@ -64,7 +64,7 @@ def _touch_evidence(flat, masks, r, K, words, label, first, end):
             left &= left - 1
 
 
-@compiled(forceinline=True)
+@compiled(helper=True, forceinline=True)
 def _observe_classes(evidence, classes, s, few, of, op, out):
     """Add one observation to the evidence (K,) of a row; see `observe_row`.
 

@@ -8,7 +8,7 @@ import numpy as np
 import numpy.typing as npt
 
 from semstab.backends.shared.association import back_project, voxel_index
-from semstab.core.compiled import serial
+from semstab.core.compiled import helper, serial
 from semstab.core.types import Int64
 from semstab.data.frames import Frame
 from semstab.data.voxels import INDEX
@@ -69,13 +69,13 @@ def mix(key):
     return x
 
 
-@serial
+@helper
 def partition_of(key):
     """Return the partition of a key: the top 6 bits of its hash."""
     return np.int64(mix(key) >> np.uint64(58))
 
 
-@serial
+@helper
 def bounds_of(number):
     """Return the bounds (n + 1,) of consecutive parts with `number` (n,) elements: each part's first, and the end."""
     bounds = np.zeros(number.shape[0] + 1, np.int64)

@@ -11,7 +11,7 @@ import numpy as np
 
 from semstab.backends.shared.keys import PARTITIONS, bounds_of
 from semstab.backends.shared.tile_loops import coordinates, key_of
-from semstab.core.compiled import parallel, serial
+from semstab.core.compiled import helper, parallel, serial
 
 DIGIT_BITS = 10
 
@@ -53,7 +53,7 @@ def _layout(low, high):
     return lowest, shift
 
 
-@serial
+@helper
 def _sort(word, count, word2, count2, bits, histogram):
     """Sort by the lowest `bits` bits, as many at a time as the histogram has room for; whether into the second pair."""
     flipped = False

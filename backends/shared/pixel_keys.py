@@ -10,7 +10,7 @@ from numba.core import cgutils, types
 from numba.extending import intrinsic
 
 from semstab.backends.shared.keys import HALF
-from semstab.core.compiled import compiled, serial
+from semstab.core.compiled import compiled, helper, serial
 from semstab.core.types import Int64, Mask
 from semstab.data.frames import Frame
 
@@ -18,13 +18,13 @@ FACE = 2.0**30
 """Index from which on rounding may move a point across a face by more than the margin of one millionth."""
 
 
-@serial
+@helper
 def in_voxels(r0, r1, r2, t, x, y, z, size):
     """Return a coordinate of a point of the camera in the map, in voxels; the order of operations is the protocol's."""
     return (((r0 * x + r1 * y) + r2 * z) + t) / size
 
 
-@serial
+@helper
 def exact_keys_of_row(depth, labels, ray_x, ray_y, T, size, ox, oy, oz, ignore, out):
     """Return packed keys of a row of pixels, -1 where a pixel does not count.
 
@@ -51,7 +51,7 @@ def exact_keys_of_row(depth, labels, ray_x, ray_y, T, size, ox, oy, oz, ignore, 
     return lost
 
 
-@serial
+@helper
 def exact_keys_of_points(points, depth, labels, T, size, ox, oy, oz, ignore, out):
     """Return packed keys of points (n, 3) of a scan, as `exact_keys_of_row` of pixels; where depth is 0 there is none.
 
@@ -75,7 +75,7 @@ def exact_keys_of_points(points, depth, labels, T, size, ox, oy, oz, ignore, out
     return lost
 
 
-@serial
+@helper
 def packed_near(a, b, c):
     """Return the packed key of a voxel given as whole numbers from the origin, or -1 if it is out of reach."""
     low, high = -float(HALF), float(HALF - 1)
@@ -116,7 +116,7 @@ def drawn_pixels(depth, wanted, ray_x, ray_y, pose, size, odd, one_in, out):
         drawn_row(depth[v], wanted[v], ray_x, ray_y[v], pose, size, odd, one_in, out[v])
 
 
-@serial
+@helper
 def drawn_row(depth, wanted, ray_x, ray_y, pose, size, odd, one_in, out):
     """Mark pixels of a row; without a branch, for vectors."""
     for u in range(depth.shape[0]):
@@ -124,7 +124,7 @@ def drawn_row(depth, wanted, ray_x, ray_y, pose, size, odd, one_in, out):
         out[u] = wanted[u] & _may_be_drawn(ray_x[u] * d, ray_y * d, d, pose, size, odd, one_in)
 
 
-@serial
+@helper
 def _may_be_drawn(x, y, z, pose, size, odd, one_in):
     (r00, r01, r02, t0), (r10, r11, r12, t1), (r20, r21, r22, t2) = pose
     a = in_voxels(r00, r01, r02, t0, x, y, z, size)
@@ -137,7 +137,7 @@ def _may_be_drawn(x, y, z, pose, size, odd, one_in):
     return (not clear) | (((mixed >> 40) & (one_in - 1)) == 0)
 
 
-@serial
+@helper
 def _is_clear(q):
     """Return whether a coordinate in voxels is not close to a face, and near enough to tell."""
     part = q - np.floor(q)
@@ -189,7 +189,7 @@ def ask_for(builder: Any, pointer: Any) -> None:
 # Doubles as the integers of the same bits, in compiled loops.
 
 
-@compiled(forceinline=True)
+@compiled(helper=True, forceinline=True)
 def bits_of(value):
     """Return the bits of a double as int64; the bits of non-negative numbers sort like the numbers."""
     return np.float64(value).view(np.int64)

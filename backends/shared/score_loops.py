@@ -14,7 +14,7 @@ from numba.extending import intrinsic
 from semstab.backends.shared.keys import PARTITIONS, mix, partition_of
 from semstab.backends.shared.pixel_keys import exact_keys_of_points, exact_keys_of_row
 from semstab.backends.shared.tile_loops import runs_of
-from semstab.core.compiled import parallel, serial
+from semstab.core.compiled import helper, parallel
 
 # Sums over the scores of pixels, eight classes at a time, for compiled loops.
 #
@@ -243,7 +243,7 @@ def sum_scores(
             spread[band, partition_of(own_key[e])] += 1
 
 
-@serial
+@helper
 def _add_stretch(scores, at, K, stride, words, scale, run_word, run_end, table, table_row, key, count, sums, n):
     """Add a stretch of pixels to their n voxels; return the number of voxels after it, or -1 without room.
 

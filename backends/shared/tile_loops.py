@@ -14,7 +14,7 @@ import numpy as np
 
 from semstab.backends.shared.keys import HALF, partition_of
 from semstab.backends.shared.pixel_keys import bits_of, exact_keys_of_points, exact_keys_of_row, touch
-from semstab.core.compiled import compiled, parallel, serial
+from semstab.core.compiled import compiled, helper, parallel, serial
 
 LANES = 8
 """Words that a stretch is a multiple of, and room that its runs need."""
@@ -56,7 +56,7 @@ GOLDEN = np.uint64(0x9E3779B97F4A7C15)
 SHIFT = np.uint64(64 - TABLE_BITS)
 
 
-@compiled(fastmath={"contract"}, forceinline=True)
+@compiled(helper=True, fastmath={"contract"}, forceinline=True)
 def _words_fused(depth, labels, ignore, ray_a, ray_b, ray_c, a0, b0, c0, ta, tb, tc, face, out):
     """Return the words of pixels; and any doubt, see `keys_fused`.
 
@@ -85,7 +85,7 @@ def _split(points, x, y, z):
         x[u], y[u], z[u] = points[u, 0], points[u, 1], points[u, 2]
 
 
-@compiled(fastmath={"contract"}, forceinline=True)
+@compiled(helper=True, fastmath={"contract"}, forceinline=True)
 def _words_of_points_fused(x, y, z, depth, labels, ignore, M, ta, tb, tc, face, out):
     """Return the words of points of a scan, and any doubt, as `_words_fused` of pixels; M (3, 3) is R / r."""
     a0, a1, a2, b0, b1, b2 = M[0, 0], M[0, 1], M[0, 2], M[1, 0], M[1, 1], M[1, 2]
@@ -153,7 +153,7 @@ def _rays(ray_x, ray_y, T, size, across):
     return down
 
 
-@compiled(forceinline=True)
+@compiled(helper=True, forceinline=True)
 def _words_of_stretch(
     depth, labels, ray_x, ray_y, T, size, origin, corner, ignore, ray_a, ray_b, ray_c, down, start, face, keys, out
 ):  # fmt: skip
@@ -171,7 +171,7 @@ def _words_of_stretch(
     return lost
 
 
-@serial
+@helper
 def _words_of_keys(keys, labels, corner, out):
     """Write the words of packed keys and labels; return whether one is out of the reach of words."""
     lost = 0
@@ -182,7 +182,7 @@ def _words_of_keys(keys, labels, corner, out):
     return lost
 
 
-@serial
+@helper
 def _keep_columns(words, columns, corner):
     """Take out the words outside of columns, given as packed keys count."""
     for u in range(words.shape[0]):
@@ -191,7 +191,7 @@ def _keep_columns(words, columns, corner):
         words[u] = words[u] if inside else -1
 
 
-@serial
+@helper
 def _from_corner(key, corner):
     mask = 2 * HALF - 1
     return (key >> 42) - corner[0], ((key >> 21) & mask) - corner[1], (key & mask) - corner[2]
@@ -203,13 +203,13 @@ def coordinates(word):
     return (word >> 48) & 0xFFFF, (word >> 32) & 0xFFFF, (word >> 16) & 0xFFFF
 
 
-@serial
+@helper
 def key_of(a, b, c, corner):
     """Return the packed key of a word's coordinates."""
     return ((a + corner[0]) << 42) | ((b + corner[1]) << 21) | (c + corner[2])
 
 
-@compiled(forceinline=True)
+@compiled(helper=True, forceinline=True)
 def _enter_runs(word, run_word, run_end, table, table_count, entry, count, n):
     """Put runs of a stretch of words into the table; those that give way become entries, whose number is returned."""
     runs = runs_of(word, run_word, run_end)
@@ -227,7 +227,7 @@ def _enter_runs(word, run_word, run_end, table, table_count, entry, count, n):
     return n
 
 
-@serial
+@helper
 def _flush(table, table_count, word, count, n):
     for at in range(table.shape[0]):
         word[n], count[n] = table[at], table_count[at]
@@ -281,7 +281,7 @@ def find_words(
     return _total(entries, high, num_classes)
 
 
-@serial
+@helper
 def _touch_points(points, depth, labels, first, end):
     """Ask for the stretch of points that comes next."""
     if first + COLUMNS <= end:
@@ -334,7 +334,7 @@ def find_words_of_points(
     return _total(entries, high, num_classes)
 
 
-@serial
+@helper
 def _finish(table, table_count, word, count, n, lost, corner, partition, spread, low, high):
     """Empty the table into a band's n entries; return the number of entries that remain, see `_describe`.
 

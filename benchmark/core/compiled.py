@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import gc
 import os
 import stat
 import sys
@@ -15,6 +16,7 @@ from typing import Any
 
 import numba as nb
 import numpy as np
+from numba.core import event
 from numba.core.caching import FunctionCache, IndexDataCacheFile
 from numba.core.dispatcher import Dispatcher
 
@@ -25,15 +27,25 @@ if sys.platform == "linux":  # the TBB that Open3D loads is too old for numba, w
     settings.THREADING_LAYER_PRIORITY = ["omp", "tbb", "workqueue"]
 
 
-def compiled(**options: Any) -> Callable[[Any], Any]:
+def compiled(*, helper: bool = False, **options: Any) -> Callable[[Any], Any]:
     """Return a decorator that compiles a function at its first call, and stores the code for later processes.
 
     The code is stored in __pycache__ next to the source, below HOME, or below the temporary folder. Without such a
     folder, each process compiles again.
+
+    Args:
+        helper: Only compiled functions call the function, Python does not: what a call from Python needs would take a
+            third of the time to compile it.
+        options: Options of `numba.njit`.
     """
+    if helper:
+        options |= {"no_cpython_wrapper": True, "no_cfunc_wrapper": True}
 
     def decorate(function: Any) -> Any:
         dispatcher = nb.njit(error_model="numpy", nogil=True, **options)(function)
+        if helper:
+            dispatcher._insert = _tell_python_nothing
+            dispatcher._compile_for_args = _refuse
         try:
             dispatcher._cache = _Cache(function)
         except RuntimeError:  # there is no folder for its cache
@@ -44,6 +56,15 @@ def compiled(**options: Any) -> Callable[[Any], Any]:
         return dispatcher
 
     return decorate
+
+
+def _tell_python_nothing(*_: Any, **__: Any) -> None:
+    """Let no call from Python find compiled code, which has no way in."""
+
+
+def _refuse(*_: Any, **__: Any) -> None:
+    """Raise TypeError for a call from Python."""
+    raise TypeError("this is a helper of compiled functions; decorate it with `serial` to call it from Python")
 
 
 class _Cache(FunctionCache):
@@ -91,7 +112,30 @@ def _stamp(function: Any, visited: frozenset[Any]) -> tuple[Any, ...]:
     return tuple(stamp)
 
 
+class _RestingCollector(event.Listener):
+    """Lets the garbage collector rest while numba compiles, which makes many objects and no garbage in cycles."""
+
+    def __init__(self) -> None:
+        self._depth, self._was_enabled = 0, False
+
+    def on_start(self, event: Any) -> None:
+        """Stop the collector when the outermost function begins to compile."""
+        if self._depth == 0:
+            self._was_enabled = gc.isenabled()
+            gc.disable()
+        self._depth += 1
+
+    def on_end(self, event: Any) -> None:
+        """Let the collector run again when the outermost function is compiled, or has failed to compile."""
+        self._depth -= 1
+        if self._depth == 0 and self._was_enabled:
+            gc.enable()
+
+
+event.register("numba:compile", _RestingCollector())  # type: ignore[no-untyped-call]
+
 serial = compiled()
+helper = compiled(helper=True)
 parallel = compiled(parallel=True)
 
 

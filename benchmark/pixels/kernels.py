@@ -8,10 +8,10 @@ from typing import Any
 import numba as nb
 import numpy as np
 
-from semstab.core.compiled import compiled, parallel, serial
+from semstab.core.compiled import compiled, helper, parallel, serial
 
 
-@serial
+@helper
 def _seen_at(d: float, ray_x: float, ray_y: float, motion: Any, camera: Any) -> tuple[float, float, float]:
     """Return the column, row and depth in the other camera of the point at depth d along a ray.
 
@@ -25,7 +25,7 @@ def _seen_at(d: float, ray_x: float, ray_y: float, motion: Any, camera: Any) -> 
     return column, row, z if (d > 0.0) & (d < math.inf) & (z > 0.0) else 0.0
 
 
-@serial
+@helper
 def _look_up_row(
     depth: Any, ray_x: Any, ray_y: float, motion: Any, camera: Any, shape: Any, index: Any, z: Any
 ) -> None:

@@ -6,7 +6,7 @@ import numpy as np
 
 from semstab.backends.shared.keys import mix
 from semstab.backends.shared.pixel_keys import in_voxels
-from semstab.core.compiled import serial
+from semstab.core.compiled import helper, serial
 
 NO_VOXEL, AGREES, CONTRADICTS = 0, 1, 2
 """Values of a picture of contradictions, the first one of a picture of drift as well."""
@@ -76,7 +76,7 @@ def first_of_blocks(index, shift):
     return first[:count].copy()
 
 
-@serial
+@helper
 def make_table(n):
     """Return an empty table for the rows of n keys, see `find`."""
     bits = 1
@@ -85,7 +85,7 @@ def make_table(n):
     return np.full(1 << bits, -1, np.int32)
 
 
-@serial
+@helper
 def key_of(x, y, z):
     """Return one number for a voxel, different for voxels within 2^20 of each other along each axis."""
     low = (1 << AXIS) - 1

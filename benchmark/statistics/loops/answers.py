@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from semstab.core.compiled import serial
+from semstab.core.compiled import helper, serial
 from semstab.statistics.loops.cells import mixed
 from semstab.statistics.loops.surface import depths_around, in_sensor, inverse, inverse_of, slope, slopes, smoothed
 
@@ -16,7 +16,7 @@ EDGE, JUMP = 4.0, 0.01
 inverse depth, is an edge."""
 
 
-@serial
+@helper
 def steps(before, here, after):
     """Return by how much inverse depth may change from a pixel to those before and after it; without branches.
 
@@ -31,7 +31,7 @@ def steps(before, here, after):
     return 0.0 if nothing else left, 0.0 if nothing else right
 
 
-@serial
+@helper
 def outside(here, left, right, up, down, dx, dy, w):
     """Return how far inverse depth w is from the range that a pixel's surface may have at (dx, dy) from its centre.
 
@@ -44,7 +44,7 @@ def outside(here, left, right, up, down, dx, dy, w):
     return max(low - w, w - high, 0.0)
 
 
-@serial
+@helper
 def misfit(around, dx, dy, z):
     """Return how much nearer than depth z a pixel's surface is at (dx, dy) from its centre, and how far it is at least.
 
@@ -56,14 +56,14 @@ def misfit(around, dx, dy, z):
     return error, outside(here, left, right, up, down, dx, dy, 1.0 / z) * z
 
 
-@serial
+@helper
 def misfit_on_plane(depth, row, column, dx, dy, z, noise):
     """Return the same two numbers by a plane through the pixels around."""
     error = smoothed(depth, row, column, inverse(depth, row, column), dx, dy, noise) * z - 1.0
     return error, abs(error)
 
 
-@serial
+@helper
 def in_view(point, camera, T, shape, spot, x, y, z):
     """Find the spots that fall on a pixel, in front of the camera, their image coordinates and depth; return how many.
 
@@ -121,7 +121,7 @@ def project(point, depth, camera, T, noise, allowed, spot, pixel, x, y, error, r
     return found
 
 
-@serial
+@helper
 def fitting_pixel(depth, row, column, x, y, z, noise, allowed):
     """Return the first of the next pixels towards (x, y) that shows the surface of a spot, and its `room`.
 
@@ -140,7 +140,7 @@ def fitting_pixel(depth, row, column, x, y, z, noise, allowed):
     return row, column, 1.0
 
 
-@serial
+@helper
 def towards(dx, dy, turn):
     """Return the step to the next pixel towards (dx, dy): along the longer of them, the shorter, or both."""
     a, b = np.int64(1) if dx > 0.0 else np.int64(-1), np.int64(1) if dy > 0.0 else np.int64(-1)
@@ -149,7 +149,7 @@ def towards(dx, dy, turn):
     return (a, np.int64(0)) if (turn == 0) == (abs(dx) > abs(dy)) else (np.int64(0), b)
 
 
-@serial
+@helper
 def own_label(labels, unlabelled, row, column, K):
     """Return the label of a pixel: K for none, K + 1 for a pixel that is left out and does not answer."""
     label = np.int64(labels[row, column])
@@ -158,20 +158,20 @@ def own_label(labels, unlabelled, row, column, K):
     return np.int64(K) if unlabelled.shape[0] and unlabelled[row, column] else np.int64(K + 1)
 
 
-@serial
+@helper
 def aside(side):
     """Return a step of one pixel to one of four sides."""
     sign = np.int64(1) if side & 2 else np.int64(-1)
     return (sign, np.int64(0)) if side & 1 else (np.int64(0), sign)
 
 
-@serial
+@helper
 def first_side(seed, hashed):
     """Return the side at which the second answer for a spot is looked for first, 0 to 3: by frame and coarse cell."""
     return np.int64(mixed(np.uint32(np.uint32(seed) ^ hashed)) & np.uint32(3))
 
 
-@serial
+@helper
 def two_labels(labels, unlabelled, row, column, step_x, step_y, K):
     """Return the labels of the next two pixels in a direction, K or more if one has none."""
     first = own_label(labels, unlabelled, row + step_y, column + step_x, K)
@@ -179,7 +179,7 @@ def two_labels(labels, unlabelled, row, column, step_x, step_y, K):
     return (first, last) if max(first, last) < K else (np.int64(K), np.int64(K))
 
 
-@serial
+@helper
 def shows(depth, row, column, here, along_x, along_y, dx, dy, allowed):
     """Return whether a pixel (dx, dy) away from another shows the surface that goes on there with these slopes."""
     there, expected = inverse(depth, row + dy, column + dx), here + along_x * dx + along_y * dy
@@ -187,7 +187,7 @@ def shows(depth, row, column, here, along_x, along_y, dx, dy, allowed):
     return there > 0.0 and abs(there - expected) <= slack * here
 
 
-@serial
+@helper
 def squared(dx, dy, here, fx, fy):
     """Return the squared distance, metres^2 across the ray, of a point (dx, dy) pixels away at an inverse depth."""
     return ((dx / fx) ** 2 + (dy / fy) ** 2) / (here * here)

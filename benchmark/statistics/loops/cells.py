@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from semstab.core.compiled import serial
+from semstab.core.compiled import helper, serial
 
 BITS = 21
 """Bits of a coarse cell's index along each axis in its key."""
@@ -24,7 +24,7 @@ PHASE = 25 / 64
 of models do not lie in their faces; a multiple of the 64ths in which a log tells places, see `SpotObservations`."""
 
 
-@serial
+@helper
 def mixed(number):
     """Return a hash of 32 bits, lowbias32 (Wellons 2018, Prospecting for Hash Functions)."""
     h = np.uint32(number)
@@ -40,13 +40,13 @@ def hash_cell(x, y, z):
     return mixed(np.uint32(weighted))
 
 
-@serial
+@helper
 def fraction(number):
     """Return a number from 0 to 1, without both, from a hash."""
     return (np.float64(mixed(number)) + 0.5) / 4294967296.0
 
 
-@serial
+@helper
 def slot_of(table, key):
     """Return where a key is looked for first in a table with open addressing, of a power of 2 slots, at most 2^24.
 
@@ -55,7 +55,7 @@ def slot_of(table, key):
     return np.int64(np.uint64(key) * GOLDEN >> np.uint64(40) & np.uint64(len(table) - 1))
 
 
-@serial
+@helper
 def is_new(table, key, added):
     """Return whether a table with open addressing lacks a key, which may then be added."""
     slot = slot_of(table, key)
@@ -68,13 +68,13 @@ def is_new(table, key, added):
     return True
 
 
-@serial
+@helper
 def key_of(a, b, c):
     """Return the key of a cell by its indices from the lowest ones on, each below SPAN."""
     return np.int64(a) << (2 * BITS) | np.int64(b) << BITS | np.int64(c)
 
 
-@serial
+@helper
 def cell_of(x, y, z, edge):
     """Return the coarse cell of a point; no face of a cell lies in a plane such as z = 0, where floors lie."""
     return (
@@ -91,7 +91,7 @@ def fill(point, edge, low, table):
         is_new(table, key_of(a - low[0], b - low[1], c - low[2]), True)
 
 
-@serial
+@helper
 def add_spot(px, py, pz, edge, share, low, table, point, hashed, n):
     """Add a point as spot n if its coarse cell is in the sample and has none; return how many spots there are."""
     i, j, k = cell_of(px, py, pz, edge)

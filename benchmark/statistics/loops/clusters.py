@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from semstab.core.compiled import CHUNKS, serial
+from semstab.core.compiled import CHUNKS, helper, serial
 
 TIE = 1e-12
 """Sums of evidence that differ by no more are equal."""
@@ -45,7 +45,7 @@ def _observations(log, first, T, number, active, x, total, squares, squared_norm
     return A
 
 
-@serial
+@helper
 def _label(total, active, A, fused):
     """Return the dominant class.
 
@@ -61,7 +61,7 @@ def _label(total, active, A, fused):
     return best
 
 
-@serial
+@helper
 def _label_without(total, x, observation, A):
     """Return the dominant class of the other observations."""
     best, top = 0, total[0] - x[observation]
@@ -72,7 +72,7 @@ def _label_without(total, x, observation, A):
     return best
 
 
-@serial
+@helper
 def _add_truth(sums, base, x, first, T, group, truth, likely, total, active, A, label, without, mean, columns):
     """Add the sums of right labels of a voxel: the fused label without one frame, and each observation by itself.
 

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from semstab.core.compiled import serial
+from semstab.core.compiled import helper, serial
 from semstab.statistics.loops.surface import in_sensor, inverse
 
 STEP, LOWEST = 0.0006, -7.0
@@ -23,13 +23,13 @@ SIDES = 3
 """Parts of an image's side; a vote is stored as its kind plus 4 times the number of the part in which the spot is."""
 
 
-@serial
+@helper
 def code_of(depth):
     """Return the code of a depth in metres."""
     return min(max(np.int64((np.log(depth) - LOWEST) / STEP + 0.5), np.int64(0)) + 1, LARGEST)
 
 
-@serial
+@helper
 def take_extremes(rows, nearest, farthest, most):
     """Take the nearest and the farthest depth of each column of four rows, and `most`: the same, endless at a hole."""
     first, second, third, fourth = rows
@@ -94,7 +94,7 @@ def on_one_surface(point, T, camera, depth, reach, most, near_by, firm):
         firm[i] = low > 0.0 and (high - low <= most * low or 2 * same > (2 * reach + 1) ** 2)
 
 
-@serial
+@helper
 def block_of(point, i, T, camera, stride, shape):
     """Return the row and the column of the block that a point falls into, and its depth; -1 if it is outside."""
     fx, fy, cx, cy = camera
@@ -135,7 +135,7 @@ def vote(point, T, camera, stride, near, far, reach, gap, aside, near_by, votes)
             votes[i] = THROUGH + part
 
 
-@serial
+@helper
 def is_farther(near, row, column, reach, code):
     """Return whether depth in the blocks up to `reach` from one is farther than a code, and known in the next ones."""
     rows, columns = near.shape

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from semstab.core.compiled import serial
+from semstab.core.compiled import helper, serial
 from semstab.statistics.loops.cells import PHASE, SPAN, add_spot, fraction, hash_cell, is_new, key_of, mixed, slot_of
 from semstab.statistics.loops.surface import area, depths_around, in_world, inverse, inverse_of, slope, slopes, smoothed
 
@@ -21,14 +21,14 @@ def number_of(expected, chance):
     return np.int64(min(np.floor(expected + chance), MOST_PLACES))
 
 
-@serial
+@helper
 def draw_place(top, left, stride, number):
     """Draw a place in a block of pixels: its hash, which follows `number` in a chain, and its image coordinates."""
     number = mixed(np.uint32(number + np.uint32(0x9E3779B9)))
     return number, left + stride * fraction(np.uint32(number ^ np.uint32(0x27D4EB2F))), top + stride * fraction(number)
 
 
-@serial
+@helper
 def places_of_block(depth, camera, row, column, stride, per_area, chance):
     """Return how many places to look at in a block of pixels, by the area that it shows at a pixel."""
     fx, fy, cx, cy = camera
@@ -40,7 +40,7 @@ def places_of_block(depth, camera, row, column, stride, per_area, chance):
     return number_of(per_area * block_area, chance)
 
 
-@serial
+@helper
 def look_at(depth, camera, T, edge, share, low, u, v, shown, here, cell, keys, rows):
     """Find the inverse depth of the pixels of places, and the keys of the coarse cells that they show.
 
@@ -73,13 +73,13 @@ def look_at(depth, camera, T, edge, share, low, u, v, shown, here, cell, keys, r
     return n
 
 
-@serial
+@helper
 def index_from(coordinate, low):
     """Return the index, from the lowest one on, of the cell of a coordinate in edges of cells; see `look_at`."""
     return np.int32(min(max(np.floor(coordinate + PHASE) - low, -1.0), np.float64(SPAN)))
 
 
-@serial
+@helper
 def add_spots(
     depth, camera, T, allowed, edge, share, low, table, point, hashed, n, u, v, shown, here, cell, keys, rows
 ):

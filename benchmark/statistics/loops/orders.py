@@ -14,7 +14,7 @@ from numba.extending import intrinsic
 from semstab.backends.shared.beliefs import js_term, plogp_of
 from semstab.backends.shared.keys import mix
 from semstab.backends.shared.score_loops import DOUBLES
-from semstab.core.compiled import CHUNKS, serial
+from semstab.core.compiled import CHUNKS, helper, serial
 
 GOLDEN = np.uint64(0x9E3779B97F4A7C15)
 """The distance between successive states of splitmix64."""
@@ -39,7 +39,7 @@ def _plogp_of_eight(_typing: Any, values: Any, _at: Any) -> Any:
     return types.void(values, types.intp), generate
 
 
-@serial
+@helper
 def _drifts(x, A, T, drift):
     """Write the sums of drifts, bits, of observations x (A, T) in the turns of their order to drift (TURNS,).
 
@@ -94,7 +94,7 @@ def draw_streams(index, seed, streams):
         streams[i] = state
 
 
-@serial
+@helper
 def _shuffle(order, T, state):
     """Write a random order of T observations to order (T,), by splitmix64, whose state (1,) it advances."""
     for t in range(T):

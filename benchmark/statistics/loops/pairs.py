@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from semstab.core.compiled import serial
+from semstab.core.compiled import helper, serial
 
 
 @serial
@@ -145,7 +145,7 @@ def add_similarity(bounds, log, cube, group, groups, products, columns, sums):
             total[met[i]] = 0.0
 
 
-@serial
+@helper
 def _with_itself(starts, label, weight, one, products):
     """Return the product of an observation's point with itself."""
     squared_norm = 0.0

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from semstab.core.compiled import serial
+from semstab.core.compiled import helper, serial
 from semstab.statistics.loops.answers import aside, first_side, own_label, squared, two_labels
 from semstab.statistics.loops.cells import add_spot, fraction, mixed
 from semstab.statistics.loops.new_spots import number_of
@@ -90,7 +90,7 @@ def surface(grid, u, v, w, x, y, reach, around):
     return there, np.sqrt(residual), nearest, least, along_x * scale, along_y * scale
 
 
-@serial
+@helper
 def shown_by(grid, u, v, w, at, camera, around, reach, allowed):
     """Return the area that a pixel at a point shows, m^2, and the plane through the points around it.
 
@@ -235,7 +235,7 @@ def answer_sparse(
     return n
 
 
-@serial
+@helper
 def next_point(grid, u, v, w, at, goal_x, goal_y, reach, around, allowed, steep):
     """Return the point nearest to a goal in the image that shows the surface of point `at`, not `at`; -1 without any.
 

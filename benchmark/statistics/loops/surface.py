@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from semstab.core.compiled import serial
+from semstab.core.compiled import helper, serial
 
 STEEPEST = 32.0
 """Largest area that a pixel shows, in those that it would show if the surface faced it."""
@@ -17,14 +17,14 @@ AROUND, LEAST_AROUND = 2, 6.0
 """Pixels to each side through which a plane is laid where a spot is found, and the least number of them."""
 
 
-@serial
+@helper
 def depth_at(depth, row, column):
     """Return the depth of a pixel, 0 outside of the image."""
     inside = (row >= 0) & (column >= 0) & (row < depth.shape[0]) & (column < depth.shape[1])
     return np.float64(depth[row, column]) if inside else 0.0
 
 
-@serial
+@helper
 def depths_around(depth, row, column):
     """Return the depth of a pixel, and of those before and after it in its row and in its column; 0 outside."""
     if 0 < row < depth.shape[0] - 1 and 0 < column < depth.shape[1] - 1:
@@ -36,20 +36,20 @@ def depths_around(depth, row, column):
     return depth_at(depth, row, column), *in_row, *in_column
 
 
-@serial
+@helper
 def inverse(depth, row, column):
     """Return the inverse depth of a pixel; 0 without valid depth and outside of the image."""
     return inverse_of(depth_at(depth, row, column))
 
 
-@serial
+@helper
 def inverse_of(depth):
     """Return inverse depth, 0 without valid depth; without branches, as `slope`, for vectors."""
     valid = (depth > 0.0) & (depth < np.inf)
     return (1.0 if valid else 0.0) / (depth if valid else 1.0)
 
 
-@serial
+@helper
 def slope(before, here, after):
     """Return the slope of inverse depth by the minmod limiter: the smaller of both sides, 0 at an edge or a peak."""
     left, right = here - before, after - here
@@ -60,7 +60,7 @@ def slope(before, here, after):
     return smaller if (before > 0.0) & (after > 0.0) else only
 
 
-@serial
+@helper
 def slopes(depth, row, column, here, span=1):
     """Return the slopes of inverse depth along a row and along a column, from pixels `span` pixels away."""
     return (
@@ -87,7 +87,7 @@ def second_differences(depth, stride, found):
     return n
 
 
-@serial
+@helper
 def smoothed(depth, row, column, here, dx, dy, allowed):
     """Return inverse depth at (dx, dy) from a pixel's centre, by a plane through the pixels around it.
 
@@ -122,7 +122,7 @@ def smoothed(depth, row, column, here, dx, dy, allowed):
     return here + mw + (cyy * cxw - cxy * cyw) / det * (dx - mx) + (cxx * cyw - cxy * cxw) / det * (dy - my)
 
 
-@serial
+@helper
 def area(here, along_x, along_y, x, y, fx, fy):
     """Return the area of the surface that a pixel at ray (x, y, 1) shows, m^2, from inverse depth and its slopes.
 
@@ -153,7 +153,7 @@ def mean_area(depth, camera, stride, span):
     return total / max(count, 1)
 
 
-@serial
+@helper
 def in_world(x, y, z, T):
     """Return a point of the sensor in the world."""
     return (
@@ -163,7 +163,7 @@ def in_world(x, y, z, T):
     )
 
 
-@serial
+@helper
 def in_sensor(px, py, pz, T):
     """Return a point of the world in the axes of the sensor."""
     a, b, c = px - T[0, 3], py - T[1, 3], pz - T[2, 3]
