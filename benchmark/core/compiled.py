@@ -8,6 +8,7 @@ import os
 import stat
 import sys
 import tempfile
+import time
 import types
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
@@ -142,22 +143,26 @@ parallel = compiled(parallel=True)
 CHUNKS = 64
 """Number of chunks of a loop over voxels, for any number of threads."""
 
+SHORT = 0.002
+"""Seconds of a loop, about, up to which it starts no threads: each takes a millisecond to start and to end."""
+
 
 def in_chunks(loop: Any, *arguments: Any) -> None:
     """Run a compiled loop once for each chunk, in as many threads as numba may use, with the same numbers for any.
 
     Such loops hold no lock. numba's own parallel form of them would take three times as long to compile.
     """
-    if (threads := nb.get_num_threads()) == 1:
-        for chunk in range(CHUNKS):
-            loop(chunk, *arguments)
-        return
-    left = iter(range(CHUNKS))
+    threads, left = nb.get_num_threads(), iter(range(CHUNKS))
 
     def take_chunks() -> None:
         for chunk in left:
             loop(chunk, *arguments)
 
+    started = time.perf_counter()
+    loop(next(left), *arguments)
+    if threads == 1 or CHUNKS * (time.perf_counter() - started) < SHORT:
+        take_chunks()
+        return
     with ThreadPoolExecutor(threads - 1) as pool:
         others = [pool.submit(take_chunks) for _ in range(threads - 1)]
         take_chunks()
