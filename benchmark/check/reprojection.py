@@ -6,6 +6,7 @@ import dataclasses
 import math
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, field
+from itertools import chain
 from typing import Any, NamedTuple, cast
 
 import numpy as np
@@ -37,6 +38,8 @@ PAIR_POINTS = 20
 """Points of a pair of frames that are seen again, from which on its error counts."""
 
 Pair = tuple[int, int]
+Lens = tuple[float, float, float, float]
+"""fx, fy, cx, cy in pixels."""
 Ids = npt.NDArray[Any]
 
 
@@ -152,22 +155,25 @@ def frames_at(
 
 
 class Placed(NamedTuple):
-    """A view as a convention reads it.
+    """A view as a convention reads it, in whatever pairs it is.
 
     Attributes:
         pose: (4, 4) camera-to-world.
         back: (3, 3) the inverse of its rotation.
         camera: Intrinsics.
-        power, rays: How depth of its file becomes planar, see `View.rays`.
         points: (3, N) its sample in the camera's axes.
+        image: What `find_matches` takes of it to look points of others up: the lens, (H, W) the stored depth, and how
+            that becomes planar, see `View.rays`.
     """
 
     pose: Float64
     back: Float64
-    camera: Intrinsics
-    power: int
-    rays: Intrinsics
     points: Float64
+    image: tuple[Lens, Float32, int, Lens]
+
+    def seen_from(self, other: Placed) -> tuple[Any, ...]:
+        """Return this sample, and how it turns and moves from this camera's axes to another view's, metres."""
+        return self.points, other.back @ self.pose[:3, :3], other.back @ (self.pose[:3, 3] - other.pose[:3, 3])
 
 
 @dataclass(frozen=True, eq=False)
@@ -178,7 +184,7 @@ class Sample:
     pairs: Sequence[Pair]
     configured: Convention
     _inverse: dict[int, Float32] = field(default_factory=dict, init=False, repr=False)
-    _placed: dict[tuple[int, Convention], Placed] = field(default_factory=dict, init=False, repr=False)
+    _placed: dict[Convention, dict[int, Placed]] = field(default_factory=dict, init=False, repr=False)
 
     def with_views(self, views: dict[int, View]) -> Sample:
         """Return a sample of the same pairs, of which these are the views."""
@@ -207,30 +213,33 @@ class Sample:
 
     def errors(self, convention: Convention, factors: Float64) -> list[Float64]:
         """Return for each pair the relative error (F, N) of the first view's sample in the second; inf if not seen."""
-        return [self.matched(pair, convention, factors).error for pair in self.pairs]
+        placed = {position: self._placed_by(convention, position) for position in set(chain(*self.pairs))}
+        most = max((view.points.shape[1] for view in placed.values()), default=0)
+        unused = _room(len(factors), most)[:-1]
+        errors = [np.empty((len(factors), placed[a].points.shape[1])) for a, _ in self.pairs]
+        for (a, b), error in zip(self.pairs, errors, strict=True):
+            find_matches(*placed[a].seen_from(placed[b]), factors, *placed[b].image, *unused, error)
+        return errors
 
     def matched(self, pair: Pair, convention: Convention, factors: Float64) -> Matches:
         """Look the sample of the pair's first view up in the second one, for each factor on depth."""
         a, b = (self._placed_by(convention, position) for position in pair)
-        shape = len(factors), a.points.shape[1]
-        u, v = np.empty(shape, np.int64), np.empty(shape, np.int64)
-        z, depth, error, inside = np.empty(shape), np.empty(shape), np.empty(shape), np.empty(shape, np.bool_)
-        find_matches(
-            a.points, b.back @ a.pose[:3, :3], b.back @ (a.pose[:3, 3] - b.pose[:3, 3]), factors, _lens(b.camera),
-            fixed(self._read_as(convention, pair[1])), b.power, _lens(b.rays), u, v, z, depth, inside, error,
-        )  # fmt: skip
-        return Matches(u, v, z, depth, inside, error)
+        matches = Matches(*_room(len(factors), a.points.shape[1]))
+        find_matches(*a.seen_from(b), factors, *b.image, *matches.arrays)
+        return matches
 
     def _placed_by(self, convention: Convention, position: int) -> Placed:
         """Return a view as a convention reads it; it is in several pairs."""
-        if (cached := self._placed.get((position, convention))) is not None:
+        of_convention = self._placed.setdefault(convention, {})
+        if (cached := of_convention.get(position)) is not None:
             return cached
         view, pose = self.views[position], self.views[position].pose(convention, self.configured)
         K, (power, rays) = view.sampled_camera(convention), view.rays(convention, self.configured)
-        depth = self._read_as(convention, position)[view.v, view.u] * ray_lengths(rays, view.u, view.v) ** power
+        stored = self._read_as(convention, position)
+        depth = stored[view.v, view.u] * ray_lengths(rays, view.u, view.v) ** power
         points = np.stack([(view.u - K.cx) / K.fx * depth, (view.v - K.cy) / K.fy * depth, depth])
         back = np.linalg.inv(pose[:3, :3]).astype(np.float64)
-        placed = self._placed[position, convention] = Placed(pose, back, K, power, rays, points)
+        placed = of_convention[position] = Placed(pose, back, points, (_lens(K), fixed(stored), power, _lens(rays)))
         return placed
 
     def _read_as(self, convention: Convention, position: int) -> Float32:
@@ -268,6 +277,17 @@ class Matches:
     inside: Mask
     error: Float64
 
+    @property
+    def arrays(self) -> tuple[Any, ...]:
+        """The arrays in the order of `find_matches`."""
+        return self.u, self.v, self.z, self.depth, self.inside, self.error
+
+
+def _room(factors: int, points: int) -> tuple[Any, ...]:
+    """Return room for the arrays of `Matches`, each (F, N)."""
+    dtypes = np.int64, np.int64, np.float64, np.float64, np.bool_, np.float64
+    return tuple(np.empty((factors, points), dtype) for dtype in dtypes)
+
 
 @dataclass(frozen=True, eq=False)
 class Shared:
@@ -293,7 +313,7 @@ class Shared:
         return label_pairs[:, (label_pairs[0] != ignored[0]) & (label_pairs[1] != ignored[-1])]
 
 
-def _lens(camera: Intrinsics) -> tuple[float, float, float, float]:
+def _lens(camera: Intrinsics) -> Lens:
     return camera.fx, camera.fy, camera.cx, camera.cy
 
 
