@@ -22,7 +22,7 @@ from semstab.errors import DataError
 from semstab.metrics import compensated_flicker
 from semstab.statistics import describe
 from semstab.statistics.loops.sparse import surface
-from semstab.statistics.sampler import _sparse  # noqa: TID251
+from semstab.statistics.sparse_depth import SparseDepth
 
 
 def a_scan(**changes):
@@ -51,7 +51,7 @@ def test_neighbours_of_sparse_points_are_looked_for_as_far_as_points_are_apart(e
     depth = np.zeros((400, 400), np.float32)
     depth[::every, ::every] = 5
     frame = Frame(0, depth, Intrinsics(200, 200, 200, 200), np.eye(4), labels=np.zeros((400, 400), np.uint8))
-    assert _sparse(frame, 3).reach == reach
+    assert SparseDepth.of(frame, 3).reach == reach
 
 
 REFUSED = {

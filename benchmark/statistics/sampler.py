@@ -13,7 +13,7 @@ import hashlib
 import math
 import zlib
 from dataclasses import dataclass, replace
-from typing import Any, TypeGuard
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -26,6 +26,7 @@ from semstab.statistics.feature_spots import FeatureObservations, FeatureStore
 from semstab.statistics.kept_depth import DepthMemory, KeptDepth, firm
 from semstab.statistics.kept_points import KeptPoints
 from semstab.statistics.observations import COLUMNS, TYPES, VIEW, SpotObservations, Views
+from semstab.statistics.sparse_depth import SparseDepth, camera_of, of_lidar, step_of_few
 from semstab.statistics.votes import SpotVotes
 
 BUDGET = 1 << 19
@@ -49,9 +50,6 @@ APART = 0.7
 
 SIDE = 320
 """Most pixels on a side of the labels by which frames that repeat another are found."""
-
-FEW = 20_000
-"""Pixels, about, of which the median depth is taken; every n-th row is looked at to see whether depth is sparse."""
 
 REACH = 1 << 20
 """Coarse cells from the first camera within which there are spots."""
@@ -78,15 +76,6 @@ relative, from which on depth comes from planes through the pixels around."""
 GATE, ENOUGH = 0.05, 50
 """The standard deviation of depth comes from relative differences up to GATE, of frames with ENOUGH such pixels."""
 
-SPARSE, ALONE, DENSE = 0.3, 0.7, 0.1
-"""Depth of an image is sparse, as from a LiDAR, if fewer than this share of its pixels have depth, and fewer than this
-share of these have one next to them; and share of the labels at pixels without depth from which on labels are read
-where a spot falls, not at the next pixel with depth."""
-
-HOLES = 3.0
-"""Distance of the pixels with depth, in pixels, up to which sparse depth of an image is of a camera, and has holes:
-whether a view sees through a spot is then told only away from holes."""
-
 
 @dataclass(frozen=True, eq=False)
 class Anchor:
@@ -103,40 +92,6 @@ class Anchor:
         angle = math.acos(min(max((float(np.trace(turned)) - 1) / 2, -1.0), 1.0))
         moved = float(np.linalg.norm(frame.T_wc[:3, 3] - self.T_wc[:3, 3])) / self.depth
         return self.focal * (angle + moved) <= STILL
-
-
-@dataclass(frozen=True, eq=False)
-class Sparse:
-    """Sparse depth: points by direction, and an image of their numbers.
-
-    Attributes:
-        grid: (rows, columns) int32 the nearest point in each pixel, -1 without any.
-        u, v, w: (n,) image coordinates and inverse depth, or inverse range of a scan; w is 0 for invalid points.
-        camera: Focal lengths and principal point in pixels; of a scan, pixels in a radian.
-        around: Whether columns close a circle.
-        reach: Pixels to each side in which points around a place are looked for.
-        spacing: Distance of the points in pixels of the grid.
-        labels: (n,) uint16 labels of the points; None if the image has labels in all pixels.
-    """
-
-    grid: npt.NDArray[np.int32]
-    u: Float64
-    v: Float64
-    w: Float64
-    camera: tuple[float, float, float, float]
-    around: bool
-    reach: int
-    spacing: float
-    labels: UInt16 | None = None
-
-    def apart(self, looked: int) -> float:
-        """Return the distance, in pixels of the grid, of some of the points that are looked at."""
-        return self.spacing * math.sqrt(len(self.w) / max(looked, 1))
-
-    @property
-    def arrays(self) -> tuple[Any, ...]:
-        """The grid and the points, in the order of compiled loops."""
-        return self.grid, self.u, self.v, self.w
 
 
 class Sampler:
@@ -182,11 +137,11 @@ class Sampler:
         self._frames += 1
         if frame.features is not None:
             self._features.start(frame)
-        few = frame.depth[:: _few(frame.shape), :: _few(frame.shape)]
+        few = frame.depth[:: step_of_few(frame.shape), :: step_of_few(frame.shape)]
         few = few[(few > 0) & (few < np.inf)]
         if not len(few):
             few = frame.depth[(frame.depth > 0) & (frame.depth < np.inf)]
-        sparse = _sparse(frame, self.K)
+        sparse = SparseDepth.of(frame, self.K)
         view = self._view_of(frame, float(np.median(few)), sparse) if len(few) else None
         if view is None:
             return
@@ -200,12 +155,12 @@ class Sampler:
         else:
             self._find_in_points(sparse, T, seed)
             self._remember(view, frame, T, sparse)
-            answers = self._answers_of_points(frame, sparse, T, seed)
+            answers = self._answersof_lidar(frame, sparse, T, seed)
         if frame.features is not None:
             self._take_features(frame, sparse, view, *answers[:2])
         self._take(view, *answers)
 
-    def _view_of(self, frame: Frame, depth: float, sparse: Sparse | None) -> int | None:
+    def _view_of(self, frame: Frame, depth: float, sparse: SparseDepth | None) -> int | None:
         """Return the view of a frame with this median depth, a new one or not; None if the frame repeats another."""
         small = frame.predicted[:: max(1, -(-frame.shape[0] // SIDE)), :: max(1, -(-frame.shape[1] // SIDE))]
         hashed = hashlib.blake2b(np.ascontiguousarray(small).tobytes(), digest_size=16)
@@ -239,14 +194,14 @@ class Sampler:
         blocks = -(-H // stride) * -(-W // stride)
         cells = self._edge, self._share, self._low
         places = stride, _factor(blocks), self._density(blocks), seed
-        of_frame = fixed(frame.depth), _camera(frame), T, SURE * self._noise
+        of_frame = fixed(frame.depth), camera_of(frame), T, SURE * self._noise
         self._new(lambda *room: new_in_image(*of_frame, *cells, *places, *room))
 
     def _density(self, blocks: int) -> float:
         """Return how many places are looked at in the area of a coarse cell's face."""
         return min(PLACES, MOST_LOOKED / (blocks * (self._widths[-1] / self._edge) ** 2))
 
-    def _find_in_points(self, sparse: Sparse, T: Float64, seed: int) -> None:
+    def _find_in_points(self, sparse: SparseDepth, T: Float64, seed: int) -> None:
         """Add spots among the points of sparse depth."""
         from semstab.statistics.loops.sparse import new_in_points
 
@@ -267,7 +222,7 @@ class Sampler:
         end = self._spots + MOST_NEW
         self._spots += find(self._table, self._point[self._spots : end], self._hash[self._spots : end])
 
-    def _remember(self, view: int, frame: Frame, T: Float64, sparse: Sparse | None) -> None:
+    def _remember(self, view: int, frame: Frame, T: Float64, sparse: SparseDepth | None) -> None:
         """Keep depth of a view, and of the new spots which view found them and which lie at no edge of depth.
 
         A point of a LiDAR lies on a surface, at an edge, too; but a spot between points may lie between two surfaces.
@@ -276,10 +231,10 @@ class Sampler:
             return
         new = slice(self._known, self._spots)
         self._found[new] = view
-        if not _of_points(sparse):
-            self._firm[new] = firm(self._point[new], T, _camera(frame), fixed(frame.depth), self._noise)
+        if not of_lidar(sparse):
+            self._firm[new] = firm(self._point[new], T, camera_of(frame), fixed(frame.depth), self._noise)
             if self._memory.wants(view):
-                self._memory.add(KeptDepth.of_image(view, T.copy(), _camera(frame), fixed(frame.depth)))
+                self._memory.add(KeptDepth.of_image(view, T.copy(), camera_of(frame), fixed(frame.depth)))
             return
         points, place = (sparse.u, sparse.v, sparse.w), (sparse.camera, sparse.around, sparse.spacing)
         depth = KeptPoints.of(view, T.copy(), *place, sparse.grid.shape, points)
@@ -315,7 +270,7 @@ class Sampler:
     def _answers_of_image(self, frame: Frame, T: Float64, seed: int) -> tuple[Any, ...]:
         from semstab.statistics.loops.answers import answer, project
 
-        n, camera = self._spots, _camera(frame)
+        n, camera = self._spots, camera_of(frame)
         spot, pixel, (x, y, error, room) = np.empty(n, np.int32), np.empty(n, np.int64), np.empty((4, n))
         noise = SURE * self._noise if self._noise > SMOOTH else 0.0
         where = fixed(frame.depth), camera, T, noise, self._allowed()
@@ -330,7 +285,7 @@ class Sampler:
         )  # fmt: skip
         return tuple(column[:m] for column in out)
 
-    def _answers_of_points(self, frame: Frame, sparse: Sparse, T: Float64, seed: int) -> tuple[Any, ...]:
+    def _answersof_lidar(self, frame: Frame, sparse: SparseDepth, T: Float64, seed: int) -> tuple[Any, ...]:
         from semstab.statistics.loops.sparse import answer_points, answer_sparse, project_sparse
 
         n = self._spots
@@ -365,7 +320,7 @@ class Sampler:
         while self._answers > self.budget or self._spots > MOST_SPOTS:
             self._halve()
 
-    def _take_features(self, frame: Frame, sparse: Sparse | None, view: int, spot: Int32, label: UInt16) -> None:
+    def _take_features(self, frame: Frame, sparse: SparseDepth | None, view: int, spot: Int32, label: UInt16) -> None:
         """Add the features of a view at the pixels, or points, that answer for spots, whatever their labels."""
         assert frame.features is not None
         assert self._pixel is not None
@@ -419,7 +374,7 @@ class Sampler:
         """
         if self._memory is None:
             raise ValueError("no depth of views is kept; make the sampler with moving=True")
-        sparse = _of_points(_sparse(frame, self.K))
+        sparse = of_lidar(SparseDepth.of(frame, self.K))
         return self._memory.moving_pixels(frame, self._sigma, votes.misplaced, self._edge, sparse=sparse)
 
     def _votes(self) -> SpotVotes | None:
@@ -432,11 +387,6 @@ class Sampler:
     def features(self) -> FeatureObservations | None:
         """Return a copy of the features of the sample so far; None without features."""
         return None if self._features.is_empty else self._features.sample(self._observed())
-
-
-def _of_points(sparse: Sparse | None) -> TypeGuard[Sparse]:
-    """Return whether depth is of the points of a LiDAR, and not of a camera whose depth has holes."""
-    return sparse is not None and (sparse.around or sparse.spacing > HOLES)
 
 
 def _room(n: int) -> tuple[Any, ...]:
@@ -452,19 +402,9 @@ def _longer(array: npt.NDArray[Any], length: int) -> npt.NDArray[Any]:
     return longer
 
 
-def _camera(frame: Frame) -> tuple[float, float, float, float]:
-    K = frame.intrinsics
-    return K.fx, K.fy, K.cx, K.cy
-
-
 def _labels(frame: Frame) -> tuple[Any, Any]:
     """Return the labels, and the mask of pixels without a label, (0, 0) if there is none."""
     return fixed(frame.predicted), fixed(np.zeros((0, 0), np.bool_) if frame.unlabelled is None else frame.unlabelled)
-
-
-def _few(shape: tuple[int, int]) -> int:
-    """Return a step along each axis that leaves about FEW pixels."""
-    return max(1, round(math.sqrt(shape[0] * shape[1] / FEW)))
 
 
 def _stride(shape: tuple[int, int]) -> int:
@@ -472,7 +412,7 @@ def _stride(shape: tuple[int, int]) -> int:
     return max(1, round(math.sqrt(shape[0] * shape[1] / LOOKED_AT)))
 
 
-def _width(frame: Frame, sparse: Sparse | None, allowed: float) -> float:
+def _width(frame: Frame, sparse: SparseDepth | None, allowed: float) -> float:
     """Return the edge, metres, of a square as large as the mean area that a block of pixels, or a point, shows."""
     from semstab.statistics.loops.sparse import mean_area_of_points
     from semstab.statistics.loops.surface import mean_area
@@ -481,7 +421,7 @@ def _width(frame: Frame, sparse: Sparse | None, allowed: float) -> float:
         place = sparse.camera, sparse.around, sparse.reach, sparse.apart(min(len(sparse.w), LOOKED_AT))
         return math.sqrt(mean_area_of_points(*sparse.arrays, *place, allowed, max(1, len(sparse.w) // SOME_POINTS)))
     stride = _stride(frame.shape)
-    return stride * math.sqrt(mean_area(fixed(frame.depth), _camera(frame), 2 * stride, stride))
+    return stride * math.sqrt(mean_area(fixed(frame.depth), camera_of(frame), 2 * stride, stride))
 
 
 def _noise(frame: Frame) -> float:
@@ -501,43 +441,3 @@ def _factor(total: int) -> int:
     while math.gcd(step, total) > 1:
         step += 1
     return step
-
-
-def _sparse(frame: Frame, K: int) -> Sparse | None:
-    """Return the points of a scan, or of an image with sparse depth; None of an image with dense depth."""
-    from semstab.statistics.loops.sparse import directions, drawn
-
-    if frame.points is not None:
-        points = fixed(frame.points.reshape(-1, 3))
-        u, v, w = np.zeros((3, len(points)))
-        if not frame.ray_angle > 0:
-            return None
-        columns = max(8, round(4 * math.pi / frame.ray_angle))  # half a distance of the points wide
-        unit = 2 * math.pi / columns
-        directions(points, unit, u, v, w)
-        grid = np.empty((math.ceil(math.pi / unit) + 1, columns), np.int32)
-        drawn(u, v, w, grid)
-        labels = frame.predicted.reshape(-1).astype(np.uint16)
-        unlabelled = np.False_ if frame.unlabelled is None else frame.unlabelled.reshape(-1)
-        labels = np.where(labels < K, labels, np.where(unlabelled, K, K + 1)).astype(np.uint16)
-        return Sparse(grid, u, v, w, (1 / unit, 1 / unit, 0.0, 0.0), True, 5, 2.0, labels)
-    rows = frame.depth[:: _few(frame.shape)]
-    valid = (rows > 0) & (rows < np.inf)
-    n, pairs = int(np.count_nonzero(valid)), int(np.count_nonzero(valid[:, 1:] & valid[:, :-1]))
-    if not n < SPARSE * valid.size or pairs >= ALONE * n > 0:
-        return None
-    valid = (frame.depth > 0) & (frame.depth < np.inf)
-    if not (n := int(np.count_nonzero(valid))):
-        return None
-    row, column = np.nonzero(valid)
-    spacing = math.sqrt((np.ptp(row) + 1) * (np.ptp(column) + 1) / n)
-    u, v, w = column.astype(np.float64), row.astype(np.float64), 1.0 / frame.depth[valid].astype(np.float64)
-    grid = np.full(valid.shape, -1, np.int32)
-    grid[valid] = np.arange(n, dtype=np.int32)
-    here = frame.predicted < K
-    dense = np.count_nonzero(here & ~valid) > DENSE * np.count_nonzero(here)
-    unlabelled = np.False_ if frame.unlabelled is None else frame.unlabelled[valid]
-    labels = frame.predicted[valid].astype(np.uint16)
-    labels = np.where(labels < K, labels, np.where(unlabelled, K, K + 1)).astype(np.uint16)
-    reach = min(max(math.ceil(1.1 * spacing), 2), 12)
-    return Sparse(grid, u, v, w, _camera(frame), False, reach, spacing, None if dense else labels)

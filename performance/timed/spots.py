@@ -26,11 +26,11 @@ import numpy as np
 from semstab.backends import create
 from semstab.data.frames import Frame
 from semstab.statistics import Sampler
-from semstab.statistics import sampler as sampling
 from semstab.statistics.loops import answers as loops
+from semstab.statistics.sparse_depth import SparseDepth
 
 PARTS: dict[str, tuple[Any, str]] = {
-    "is depth sparse": (sampling, "_sparse"),
+    "is depth sparse": (SparseDepth, "of"),
     "view: hash of labels, mean area": (Sampler, "_view_of"),
     "new spots": (Sampler, "_find"),
     "projection": (loops, "project"),
