@@ -17,7 +17,7 @@ from semstab.check.loops import find_matches
 from semstab.check.verdict import Fit
 from semstab.core.prefetch import prefetch
 from semstab.core.types import Float32, Float64, Int64, Mask
-from semstab.data.frames import Frame, Intrinsics
+from semstab.data.frames import Frame, Intrinsics, Pinhole, pinhole
 from semstab.data.labels import fixed
 from semstab.datasets import GROUND_TRUTH, Scene
 from semstab.datasets.geometry.cameras import CAMERA_AXES, ray_lengths
@@ -38,8 +38,6 @@ PAIR_POINTS = 20
 """Points of a pair of frames that are seen again, from which on its error counts."""
 
 Pair = tuple[int, int]
-Lens = tuple[float, float, float, float]
-"""fx, fy, cx, cy in pixels."""
 Ids = npt.NDArray[Any]
 
 
@@ -160,16 +158,15 @@ class Placed(NamedTuple):
     Attributes:
         pose: (4, 4) camera-to-world.
         back: (3, 3) the inverse of its rotation.
-        camera: Intrinsics.
         points: (3, N) its sample in the camera's axes.
-        image: What `find_matches` takes of it to look points of others up: the lens, (H, W) the stored depth, and how
+        image: What `find_matches` takes of it to look points of others up: its camera, (H, W) the stored depth, and how
             that becomes planar, see `View.rays`.
     """
 
     pose: Float64
     back: Float64
     points: Float64
-    image: tuple[Lens, Float32, int, Lens]
+    image: tuple[Pinhole, Float32, int, Pinhole]
 
     def seen_from(self, other: Placed) -> tuple[Any, ...]:
         """Return this sample, and how it turns and moves from this camera's axes to another view's, metres."""
@@ -239,7 +236,7 @@ class Sample:
         depth = stored[view.v, view.u] * ray_lengths(rays, view.u, view.v) ** power
         points = np.stack([(view.u - K.cx) / K.fx * depth, (view.v - K.cy) / K.fy * depth, depth])
         back = np.linalg.inv(pose[:3, :3]).astype(np.float64)
-        placed = of_convention[position] = Placed(pose, back, points, (_lens(K), fixed(stored), power, _lens(rays)))
+        placed = of_convention[position] = Placed(pose, back, points, (pinhole(K), fixed(stored), power, pinhole(rays)))
         return placed
 
     def _read_as(self, convention: Convention, position: int) -> Float32:
@@ -311,10 +308,6 @@ class Shared:
             return np.empty((2, 0), dtype=np.int64)
         label_pairs = np.stack([first[self.first], second[self.second]]).astype(np.int64)
         return label_pairs[:, (label_pairs[0] != ignored[0]) & (label_pairs[1] != ignored[-1])]
-
-
-def _lens(camera: Intrinsics) -> Lens:
-    return camera.fx, camera.fy, camera.cx, camera.cy
 
 
 def motion(pose: Float64, other: Float64) -> tuple[Float64, Float64]:

@@ -35,8 +35,8 @@ def compiled(*, helper: bool = False, **options: Any) -> Callable[[Any], Any]:
     folder, each process compiles again.
 
     Args:
-        helper: Only compiled functions call the function, Python does not: what a call from Python needs would take a
-            third of the time to compile it.
+        helper: Only compiled functions call the function, Python does not. What a call from Python needs is then not
+            compiled; for all helpers together that would take a tenth of the time of a first run.
         options: Options of `numba.njit`.
     """
     if helper:
@@ -114,7 +114,7 @@ def _stamp(function: Any, visited: frozenset[Any]) -> tuple[Any, ...]:
 
 
 class _RestingCollector(event.Listener):
-    """Lets the garbage collector rest while numba compiles, which makes many objects and no garbage in cycles."""
+    """Lets the garbage collector rest while numba compiles: it would take a twelfth of that time."""
 
     def __init__(self) -> None:
         self._depth, self._was_enabled = 0, False
@@ -144,7 +144,7 @@ CHUNKS = 64
 """Number of chunks of a loop over voxels, for any number of threads."""
 
 SHORT = 0.002
-"""Seconds of a loop, about, up to which it starts no threads: each takes a millisecond to start and to end."""
+"""Seconds of a loop, about, up to which it starts no threads: to start and to end them takes as long."""
 
 
 def in_chunks(loop: Any, *arguments: Any) -> None:

@@ -76,6 +76,14 @@ class Intrinsics:
         return Intrinsics(self.fx * sx, self.fy * sy, (self.cx + 0.5) * sx - 0.5, (self.cy + 0.5) * sy - 0.5)
 
 
+Pinhole = tuple[float, float, float, float]
+
+
+def pinhole(camera: Intrinsics) -> Pinhole:
+    """Return fx, fy, cx, cy, pixels, as compiled loops take them."""
+    return camera.fx, camera.fy, camera.cx, camera.cy
+
+
 @dataclass(frozen=True)
 class LeftOut:
     """The share of a pixel's scores that `top_k` left out: the mean over pixels, and the most of any.

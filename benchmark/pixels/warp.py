@@ -10,7 +10,7 @@ import numpy as np
 import numpy.typing as npt
 
 from semstab.core.types import Float32, Float64, Int32, Mask
-from semstab.data.frames import Frame
+from semstab.data.frames import Frame, pinhole
 from semstab.data.labels import fixed
 from semstab.errors import ConfigError
 
@@ -79,7 +79,7 @@ def correspond(frame: Frame, other: Frame, *, depth_tolerance: float = DEPTH_TOL
     pixel = np.empty(frame.shape, dtype=np.int32)
     look_up(
         fixed(frame.depth), frame.rays, by_rows(motion(frame, other)), fixed(other.depth),
-        (camera.fx, camera.fy, camera.cx, camera.cy), depth_tolerance, pixel,
+        pinhole(camera), depth_tolerance, pixel,
     )  # fmt: skip
     return Correspondence(pixel)
 
@@ -124,6 +124,6 @@ def carry(belief: Float32, source: Frame, target: Frame, *, depth_tolerance: flo
     carried = np.zeros((H, W, belief.shape[2]), dtype=np.float32)
     blend(
         fixed(target.depth), target.rays, by_rows(motion(target, source)), fixed(source.depth),
-        (camera.fx, camera.fy, camera.cx, camera.cy), depth_tolerance, np.ascontiguousarray(belief), carried,
+        pinhole(camera), depth_tolerance, np.ascontiguousarray(belief), carried,
     )  # fmt: skip
     return carried

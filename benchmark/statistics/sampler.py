@@ -20,13 +20,13 @@ import numpy.typing as npt
 
 from semstab.core.arrays import GrowingRows
 from semstab.core.types import Float64, Int32, Int64, Mask, UInt16
-from semstab.data.frames import Frame
+from semstab.data.frames import Frame, pinhole
 from semstab.data.labels import fixed
 from semstab.statistics.feature_spots import FeatureObservations, FeatureStore
 from semstab.statistics.kept_depth import DepthMemory, KeptDepth, firm
 from semstab.statistics.kept_points import KeptPoints
 from semstab.statistics.observations import COLUMNS, TYPES, VIEW, SpotObservations, Views
-from semstab.statistics.sparse_depth import SparseDepth, camera_of, of_lidar, step_of_few
+from semstab.statistics.sparse_depth import SparseDepth, of_lidar, step_of_few
 from semstab.statistics.votes import SpotVotes
 
 BUDGET = 1 << 19
@@ -155,7 +155,7 @@ class Sampler:
         else:
             self._find_in_points(sparse, T, seed)
             self._remember(view, frame, T, sparse)
-            answers = self._answersof_lidar(frame, sparse, T, seed)
+            answers = self._answers_of_points(frame, sparse, T, seed)
         if frame.features is not None:
             self._take_features(frame, sparse, view, *answers[:2])
         self._take(view, *answers)
@@ -194,7 +194,7 @@ class Sampler:
         blocks = -(-H // stride) * -(-W // stride)
         cells = self._edge, self._share, self._low
         places = stride, _factor(blocks), self._density(blocks), seed
-        of_frame = fixed(frame.depth), camera_of(frame), T, SURE * self._noise
+        of_frame = fixed(frame.depth), pinhole(frame.intrinsics), T, SURE * self._noise
         self._new(lambda *room: new_in_image(*of_frame, *cells, *places, *room))
 
     def _density(self, blocks: int) -> float:
@@ -232,9 +232,9 @@ class Sampler:
         new = slice(self._known, self._spots)
         self._found[new] = view
         if not of_lidar(sparse):
-            self._firm[new] = firm(self._point[new], T, camera_of(frame), fixed(frame.depth), self._noise)
+            self._firm[new] = firm(self._point[new], T, pinhole(frame.intrinsics), fixed(frame.depth), self._noise)
             if self._memory.wants(view):
-                self._memory.add(KeptDepth.of_image(view, T.copy(), camera_of(frame), fixed(frame.depth)))
+                self._memory.add(KeptDepth.of_image(view, T.copy(), pinhole(frame.intrinsics), fixed(frame.depth)))
             return
         points, place = (sparse.u, sparse.v, sparse.w), (sparse.camera, sparse.around, sparse.spacing)
         depth = KeptPoints.of(view, T.copy(), *place, sparse.grid.shape, points)
@@ -270,7 +270,7 @@ class Sampler:
     def _answers_of_image(self, frame: Frame, T: Float64, seed: int) -> tuple[Any, ...]:
         from semstab.statistics.loops.answers import answer, project
 
-        n, camera = self._spots, camera_of(frame)
+        n, camera = self._spots, pinhole(frame.intrinsics)
         spot, pixel, (x, y, error, room) = np.empty(n, np.int32), np.empty(n, np.int64), np.empty((4, n))
         noise = SURE * self._noise if self._noise > SMOOTH else 0.0
         where = fixed(frame.depth), camera, T, noise, self._allowed()
@@ -285,7 +285,7 @@ class Sampler:
         )  # fmt: skip
         return tuple(column[:m] for column in out)
 
-    def _answersof_lidar(self, frame: Frame, sparse: SparseDepth, T: Float64, seed: int) -> tuple[Any, ...]:
+    def _answers_of_points(self, frame: Frame, sparse: SparseDepth, T: Float64, seed: int) -> tuple[Any, ...]:
         from semstab.statistics.loops.sparse import answer_points, answer_sparse, project_sparse
 
         n = self._spots
@@ -421,7 +421,7 @@ def _width(frame: Frame, sparse: SparseDepth | None, allowed: float) -> float:
         place = sparse.camera, sparse.around, sparse.reach, sparse.apart(min(len(sparse.w), LOOKED_AT))
         return math.sqrt(mean_area_of_points(*sparse.arrays, *place, allowed, max(1, len(sparse.w) // SOME_POINTS)))
     stride = _stride(frame.shape)
-    return stride * math.sqrt(mean_area(fixed(frame.depth), camera_of(frame), 2 * stride, stride))
+    return stride * math.sqrt(mean_area(fixed(frame.depth), pinhole(frame.intrinsics), 2 * stride, stride))
 
 
 def _noise(frame: Frame) -> float:

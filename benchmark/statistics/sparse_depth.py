@@ -10,7 +10,7 @@ import numpy as np
 import numpy.typing as npt
 
 from semstab.core.types import Float64, UInt16
-from semstab.data.frames import Frame
+from semstab.data.frames import Frame, Pinhole, pinhole
 from semstab.data.labels import fixed
 
 FEW = 20_000
@@ -44,7 +44,7 @@ class SparseDepth:
     u: Float64
     v: Float64
     w: Float64
-    camera: tuple[float, float, float, float]
+    camera: Pinhole
     around: bool
     reach: int
     spacing: float
@@ -82,12 +82,6 @@ def step_of_few(shape: tuple[int, int]) -> int:
     return max(1, round(math.sqrt(shape[0] * shape[1] / FEW)))
 
 
-def camera_of(frame: Frame) -> tuple[float, float, float, float]:
-    """Return focal lengths and principal point, in the order of compiled loops."""
-    K = frame.intrinsics
-    return K.fx, K.fy, K.cx, K.cy
-
-
 def _of_scan(points: npt.NDArray[Any], ray_angle: float, labels: UInt16) -> SparseDepth | None:
     """Return the points (n, 3) of a scan in an image of directions, whose pixels are half their distance wide."""
     from semstab.statistics.loops.sparse import directions, drawn
@@ -122,7 +116,7 @@ def _of_image(frame: Frame, K: int) -> SparseDepth | None:
     dense = np.count_nonzero(labelled & ~valid) > DENSE * np.count_nonzero(labelled)
     labels = None if dense else _labels(frame, K, valid)
     reach = min(max(math.ceil(1.1 * spacing), 2), 12)
-    return SparseDepth(grid, u, v, w, camera_of(frame), False, reach, spacing, labels)
+    return SparseDepth(grid, u, v, w, pinhole(frame.intrinsics), False, reach, spacing, labels)
 
 
 def _labels(frame: Frame, K: int, chosen: Any = ...) -> UInt16:
