@@ -27,7 +27,7 @@ from semstab.statistics import Sampler, SpotObservations, Views, describe, disag
 from semstab.statistics.accumulate import sums_of_spots
 from semstab.statistics.cluster_sums import lever_of, value
 from semstab.statistics.intervals import estimate
-from semstab.statistics.loops.cells import hash_cell
+from semstab.statistics.loops.cells import EDGE, hash_cell
 from semstab.statistics.observations import COLUMNS
 
 DATA = Path(os.environ.get("SEMSTAB_DATA", Path(__file__).parents[2] / "shared/data"))
@@ -392,14 +392,14 @@ def test_spots_that_are_seen_once_are_bounded_as_well(monkeypatch):
     assert entries(some) == entries(everything.within(some.share))
 
 
-def test_one_frame_adds_a_bounded_number_of_spots(monkeypatch):
+def test_one_frame_adds_spots_of_a_bounded_number_of_cells(monkeypatch):
     """They are spread over the image, as the order in which it is looked through jumps over it."""
     monkeypatch.setattr("semstab.statistics.sampler.MOST_NEW", 400)
     some = sampled(flight(1)).point
-    assert len(some) == 400
+    assert len(some) == pytest.approx(400 * EDGE**2, abs=4 * math.sqrt(400 * EDGE**2 * (1 - EDGE**2)))
     x, y = (some[:, :2] - some[:, :2].min(axis=0)).T / np.ptp(some[:, :2], axis=0)[:, None]
     counts, *_ = np.histogram2d(x, y, bins=4)
-    assert counts.min() > 10
+    assert counts.min() > 5
 
 
 @pytest.mark.parametrize("budget", [1 << 19, 5000])
@@ -692,14 +692,14 @@ def shelf():
 
 
 def test_two_spots_beside_a_face_of_their_cells_are_two_units():
-    """A face of cells is one of the 64ths in which a log tells places."""
+    """They share a voxel of their log, a 64th of the spacing."""
     column = np.array([0, 0, 1, 1])
     spots = SpotObservations(
         spot=column.astype(np.int32),
         view=np.array([0, 1, 0, 1], np.int32),
         **dict.fromkeys(("label", "neighbour", "beyond"), column.astype(np.uint16)),
         **dict.fromkeys(("near", "far"), np.zeros(4, np.float32)),
-        point=np.array([[0.609, 0.1, 0.1], [0.61, 0.1, 0.1]]),
+        point=np.array([[0.507, 0.1, 0.1], [0.5085, 0.1, 0.1]]),
         drawn=np.arange(2, dtype=np.uint32),
         views=Views.of([[index, index, 0, 0, 0, 0.01] for index in range(2)]),
         spacing=1.0,

@@ -94,14 +94,14 @@ COLUMNS = tuple(TYPES)
 SCHEMA = 1
 
 PARTS = 64
-"""Parts of a coarse cell's edge in which the place of a spot is told in a log."""
+"""Parts of the spacing in which the place of a spot is told in a log."""
 
 
 @dataclass(frozen=True, eq=False)
 class SpotObservations:
     """Answers of views for spots of the surface: a row (m,) for each spot and frame.
 
-    A spot is a point of the surface, one in a coarse cell; it does not depend on the voxels of a map. The answer of a
+    A spot is a point of the surface; it does not depend on the voxels of a map. The answer of a
     frame is the label of the pixel which the spot falls into. A second and a third answer, of the next two pixels on
     the same surface, tell how agreement falls with the distance of the points that answer: at a border of two classes
     the first one is wrong if the pixel's centre and the spot lie on different sides.
@@ -116,7 +116,7 @@ class SpotObservations:
         point: (n, 3) spots in metres.
         drawn: (n,) uint32 hash of the spot's coarse cell; cells below `share` are in the sample.
         views: Distinct views, in order of integration.
-        spacing: Edge of a coarse cell in metres, a power of 2.
+        spacing: Distance of spots in metres, a power of 2: a spot stands for its square of surface.
         K: Number of classes.
         share: Sampled share of the coarse cells, times 2^32.
         classes: Names of the classes.
@@ -234,18 +234,19 @@ class SpotObservations:
     def _by_voxel(self) -> tuple[Int64, Int64, Int64, Int64]:
         """(n, 3) indices of the voxels of a log and (n,) their spots; (m,) answers in order, and the voxel of each.
 
-        A spot is a voxel of a PARTS-th of a coarse cell, whose faces are faces of such voxels.
+        A spot is a voxel of a PARTS-th of the spacing; of a voxel that holds two spots there are two.
         """
         rows = np.flatnonzero(self.label < self.K)
         spot = self.spot[rows]
         number = np.zeros(len(self.point), np.int64)
         number[spot] = 1
         spots = np.flatnonzero(number)
-        index, number[spots] = distinct_rows(np.floor(self.point[spots] * (PARTS / self.spacing)).astype(np.int64))
-        at = np.empty(len(index), np.int64)
-        at[number[spots]] = spots
+        index = np.floor(self.point[spots] * (PARTS / self.spacing)).astype(np.int64)
+        by_index = np.lexsort(index.T[::-1])
+        at = spots[by_index]
+        number[at] = np.arange(len(at))
         order = np.lexsort((self.view[rows], number[spot]))
-        return index, at, rows[order], number[spot[order]]
+        return index[by_index], at, rows[order], number[spot[order]]
 
     def _log(self, label: UInt16, square: Float32 | None = None) -> tuple[Events, Float64]:
         """Return a log of these labels, and (m,) squared distances."""
@@ -346,11 +347,11 @@ class SpotObservations:
             raise DataError("a spot that lies too far away")
 
 
-def cells_of(point: Float64, edge: float) -> Int64:
-    """Return the coarse cells (n, 3) of points (n, 3)."""
-    from semstab.statistics.loops.cells import PHASE
+def cells_of(point: Float64, spacing: float) -> Int64:
+    """Return the coarse cells (..., 3) of points (..., 3) for this spacing of spots."""
+    from semstab.statistics.loops.cells import EDGE, PHASE
 
-    return np.floor(point / edge + PHASE).astype(np.int64)
+    return np.floor(point / (EDGE * spacing) + PHASE).astype(np.int64)
 
 
 def numbered_as_one_flight(samples: Sequence[SpotObservations]) -> list[SpotObservations]:

@@ -1,9 +1,10 @@
 """Spots of the surface, and the labels that each view gives them.
 
-A spot is a point of the surface: one in each coarse cell that a frame shows, at a place that depth alone decides. Each
-later frame answers for all spots that it sees, near or far, with the label of the pixel that a spot falls into. So
-spots are even over the surface, and a spot has as many answers as views see it. All models of a flight are asked at the
-same spots. Memory is bounded: if there are too many answers, every second spot is dropped, by a hash of its cell.
+A spot is a point of the surface, in a coarse cell that a frame shows, at a place that depth alone decides; as many
+cells have one as stand for equal areas. Each later frame answers for all spots that it sees, near or far, with the
+label of the pixel that a spot falls into. So spots are even over the surface, and a spot has as many answers as views
+see it. All models of a flight are asked at the same spots. Memory is bounded: if there are too many answers, every
+second spot is dropped, by a hash of its cell.
 """
 
 from __future__ import annotations
@@ -25,7 +26,7 @@ from semstab.data.labels import fixed
 from semstab.statistics.feature_spots import FeatureObservations, FeatureStore
 from semstab.statistics.kept_depth import DepthMemory, KeptDepth, firm
 from semstab.statistics.kept_points import KeptPoints
-from semstab.statistics.observations import COLUMNS, TYPES, VIEW, SpotObservations, Views
+from semstab.statistics.observations import COLUMNS, TYPES, VIEW, SpotObservations, Views, cells_of
 from semstab.statistics.sparse_depth import SparseDepth, of_lidar, step_of_few
 from semstab.statistics.votes import SpotVotes
 
@@ -36,17 +37,20 @@ MOST_SPOTS = 1 << 16
 """Most spots, of which many may have been seen once."""
 
 MOST_NEW = 1 << 15
-"""Most spots that one frame adds."""
+"""Most coarse cells, with a spot or without, that one frame adds."""
+
+SLOTS = 2
+"""Slots, at least, of the table of coarse cells for each of them."""
 
 LOOKED_AT = 6_000
 """Blocks of pixels, about, or points of a scan, in which new spots are looked for."""
 
 PLACES, MOST_LOOKED = 4.0, 1 << 17
-"""Places that are looked at in the area of a coarse cell's face, so that few cells are left out by chance; and the most
+"""Places that are looked at in the square of the spacing, so that few cells are left out by chance; and the most
 places, about, of a frame."""
 
 APART = 0.7
-"""Edge of a coarse cell, by the mean area that a block of pixels shows, or up to twice as much."""
+"""Spacing of spots, by the edge of a square as large as a block of pixels shows on average, or up to twice as much."""
 
 SIDE = 320
 """Most pixels on a side of the labels by which frames that repeat another are found."""
@@ -97,7 +101,7 @@ class Anchor:
 class Sampler:
     """Takes frames one by one, as they are fused; `sample` returns the answers so far.
 
-    The first frame sets the size of the coarse cells, a power of 2. Frames that a standing camera takes are one view,
+    The first frame sets the spacing of spots, a power of 2. Frames that a standing camera takes are one view,
     and so are frames with the same pose and the same labels.
 
     Args:
@@ -109,7 +113,7 @@ class Sampler:
     def __init__(self, num_classes: int, budget: int = BUDGET, *, moving: bool = True) -> None:
         self.K, self.budget = num_classes, budget
         self._memory = DepthMemory() if moving else None
-        self._edge = math.nan
+        self._spacing = math.nan
         self._low: Int64 = np.zeros(3, np.int64)
         self._columns: dict[str, npt.NDArray[Any]] = {}
         self._views = GrowingRows(VIEW)
@@ -125,7 +129,7 @@ class Sampler:
         self._clear()
 
     def _clear(self) -> None:
-        self._share, self._answers, self._spots = 1 << 32, 0, 0
+        self._share, self._answers, self._spots, self._cells = 1 << 32, 0, 0, 0
         self._point, self._hash = np.empty((1 << 12, 3)), np.empty(1 << 12, np.uint32)
         self._found, self._firm = np.empty(1 << 12, np.int32), np.ones(1 << 12, np.bool_)
         self._table = np.full(1 << 14, -1, np.int64)
@@ -177,10 +181,10 @@ class Sampler:
         centre, when = frame.T_wc[:3, 3], math.nan if frame.timestamp is None else frame.timestamp
         self._views.append([frame.index, *centre.tolist(), when, depth / focal])
         self._widths.append(_width(frame, sparse, self._allowed()) or depth / focal)
-        edge = 2.0 ** math.ceil(math.log2(APART * float(np.median(self._widths))))
-        if not self._edge / CHANGE < edge < self._edge * CHANGE:
-            self._edge = edge
-            self._low = np.floor(centre / edge).astype(np.int64) - REACH
+        spacing = 2.0 ** math.ceil(math.log2(APART * float(np.median(self._widths))))
+        if not self._spacing / CHANGE < spacing < self._spacing * CHANGE:
+            self._spacing = spacing
+            self._low = cells_of(centre, spacing) - REACH
             self._clear()
         return self._anchor.view
 
@@ -192,14 +196,14 @@ class Sampler:
 
         (H, W), stride = frame.shape, _stride(frame.shape)
         blocks = -(-H // stride) * -(-W // stride)
-        cells = self._edge, self._share, self._low
+        cells = self._spacing, self._share, self._low
         places = stride, _factor(blocks), self._density(blocks), seed
         of_frame = fixed(frame.depth), pinhole(frame.intrinsics), T, SURE * self._noise
         self._new(lambda *room: new_in_image(*of_frame, *cells, *places, *room))
 
     def _density(self, blocks: int) -> float:
-        """Return how many places are looked at in the area of a coarse cell's face."""
-        return min(PLACES, MOST_LOOKED / (blocks * (self._widths[-1] / self._edge) ** 2))
+        """Return how many places are looked at in the square of the spacing."""
+        return min(PLACES, MOST_LOOKED / (blocks * (self._widths[-1] / self._spacing) ** 2))
 
     def _find_in_points(self, sparse: SparseDepth, T: Float64, seed: int) -> None:
         """Add spots among the points of sparse depth."""
@@ -207,20 +211,21 @@ class Sampler:
 
         looked = min(len(sparse.w), LOOKED_AT)
         place = sparse.camera, sparse.around, sparse.reach, sparse.apart(looked)
-        cells = self._edge, self._share, self._low
+        cells = self._spacing, self._share, self._low
         places = _factor(len(sparse.w)), looked, self._density(looked), seed
         self._new(lambda *room: new_in_points(*sparse.arrays, *place, self._allowed(), T, *cells, *places, *room))
 
     def _new(self, find: Any) -> None:
-        """Add the spots that a loop finds, at most MOST_NEW."""
-        while 2 * (self._spots + MOST_NEW) > len(self._table):
-            self._table = self._rebuilt(2 * len(self._table))
+        """Add the spots that a loop finds, of at most MOST_NEW cells."""
+        while SLOTS * (self._cells + MOST_NEW) > len(self._table):
+            self._rebuild(2 * len(self._table))
         if self._spots + MOST_NEW > len(self._hash):
             room = max(2 * len(self._hash), self._spots + MOST_NEW)
             self._point, self._hash = _longer(self._point, room), _longer(self._hash, room)
             self._found, self._firm = _longer(self._found, room), _longer(self._firm, room)
         end = self._spots + MOST_NEW
-        self._spots += find(self._table, self._point[self._spots : end], self._hash[self._spots : end])
+        spots, cells = find(self._table, self._point[self._spots : end], self._hash[self._spots : end])
+        self._spots, self._cells = self._spots + spots, self._cells + cells
 
     def _remember(self, view: int, frame: Frame, T: Float64, sparse: SparseDepth | None) -> None:
         """Keep depth of a view, and of the new spots which view found them and which lie at no edge of depth.
@@ -242,13 +247,13 @@ class Sampler:
         if self._memory.wants(view):
             self._memory.add(depth)
 
-    def _rebuilt(self, size: int) -> Int64:
-        """Return a table of the coarse cells of all spots."""
-        from semstab.statistics.loops.cells import fill
+    def _rebuild(self, size: int) -> None:
+        """Put the coarse cells that are in the sample into a table of another size."""
+        from semstab.statistics.loops.cells import refill
 
         table = np.full(size, -1, np.int64)
-        fill(self._point[: self._spots], self._edge, self._low, table)
-        return table
+        self._cells = refill(self._table, self._share, self._low, table)
+        self._table = table
 
     # --- Answers ------------------------------------------------------------------------------------------------------
 
@@ -345,7 +350,7 @@ class Sampler:
         for array in (self._point, self._hash, self._found, self._firm):
             array[:n] = array[: self._spots][remaining]
         self._spots = n
-        self._table = self._rebuilt(len(self._table))
+        self._rebuild(len(self._table))
 
     def sample(self, classes: tuple[str, ...] = (), distances: Float64 | None = None) -> SpotObservations:
         """Return a copy of the sample so far, without the pixels that are left out; distances are (K, K)."""
@@ -360,7 +365,7 @@ class Sampler:
             point=self._point[: self._spots].copy(),
             drawn=self._hash[: self._spots].copy(),
             views=Views.of(self._views.table().copy()),
-            spacing=self._edge if len(self._views) else 1.0,
+            spacing=self._spacing if len(self._views) else 1.0,
             K=self.K,
             share=self._share,
             frames=self._frames,
@@ -375,14 +380,15 @@ class Sampler:
         if self._memory is None:
             raise ValueError("no depth of views is kept; make the sampler with moving=True")
         sparse = of_lidar(SparseDepth.of(frame, self.K))
-        return self._memory.moving_pixels(frame, self._sigma, votes.misplaced, self._edge, sparse=sparse)
+        return self._memory.moving_pixels(frame, self._sigma, votes.misplaced, self._spacing, sparse=sparse)
 
     def _votes(self) -> SpotVotes | None:
         """Return what views say of the spots; None without depth of views."""
         if self._memory is None:
             return None
         n, views = self._spots, len(self._views)
-        return self._memory.votes_on(self._point[:n], self._found[:n], self._firm[:n], views, self._sigma, self._edge)
+        spots = self._point[:n], self._found[:n], self._firm[:n]
+        return self._memory.votes_on(*spots, views, self._sigma, self._spacing)
 
     def features(self) -> FeatureObservations | None:
         """Return a copy of the features of the sample so far; None without features."""

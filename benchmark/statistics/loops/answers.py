@@ -6,7 +6,7 @@ import numpy as np
 
 from semstab.core.compiled import helper, serial
 from semstab.statistics.loops.cells import mixed
-from semstab.statistics.loops.surface import depths_around, in_sensor, inverse, inverse_of, slope, slopes, smoothed
+from semstab.statistics.loops.surface import depths_around, in_sensor, inverse, inverse_of, plane_around, slope, slopes
 
 SLACK = 0.25
 """Share of the slope of inverse depth by which two pixels next to each other on one surface may differ from a plane."""
@@ -59,7 +59,8 @@ def misfit(around, dx, dy, z):
 @helper
 def misfit_on_plane(depth, row, column, dx, dy, z, noise):
     """Return the same two numbers by a plane through the pixels around."""
-    error = smoothed(depth, row, column, inverse(depth, row, column), dx, dy, noise) * z - 1.0
+    w, along_x, along_y = plane_around(depth, row, column, inverse(depth, row, column), noise)
+    error = (w + along_x * dx + along_y * dy) * z - 1.0
     return error, abs(error)
 
 

@@ -1,4 +1,8 @@
-"""Coarse cells of space: their hashes, the table of those that have a spot, and spots that are added to it."""
+"""Coarse cells of space: their hashes, the table of those that surfaces meet, and the spots of those that count.
+
+A cell counts with a probability in proportion to the area of the surface in it. So spots are even over surfaces,
+whichever way these are turned: of all cells, 1 in the square of their edge meets a floor, up to 1.73 an oblique wall.
+"""
 
 from __future__ import annotations
 
@@ -19,9 +23,16 @@ GOLDEN = np.uint64(0x9E3779B97F4A7C15)
 
 EMPTY = np.int64(-1)
 
-PHASE = 25 / 64
-"""Part of its edge by which coarse cells are moved from the origin, near the golden section, so that floors and walls
-of models do not lie in their faces; a multiple of the 64ths in which a log tells places, see `SpotObservations`."""
+EDGE = 53 / 64
+"""Edge of a coarse cell, by the spacing of spots: the most 64ths with which no plane has more than the square of the
+spacing in a cell. The largest section of a cube has sqrt(2) times the square of its edge."""
+
+PHASE = 20.5 / 53
+"""Part of its edge by which coarse cells are moved from the origin, near the golden section. No face of a cell is a
+multiple of a 64th of the spacing, so floors and walls of models do not lie in faces."""
+
+FLAT = 1e-3
+"""Least component of a unit normal, for `area_in_cell`."""
 
 
 @helper
@@ -75,8 +86,9 @@ def key_of(a, b, c):
 
 
 @helper
-def cell_of(x, y, z, edge):
+def cell_of(x, y, z, spacing):
     """Return the coarse cell of a point; no face of a cell lies in a plane such as z = 0, where floors lie."""
+    edge = EDGE * spacing
     return (
         np.int64(np.floor(x / edge + PHASE)), np.int64(np.floor(y / edge + PHASE)),
         np.int64(np.floor(z / edge + PHASE)),
@@ -84,20 +96,54 @@ def cell_of(x, y, z, edge):
 
 
 @serial
-def fill(point, edge, low, table):
-    """Add the coarse cells of points (n, 3) to a table."""
-    for i in range(len(point)):
-        a, b, c = cell_of(point[i, 0], point[i, 1], point[i, 2], edge)
-        is_new(table, key_of(a - low[0], b - low[1], c - low[2]), True)
+def refill(table, share, low, new):
+    """Add the cells of a table that are in the sample to a new table; return how many."""
+    n = 0
+    for key in table:
+        if key != EMPTY:
+            a, b, c = key >> np.int64(2 * BITS), (key >> np.int64(BITS)) & (SPAN - 1), key & (SPAN - 1)
+            if hash_cell(a + low[0], b + low[1], c + low[2]) < share:
+                is_new(new, key, True)
+                n += 1
+    return n
 
 
 @helper
-def add_spot(px, py, pz, edge, share, low, table, point, hashed, n):
-    """Add a point as spot n if its coarse cell is in the sample and has none; return how many spots there are."""
-    i, j, k = cell_of(px, py, pz, edge)
+def above(number):
+    """Return the square of a number, 0 of one below 0."""
+    return number * number if number > 0.0 else 0.0
+
+
+@helper
+def area_in_cell(normal, x, y, z):
+    """Return the area of a plane in the unit cube, by its normal and a point (x, y, z) of it in the cube.
+
+    It is the derivative of the volume below the plane, which is a sum over the cube's corners.
+    """
+    nx, ny, nz = normal
+    length = np.sqrt(nx * nx + ny * ny + nz * nz)
+    a, b, c = max(abs(nx) / length, FLAT), max(abs(ny) / length, FLAT), max(abs(nz) / length, FLAT)
+    t = a * (x if nx > 0.0 else 1.0 - x) + b * (y if ny > 0.0 else 1.0 - y) + c * (z if nz > 0.0 else 1.0 - z)
+    one, two = above(t - a) + above(t - b) + above(t - c), above(t - a - b) + above(t - a - c) + above(t - b - c)
+    return (t * t - one + two) / (2.0 * a * b * c)
+
+
+@helper
+def add_spot(p, normal, spacing, share, low, table, point, hashed, n, met):
+    """Add point p as spot n if its coarse cell is in the sample, was not met before, and counts.
+
+    The cell counts with the probability that the plane with this normal has of the square of the spacing in it. Returns
+    how many spots there are, and how many cells were met.
+    """
+    px, py, pz = p
+    edge = EDGE * spacing
+    i, j, k = cell_of(px, py, pz, spacing)
     a, b, c, cell_hash = i - low[0], j - low[1], k - low[2], hash_cell(i, j, k)
     within_reach = 0 <= a < SPAN and 0 <= b < SPAN and 0 <= c < SPAN
     if cell_hash >= share or not within_reach or not is_new(table, key_of(a, b, c), True):
-        return n
+        return n, met
+    place = px / edge + PHASE - i, py / edge + PHASE - j, pz / edge + PHASE - k
+    if fraction(np.uint32(cell_hash ^ np.uint32(0x9E3779B9))) >= EDGE * EDGE * area_in_cell(normal, *place):
+        return n, met + 1
     point[n, 0], point[n, 1], point[n, 2], hashed[n] = px, py, pz, cell_hash
-    return n + 1
+    return n + 1, met + 1

@@ -5,8 +5,30 @@ from __future__ import annotations
 import numpy as np
 
 from semstab.core.compiled import helper, serial
-from semstab.statistics.loops.cells import PHASE, SPAN, add_spot, fraction, hash_cell, is_new, key_of, mixed, slot_of
-from semstab.statistics.loops.surface import area, depths_around, in_world, inverse, inverse_of, slope, slopes, smoothed
+from semstab.statistics.loops.cells import (
+    EDGE,
+    PHASE,
+    SPAN,
+    add_spot,
+    fraction,
+    hash_cell,
+    is_new,
+    key_of,
+    mixed,
+    slot_of,
+)
+from semstab.statistics.loops.surface import (
+    area,
+    depths_around,
+    in_world,
+    inverse,
+    inverse_of,
+    normal_of,
+    plane_around,
+    slope,
+    slopes,
+    turned,
+)
 
 MOST_PLACES = 1 << 16
 """Most places that are looked at in a block of pixels: a pixel of damaged depth may show thousands of kilometres."""
@@ -41,7 +63,7 @@ def places_of_block(depth, camera, row, column, stride, per_area, chance):
 
 
 @helper
-def look_at(depth, camera, T, edge, share, low, u, v, shown, here, cell, keys, rows):
+def look_at(depth, camera, T, spacing, share, low, u, v, shown, here, cell, keys, rows):
     """Find the inverse depth of the pixels of places, and the keys of the coarse cells that they show.
 
     Returns how many places show a cell within reach and in the sample, and writes which in `rows`. shown (5, n) and
@@ -49,6 +71,7 @@ def look_at(depth, camera, T, edge, share, low, u, v, shown, here, cell, keys, r
     lowest ones on. The loops are apart since arithmetic alone becomes vector instructions.
     """
     fx, fy, cx, cy = camera
+    edge = EDGE * spacing
     for i in range(len(u)):
         around = depths_around(depth, np.int64(v[i]), np.int64(u[i]))
         shown[0, i], shown[1, i], shown[2, i], shown[3, i], shown[4, i] = around
@@ -81,43 +104,45 @@ def index_from(coordinate, low):
 
 @helper
 def add_spots(
-    depth, camera, T, allowed, edge, share, low, table, point, hashed, n, u, v, shown, here, cell, keys, rows
+    depth, camera, T, allowed, spacing, share, low, table, point, hashed, n, met, u, v, shown, here, cell, keys, rows
 ):
-    """Look at places, and add spots to n others; return how many spots there are."""
+    """Look at places, and add spots to n others; return how many spots there are, and how many cells were met."""
     fx, fy, cx, cy = camera
-    count = look_at(depth, camera, T, edge, share, low, u, v, shown, here, cell, keys, rows)
+    count = look_at(depth, camera, T, spacing, share, low, u, v, shown, here, cell, keys, rows)
     found = 0
-    for k in range(count):  # most cells have a spot, in the first slot: no branch, so that the memory is asked ahead
+    for k in range(count):  # most cells were met, and are in the first slot: no branch, so memory is asked ahead
         keys[found], rows[found] = keys[k], rows[k]
         found += table[slot_of(table, keys[k])] != keys[k]
     for k in range(found):
         if not is_new(table, keys[k], False):
             continue
         i = rows[k]
-        row, column, x, y = np.int64(v[i]), np.int64(u[i]), u[i] - 0.5, v[i] - 0.5
-        there = smoothed(depth, row, column, here[i], x - column, y - row, allowed)
-        z = 1.0 / (there if there > 0.5 * here[i] else here[i])
-        px, py, pz = in_world((x - cx) / fx * z, (y - cy) / fy * z, z, T)
-        n = add_spot(px, py, pz, edge, share, low, table, point, hashed, n)
-        if n == len(hashed):
+        row, column = np.int64(v[i]), np.int64(u[i])
+        w, along_x, along_y = plane_around(depth, row, column, here[i], allowed)
+        there = w + along_x * (u[i] - 0.5 - column) + along_y * (v[i] - 0.5 - row)
+        there = there if there > 0.5 * here[i] else here[i]
+        x, y, z = (u[i] - 0.5 - cx) / fx, (v[i] - 0.5 - cy) / fy, 1.0 / there
+        normal = turned(*normal_of(there, along_x, along_y, x, y, fx, fy), T)
+        n, met = add_spot(in_world(x * z, y * z, z, T), normal, spacing, share, low, table, point, hashed, n, met)
+        if met == len(hashed):
             break
-    return n
+    return n, met
 
 
 @serial
-def new_in_image(depth, camera, T, allowed, edge, share, low, stride, factor, density, seed, table, point, hashed):
-    """Add spots where an image shows a coarse cell without one; return how many.
+def new_in_image(depth, camera, T, allowed, spacing, share, low, stride, factor, density, seed, table, point, hashed):
+    """Add spots where an image shows coarse cells that were not met before; return how many, and of how many cells.
 
-    Places are looked at evenly over the surface, `density` in the area of a coarse cell's face: in all blocks of stride
-    x stride pixels, in an order that jumps over the image by `factor`, as many as the area that a block shows asks for.
-    A place lies anywhere in its pixel, so that the view that finds a spot meets it as any other view does.
+    Places are looked at evenly over the surface, `density` in the square of the spacing: in all blocks of stride x
+    stride pixels, in an order that jumps over the image by `factor`, as many as the area that a block shows asks for. A
+    place lies anywhere in its pixel, so that the view that finds a spot meets it as any other view does.
     """
-    surface = depth, camera, T, allowed, edge, share, low, table, point, hashed
+    surface = depth, camera, T, allowed, spacing, share, low, table, point, hashed
     u, v, here, shown = np.empty(AT_ONCE), np.empty(AT_ONCE), np.empty(AT_ONCE), np.empty((5, AT_ONCE))
     cell, keys, rows = np.empty((3, AT_ONCE), np.int32), np.empty(AT_ONCE, np.int64), np.empty(AT_ONCE, np.int64)
     columns = (depth.shape[1] + stride - 1) // stride
     total = (depth.shape[0] + stride - 1) // stride * columns
-    at, per_area, count, n = np.int64(seed % total), density / (edge * edge), 0, 0
+    at, per_area, count, n, met = np.int64(seed % total), density / (spacing * spacing), 0, 0, 0
     for _ in range(total):
         at += factor
         if at >= total:
@@ -131,9 +156,10 @@ def new_in_image(depth, camera, T, allowed, edge, share, low, stride, factor, de
         while places > 0:
             count, places = count + 1, places - 1
             if count == AT_ONCE:
-                n, count = add_spots(*surface, n, u, v, shown, here, cell, keys, rows), 0
-                if n == len(hashed):
-                    return n
+                n, met = add_spots(*surface, n, met, u, v, shown, here, cell, keys, rows)
+                count = 0
+                if met == len(hashed):
+                    return n, met
             if places > 0:
                 number, u[count], v[count] = draw_place(top, left, stride, number)
-    return add_spots(*surface, n, u[:count], v[:count], shown, here, cell, keys, rows)
+    return add_spots(*surface, n, met, u[:count], v[:count], shown, here, cell, keys, rows)

@@ -8,7 +8,7 @@ from semstab.core.compiled import helper, serial
 from semstab.statistics.loops.answers import aside, first_side, own_label, squared, two_labels
 from semstab.statistics.loops.cells import add_spot, fraction, mixed
 from semstab.statistics.loops.new_spots import number_of
-from semstab.statistics.loops.surface import STEEPEST, area, in_sensor, in_world
+from semstab.statistics.loops.surface import STEEPEST, area, in_sensor, in_world, normal_of, turned
 
 ON_A_PLANE = 0.03
 """Sparse points lie on a plane if it leaves at most this over of their inverse depth, relative."""
@@ -125,15 +125,16 @@ def mean_area_of_points(grid, u, v, w, camera, around, reach, spacing, allowed, 
 
 @serial
 def new_in_points(
-    grid, u, v, w, camera, around, reach, spacing, allowed, T, edge, share, low, factor, looked, density, seed, table,
+    grid, u, v, w, camera, around, reach, apart, allowed, T, spacing, share, low, factor, looked, density, seed, table,
     point, hashed,
 ):  # fmt: skip
-    """Add spots where points show a coarse cell without one; return how many.
+    """Add spots where points show coarse cells that were not met before; return how many, and of how many cells.
 
     Places are looked at evenly over the surface, as in `new_in_image`, at `looked` points: on the plane through the
-    points around a point, up to half of `spacing` (pixels) away from it; at the point itself without a plane.
+    points around a point, up to half of `apart` (pixels) away from it; at the point itself without a plane, where the
+    surface is taken to face the sensor.
     """
-    total, n, at = len(w), 0, np.int64(seed % len(w))
+    total, n, met, at = len(w), 0, 0, np.int64(seed % len(w))
     for _ in range(looked):
         at += factor
         if at >= total:
@@ -142,21 +143,34 @@ def new_in_points(
             continue
         number = np.uint32(np.uint32(seed) ^ (np.uint32(at) * np.uint32(0x85EBCA6B)))
         pixel_area, there, along_x, along_y = shown_by(grid, u, v, w, at, camera, around, reach, allowed)
-        expected = density * pixel_area * spacing * spacing / (edge * edge)
+        expected = density * pixel_area * apart * apart / (spacing * spacing)
         for _ in range(number_of(expected, fraction(np.uint32(number ^ np.uint32(0x165667B1))))):
             number = mixed(np.uint32(number + np.uint32(0x9E3779B9)))
             x, y, here = u[at], v[at], w[at]
             if there > 0.0:
-                dx = (fraction(number) - 0.5) * spacing
-                dy = (fraction(np.uint32(number ^ np.uint32(0x27D4EB2F))) - 0.5) * spacing
+                dx = (fraction(number) - 0.5) * apart
+                dy = (fraction(np.uint32(number ^ np.uint32(0x27D4EB2F))) - 0.5) * apart
                 near = there * (1.0 + along_x * dx + along_y * dy)
                 if near > 0.5 * here:
                     x, y, here = x + dx, y + dy, near
-            px, py, pz = in_world(*back(x, y, here, camera, around), T)
-            n = add_spot(px, py, pz, edge, share, low, table, point, hashed, n)
-            if n == len(hashed):
-                return n
-    return n
+            p = in_world(*back(x, y, here, camera, around), T)
+            normal = turned(*normal_at(x, y, here, along_x * there, along_y * there, camera, around), T)
+            n, met = add_spot(p, normal, spacing, share, low, table, point, hashed, n, met)
+            if met == len(hashed):
+                return n, met
+    return n, met
+
+
+@helper
+def normal_at(x, y, w, along_x, along_y, camera, around):
+    """Return the normal of a surface at image coordinates, by its inverse depth, or range, and slopes in a pixel."""
+    fx, fy, cx, cy = camera
+    if not around:
+        return normal_of(w, along_x, along_y, (x - cx) / fx, (y - cy) / fy, fx, fy)
+    azimuth, elevation = x / fx - np.pi, y / fy - 0.5 * np.pi
+    ca, sa, ce, se = np.cos(azimuth), np.sin(azimuth), np.cos(elevation), np.sin(elevation)
+    east, up = along_x * fx / max(ce, 1e-3), along_y * fy
+    return w * ce * ca - east * sa - up * se * ca, w * ce * sa + east * ca - up * se * sa, w * se + up * ce
 
 
 @serial

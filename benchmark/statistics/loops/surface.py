@@ -88,8 +88,8 @@ def second_differences(depth, stride, found):
 
 
 @helper
-def smoothed(depth, row, column, here, dx, dy, allowed):
-    """Return inverse depth at (dx, dy) from a pixel's centre, by a plane through the pixels around it.
+def plane_around(depth, row, column, here, allowed):
+    """Return inverse depth at a pixel's centre, and its slopes, by a plane through the pixels around it.
 
     Pixels of another surface do not count: they differ by more than noise, `allowed` (relative), and slope explain. So
     a spot's own error is a fifth of a pixel's, and views from other sides meet it where it is.
@@ -106,8 +106,7 @@ def smoothed(depth, row, column, here, dx, dy, allowed):
             n, sx, sy, sw = n + 1.0, sx + a, sy + b, sw + w
             sxx, sxy, syy, sxw, syw = sxx + a * a, sxy + a * b, syy + b * b, sxw + a * w, syw + b * w
     if n < LEAST_AROUND:
-        along_x, along_y = slopes(depth, row, column, here)
-        return here + along_x * dx + along_y * dy
+        return here, *slopes(depth, row, column, here)
     mx, my, mw = sx / n, sy / n, sw / n
     cxx, cxy, cyy, cxw, cyw = (
         sxx / n - mx * mx,
@@ -118,19 +117,28 @@ def smoothed(depth, row, column, here, dx, dy, allowed):
     )
     det = cxx * cyy - cxy * cxy
     if not det > 0.01:
-        return here
-    return here + mw + (cyy * cxw - cxy * cyw) / det * (dx - mx) + (cxx * cyw - cxy * cxw) / det * (dy - my)
+        return here, 0.0, 0.0
+    along_x, along_y = (cyy * cxw - cxy * cyw) / det, (cxx * cyw - cxy * cxw) / det
+    return here + mw - along_x * mx - along_y * my, along_x, along_y
+
+
+@helper
+def normal_of(w, along_x, along_y, x, y, fx, fy):
+    """Return n of the plane n . X = 1, 1/m, from its inverse depth at ray (x, y, 1), and slopes in a pixel.
+
+    Inverse depth of the plane is n . (x, y, 1).
+    """
+    nx, ny = along_x * fx, along_y * fy
+    return nx, ny, w - nx * x - ny * y
 
 
 @helper
 def area(here, along_x, along_y, x, y, fx, fy):
     """Return the area of the surface that a pixel at ray (x, y, 1) shows, m^2, from inverse depth and its slopes.
 
-    Inverse depth of a plane n . X = 1 is n . (x, y, 1). So n follows from the slopes, and the area is
-    z^3 |n| / (fx fy), at most STEEPEST times that of a surface that faces the camera.
+    It is z^3 |n| / (fx fy) of a plane n . X = 1, at most STEEPEST times that of a surface that faces the camera.
     """
-    nx, ny = along_x * fx, along_y * fy
-    nz = here - nx * x - ny * y
+    nx, ny, nz = normal_of(here, along_x, along_y, x, y, fx, fy)
     normal = np.sqrt(nx * nx + ny * ny + nz * nz)
     return min(normal, STEEPEST * here) / (here * here * here * fx * fy)
 
@@ -160,6 +168,16 @@ def in_world(x, y, z, T):
         T[0, 0] * x + T[0, 1] * y + T[0, 2] * z + T[0, 3],
         T[1, 0] * x + T[1, 1] * y + T[1, 2] * z + T[1, 3],
         T[2, 0] * x + T[2, 1] * y + T[2, 2] * z + T[2, 3],
+    )
+
+
+@helper
+def turned(x, y, z, T):
+    """Return a direction of the sensor in the world."""
+    return (
+        T[0, 0] * x + T[0, 1] * y + T[0, 2] * z,
+        T[1, 0] * x + T[1, 1] * y + T[1, 2] * z,
+        T[2, 0] * x + T[2, 1] * y + T[2, 2] * z,
     )
 
 
