@@ -231,7 +231,7 @@ class SpotAgreement:
     """The observations that alpha rests on: labels that views give spots of the surface.
 
     Attributes:
-        spacing: Edge in metres of the coarse cells that have a spot each.
+        spacing: Distance of spots in metres: a spot stands for its square of surface.
         spots: Spots that two views saw or more.
         cubes: Cubes of space that hold them.
         frames: Frames that were fused.
