@@ -691,8 +691,8 @@ def shelf():
     return [scene.frame(index, "gt") for index in range(15)]
 
 
-def test_two_spots_beside_a_face_of_their_cells_are_two_units():
-    """They share a voxel of their log, a 64th of the spacing."""
+def test_two_spots_within_a_64th_of_the_spacing_are_one_unit():
+    """As rare as they are, on both sides of a face of their cells; the answers of both count."""
     column = np.array([0, 0, 1, 1])
     spots = SpotObservations(
         spot=column.astype(np.int32),
@@ -707,6 +707,6 @@ def test_two_spots_beside_a_face_of_their_cells_are_two_units():
     )
     assert len({*map(tuple, spots.cell.tolist())}) == 2
     log = spots.observations()
-    assert np.bincount(log.voxel).tolist() == [2, 2]
-    assert log.evidence.weight.tolist() == [1, 1, 1, 1]
-    assert value(sums_of_spots(spots).answers[0], "voxel_alpha") == 1
+    assert np.bincount(log.voxel).tolist() == [2]
+    assert log.evidence.weight.tolist() == [0.5] * 4
+    assert log.table().op.tolist() == [2]

@@ -234,19 +234,18 @@ class SpotObservations:
     def _by_voxel(self) -> tuple[Int64, Int64, Int64, Int64]:
         """(n, 3) indices of the voxels of a log and (n,) their spots; (m,) answers in order, and the voxel of each.
 
-        A spot is a voxel of a PARTS-th of the spacing; of a voxel that holds two spots there are two.
+        A spot is a voxel of a PARTS-th of the spacing; the few spots that share one are one location.
         """
         rows = np.flatnonzero(self.label < self.K)
         spot = self.spot[rows]
         number = np.zeros(len(self.point), np.int64)
         number[spot] = 1
         spots = np.flatnonzero(number)
-        index = np.floor(self.point[spots] * (PARTS / self.spacing)).astype(np.int64)
-        by_index = np.lexsort(index.T[::-1])
-        at = spots[by_index]
-        number[at] = np.arange(len(at))
+        index, number[spots] = distinct_rows(np.floor(self.point[spots] * (PARTS / self.spacing)).astype(np.int64))
+        at = np.empty(len(index), np.int64)
+        at[number[spots]] = spots
         order = np.lexsort((self.view[rows], number[spot]))
-        return index[by_index], at, rows[order], number[spot[order]]
+        return index, at, rows[order], number[spot[order]]
 
     def _log(self, label: UInt16, square: Float32 | None = None) -> tuple[Events, Float64]:
         """Return a log of these labels, and (m,) squared distances."""
