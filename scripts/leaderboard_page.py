@@ -34,7 +34,7 @@ Made by:
 semstab-bench benchmark city@1 -m sim-steady -m sim-flicker -m sim-soft -m trick-two-class \\
   -m trick-world-locked -m trick-constant --submit results
 semstab-bench benchmark city@1 --predict colour-clusters \\
-  --taxonomy results/colour_clusters_uavid7.yaml --submit results
+  --taxonomy results/colour_clusters_uavid7.yaml --out runs/colours --submit results
 semstab-bench benchmark apc_shelf@1 --data DATA/apc_shelf --submit results
 semstab-bench benchmark livingroom@1 --data DATA/livingroom \\
   --predict EdgeNets/nets.py:espnetv2_voc,scale=0.5,name=espnetv2-0.5 ... --submit results
