@@ -439,6 +439,7 @@ def test_spots_are_one_in_a_coarse_cell_and_even_over_the_floor():
     """Most of the cells which the first image shows have one."""
     spots = sampled(flight(1))
     assert len({*map(tuple, spots.cell.tolist())}) == len(spots.point)
+    assert len({*map(tuple, spots.places(np.arange(len(spots.point))).tolist())}) == len(spots.point)
     shown = 60 * 80 * (Z / F) ** 2 / spots.spacing**2
     assert 0.75 < len(spots.point) / shown < 1.1
     assert len(spots.point) == len(sampled([next(flight(1, coin=True))]).point)
@@ -691,8 +692,8 @@ def shelf():
     return [scene.frame(index, "gt") for index in range(15)]
 
 
-def test_two_spots_within_a_64th_of_the_spacing_are_one_unit():
-    """As rare as they are, on both sides of a face of their cells; the answers of both count."""
+def test_two_spots_beside_a_face_of_their_cells_are_two_units():
+    """A face of cells lies halfway between two of the 64ths in which a log tells places."""
     column = np.array([0, 0, 1, 1])
     spots = SpotObservations(
         spot=column.astype(np.int32),
@@ -707,6 +708,6 @@ def test_two_spots_within_a_64th_of_the_spacing_are_one_unit():
     )
     assert len({*map(tuple, spots.cell.tolist())}) == 2
     log = spots.observations()
-    assert np.bincount(log.voxel).tolist() == [2]
-    assert log.evidence.weight.tolist() == [0.5] * 4
-    assert log.table().op.tolist() == [2]
+    assert np.bincount(log.voxel).tolist() == [2, 2]
+    assert log.evidence.weight.tolist() == [1, 1, 1, 1]
+    assert value(sums_of_spots(spots).answers[0], "voxel_alpha") == 1

@@ -24,7 +24,7 @@ from semstab.data.features import Features
 from semstab.data.frames import Frame
 from semstab.errors import DataError
 from semstab.statistics.cluster_sums import distinct_rows
-from semstab.statistics.observations import PARTS, SpotObservations
+from semstab.statistics.observations import SpotObservations
 
 logger = logging.getLogger("semstab")
 
@@ -193,9 +193,8 @@ class FeatureObservations:
     def _order(self) -> tuple[Int64, Int64]:
         """The answers in order of observations, and (m + 1,) the first one of each observation."""
         spots, spot_ids = self.spots, np.unique(self.spots.spot)
-        place = np.floor(spots.point[spot_ids] * (PARTS / spots.spacing)).astype(np.int64)
         number = np.zeros(len(spots.point), np.int64)
-        number[spot_ids] = distinct_rows(place)[1]  # as the log numbers its voxels
+        number[spot_ids] = distinct_rows(spots.places(spot_ids))[1]  # as the log numbers its voxels
         key = number[self.spots.spot] * max(len(self.spots.views), 1) + self.spots.view
         order = np.argsort(key, kind="stable")
         first = np.flatnonzero(np.diff(key[order], prepend=-1))

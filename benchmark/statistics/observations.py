@@ -151,6 +151,13 @@ class SpotObservations:
         """(n, 3) coarse cell of each spot."""
         return cells_of(self.point, self.spacing)
 
+    def places(self, spots: Int64) -> Int64:
+        """Return the nearest PARTS-th (n, 3) of the spacing to spots: no two spots have the same one.
+
+        Faces of coarse cells lie halfway between PARTS-ths.
+        """
+        return np.floor(self.point[spots] * (PARTS / self.spacing) + 0.5).astype(np.int64)
+
     @property
     def distance(self) -> Float64:
         """(m,) metres from the spot to the centre of the view that answers."""
@@ -234,14 +241,14 @@ class SpotObservations:
     def _by_voxel(self) -> tuple[Int64, Int64, Int64, Int64]:
         """(n, 3) indices of the voxels of a log and (n,) their spots; (m,) answers in order, and the voxel of each.
 
-        A spot is a voxel of a PARTS-th of the spacing; the few spots that share one are one location.
+        A spot is a voxel of a PARTS-th of the spacing.
         """
         rows = np.flatnonzero(self.label < self.K)
         spot = self.spot[rows]
         number = np.zeros(len(self.point), np.int64)
         number[spot] = 1
         spots = np.flatnonzero(number)
-        index, number[spots] = distinct_rows(np.floor(self.point[spots] * (PARTS / self.spacing)).astype(np.int64))
+        index, number[spots] = distinct_rows(self.places(spots))
         at = np.empty(len(index), np.int64)
         at[number[spots]] = spots
         order = np.lexsort((self.view[rows], number[spot]))

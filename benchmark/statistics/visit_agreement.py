@@ -170,7 +170,7 @@ def _sums(visited: VisitedSpots, K: int, of: int | None, levers: Levers | None) 
         return None
     counts = visited.counts[:, common]
     weight = counts.sum(axis=0).astype(np.float64)
-    place = np.floor(spots.point[common] * (PARTS / spots.spacing)).astype(np.int32)
+    place = spots.places(common).astype(np.int32)
     cell, at, edge = cubes_of((place[:, 0], place[:, 1], place[:, 2]), spots.spacing / PARTS)
     into = csr_array((weight, (at, np.arange(len(common)))), shape=(len(cell), len(common)))
     columns, agree = [], []

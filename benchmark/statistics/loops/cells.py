@@ -28,8 +28,9 @@ EDGE = 53 / 64
 spacing in a cell. The largest section of a cube has sqrt(2) times the square of its edge."""
 
 PHASE = 20.5 / 53
-"""Part of its edge by which coarse cells are moved from the origin, near the golden section. No face of a cell is a
-multiple of a 64th of the spacing, so floors and walls of models do not lie in faces."""
+"""Part of its edge by which coarse cells are moved from the origin, near the golden section. Faces lie halfway between
+64ths of the spacing: floors and walls of models do not lie in faces, and no two spots have the same place in a log, see
+`SpotObservations.places`."""
 
 FLAT = 1e-3
 """Least component of a unit normal, for `area_in_cell`."""
