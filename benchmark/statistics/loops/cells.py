@@ -133,7 +133,7 @@ def area_in_cell(normal, x, y, z):
 def add_spot(p, normal, spacing, share, low, table, point, hashed, n, met):
     """Add point p as spot n if its coarse cell is in the sample, was not met before, and counts.
 
-    The cell counts with the probability that the plane with this normal has of the square of the spacing in it. Returns
+    It counts with probability area / spacing^2, with the area in it of the plane through p with this normal. Returns
     how many spots there are, and how many cells were met.
     """
     px, py, pz = p
