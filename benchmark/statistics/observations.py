@@ -151,12 +151,13 @@ class SpotObservations:
         """(n, 3) coarse cell of each spot."""
         return cells_of(self.point, self.spacing)
 
-    def places(self, spots: Int64) -> Int64:
+    def places(self, spots: npt.NDArray[np.integer[Any]]) -> Int64:
         """Return the nearest PARTS-th (n, 3) of the spacing to spots: no two spots have the same one.
 
         Faces of coarse cells lie halfway between PARTS-ths.
         """
-        return np.floor(self.point[spots] * (PARTS / self.spacing) + 0.5).astype(np.int64)
+        nearest: Int64 = np.floor(self.point[spots] * (PARTS / self.spacing) + 0.5).astype(np.int64)
+        return nearest
 
     @property
     def distance(self) -> Float64:
