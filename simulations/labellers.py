@@ -38,10 +38,10 @@ def rows(scene: str, frames: int, width: int) -> Iterator[list[str]]:
     settings = {"dataset": {"name": "city", "options": options}, "scenes": [scene], "check": None}
     with tempfile.TemporaryDirectory() as folder:
         results = []
-        for statistics in (False, True):
-            out = Path(folder) / str(statistics)
+        for truth in (False, True):
+            out = Path(folder) / str(truth)
             semstab.run(
-                semstab.load_config(overrides={**settings, "models": names, "statistics": statistics}),
+                semstab.load_config(overrides={**settings, "models": names, "truth": truth}),
                 out=out,
                 report=False,
             )
