@@ -167,7 +167,7 @@ def compare(
     Examples:
         >>> semstab.compare("run:sim-steady", "run:sim-flicker")
         <RunComparison with sim-steady on scene0>
-          sim-flicker: alpha -.19 ..., p ...; worse in alpha, psa_op2, vss_op3...
+          sim-flicker: alpha -.18 ..., p ...; worse in alpha, psa_op2, vss_op3...
     """
     return compare_opened(open_compared(runs), out=out, scope=scope, progress=progress)
 

@@ -111,13 +111,13 @@ def load(folder: str | Path) -> Run:
     Examples:
         >>> run = semstab.load("run")
         >>> run.summary[["model", "verdict"]]
-                 model   verdict
-        0   sim-steady    stable
-        1  sim-flicker  unstable
+                 model    verdict
+        0   sim-steady     stable
+        1  sim-flicker  undecided
         >>> run.classes[["model", "class", "alpha", "alpha_low", "alpha_high"]].head(2).round(2)
                 model     class  alpha  alpha_low  alpha_high
         0  sim-steady  building   0.92       0.91        0.93
-        1  sim-steady      road   0.89       0.88        0.90
+        1  sim-steady      road   0.89       0.88        0.91
     """
     return Run(Path(folder), load_result(folder))
 
