@@ -221,7 +221,7 @@ def test_disagreement_is_exit_3_after_everything_is_written(wall, tmp_path) -> N
 
 
 def test_ctrl_c_is_exit_130_and_the_same_command_goes_on(tmp_path) -> None:
-    wall = tiny_scene.write(tmp_path / "wall", models=("a", "b"), frames=100)
+    wall = tiny_scene.write(tmp_path / "wall", models=tuple("abcdef"), frames=100)
     arguments = ("--data", wall, "--backend", "numpy", "--voxel-size", "0.05", "--rerun", "off", "--out", "run")
     process = started(*arguments, cwd=tmp_path)
     units = tmp_path / "run" / "units"
@@ -235,7 +235,7 @@ def test_ctrl_c_is_exit_130_and_the_same_command_goes_on(tmp_path) -> None:
     assert "with --out run resumes" in stderr
     assert "Traceback" not in stderr
     again = bench(*arguments, cwd=tmp_path)
-    assert "finished earlier: 1 of 2 units" in again.stderr
+    assert re.search(r"finished earlier: [1-5] of 6 units", again.stderr)
 
 
 def test_a_warning_of_check_and_run_is_said_once(monkeypatch, capsys):
