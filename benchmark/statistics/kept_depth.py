@@ -17,7 +17,7 @@ import numpy as np
 import numpy.typing as npt
 
 from semstab.core.types import Float64, Int64, Mask, UInt16
-from semstab.data.frames import Frame
+from semstab.data.frames import Frame, Pinhole
 from semstab.statistics.kept_points import KeptPoints, codes
 from semstab.statistics.misplaced import fitting
 from semstab.statistics.votes import LEAST_VOTES, NEXT_TO, NEXT_TO_OF_POINTS, SpotVotes, has_moved, lone
@@ -69,15 +69,13 @@ class KeptDepth:
 
     view: int
     T_wc: Float64
-    camera: tuple[float, float, float, float]
+    camera: Pinhole
     stride: float
     near: UInt16
     far: UInt16
 
     @classmethod
-    def of_image(
-        cls, view: int, T_wc: Float64, camera: tuple[float, float, float, float], depth: npt.NDArray[Any]
-    ) -> KeptDepth:
+    def of_image(cls, view: int, T_wc: Float64, camera: Pinhole, depth: npt.NDArray[Any]) -> KeptDepth:
         """Keep depth (H, W)."""
         from semstab.statistics.loops.moving import blocks_of_image
 
@@ -239,9 +237,7 @@ def near_by_of(sigma: float) -> float:
     return max(NEAR_BY, NEAR_BY_SIGMAS * sigma)
 
 
-def firm(
-    point: Float64, T_wc: Float64, camera: tuple[float, float, float, float], depth: npt.NDArray[Any], noise: float
-) -> Mask:
+def firm(point: Float64, T_wc: Float64, camera: Pinhole, depth: npt.NDArray[Any], noise: float) -> Mask:
     """Return which points (n, 3) that an image (H, W) shows lie at no edge of its depth; `noise` is relative."""
     from semstab.statistics.loops.moving import on_one_surface
 

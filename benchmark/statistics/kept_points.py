@@ -9,6 +9,7 @@ import numpy as np
 import numpy.typing as npt
 
 from semstab.core.types import Float64, Mask, UInt16
+from semstab.data.frames import Pinhole
 
 PIXELS, WIDER = 125_000, 1.1
 """Most pixels, about, of a view's image of directions, and the edge of a pixel by the distance of the points, at least:
@@ -49,7 +50,7 @@ class KeptPoints:
 
     view: int
     T_wc: Float64
-    camera: tuple[float, float, float, float]
+    camera: Pinhole
     around: bool
     stride: float
     spacing: float
@@ -61,7 +62,7 @@ class KeptPoints:
         cls,
         view: int,
         T_wc: Float64,
-        camera: tuple[float, float, float, float],
+        camera: Pinhole,
         around: bool,
         spacing: float,
         shape: tuple[int, int],

@@ -86,16 +86,6 @@ def key_of(a, b, c):
     return np.int64(a) << (2 * BITS) | np.int64(b) << BITS | np.int64(c)
 
 
-@helper
-def cell_of(x, y, z, spacing):
-    """Return the coarse cell of a point; no face of a cell lies in a plane such as z = 0, where floors lie."""
-    edge = EDGE * spacing
-    return (
-        np.int64(np.floor(x / edge + PHASE)), np.int64(np.floor(y / edge + PHASE)),
-        np.int64(np.floor(z / edge + PHASE)),
-    )  # fmt: skip
-
-
 @serial
 def refill(table, share, low, new):
     """Add the cells of a table that are in the sample to a new table; return how many."""
@@ -138,13 +128,14 @@ def add_spot(p, normal, spacing, share, low, table, point, hashed, n, met):
     """
     px, py, pz = p
     edge = EDGE * spacing
-    i, j, k = cell_of(px, py, pz, spacing)
+    x, y, z = px / edge + PHASE, py / edge + PHASE, pz / edge + PHASE
+    i, j, k = np.int64(np.floor(x)), np.int64(np.floor(y)), np.int64(np.floor(z))
     a, b, c, cell_hash = i - low[0], j - low[1], k - low[2], hash_cell(i, j, k)
     within_reach = 0 <= a < SPAN and 0 <= b < SPAN and 0 <= c < SPAN
     if cell_hash >= share or not within_reach or not is_new(table, key_of(a, b, c), True):
         return n, met
-    place = px / edge + PHASE - i, py / edge + PHASE - j, pz / edge + PHASE - k
-    if fraction(np.uint32(cell_hash ^ np.uint32(0x9E3779B9))) >= EDGE * EDGE * area_in_cell(normal, *place):
+    area = EDGE * EDGE * area_in_cell(normal, x - i, y - j, z - k)
+    if fraction(np.uint32(cell_hash ^ np.uint32(0x9E3779B9))) >= area:
         return n, met + 1
     point[n, 0], point[n, 1], point[n, 2], hashed[n] = px, py, pz, cell_hash
     return n + 1, met + 1
