@@ -81,6 +81,9 @@ class FusionBackend(Protocol):
 
     A static method `check_options(voxel_size, num_classes, ...)`, with those options that it checks, raises ConfigError
     for values that no map can have: a run calls it before it reads a frame.
+
+    A backend to which growth costs much has `room()`, which returns the size of a map, a whole number in units of its
+    own, and `reserve(room)`, which makes as much room in an empty map: a run calls it for each further map of a scene.
     """
 
     def integrate(self, frame: Frame) -> FrameReport:

@@ -40,6 +40,9 @@ FILLED, OFTEN = 0.2, 1.2
 SPARE, GROWING = 1.3, 1.0
 """Blocks that a grid has room for, and those of the one that it grew from, to each that is seen, on average."""
 
+RESERVED = 8
+"""Blocks of another map of the same frames to each spare one: labels lie a little differently there."""
+
 DENSE = ("evidence", "classes")
 """Attributes of more than one number."""
 
@@ -103,6 +106,15 @@ class Open3DBlocks(FusionBackend):
         """
         voxel_bytes = 8 * (num_classes + mask_words(num_classes)) + 48
         return int(max((SPARE + GROWING) * voxels / (OFTEN * FILLED), LEAST_BLOCKS * 4**3) * voxel_bytes)
+
+    def room(self) -> int:
+        """Return the blocks of the map, for `reserve` of another map of the same frames."""
+        return int(self.grid.hashmap().size())
+
+    def reserve(self, room: int) -> None:
+        """Make room for that many blocks in an empty map: a grid that grows is copied each time."""
+        if room > self.grid.hashmap().capacity():
+            self.grid = self._new_grid(room + room // RESERVED)
 
     def integrate(self, frame: Frame) -> FrameReport:
         """Fuse one frame: aggregate its pixels to voxels, activate the blocks, update the touched voxels."""

@@ -74,6 +74,17 @@ class TestOpen3D(BackendConformance):
     def create(self, voxel_size, num_classes):
         return open3d_map(voxel_size, num_classes, block_resolution=7)
 
+    def test_a_map_with_room_for_another_ones_blocks_never_grows_and_is_the_same(self) -> None:
+        hits = [(7.0 * i + 0.5, i % 3) for i in range(200)]
+        growing, ready = (open3d_map(0.25, 3) for _ in range(2))
+        growing.integrate(sight_line(0, hits))
+        ready.reserve(growing.room())
+        before = ready.grid.hashmap().capacity()
+        ready.integrate(sight_line(0, hits))
+        assert growing.room() == 200
+        assert ready.grid.hashmap().capacity() == before >= 200
+        assert ready.table().evidence[:].tolist() == growing.table().evidence[:].tolist()
+
     def test_a_first_frame_beyond_the_room(self) -> None:
         """The first frame alone needs 200 blocks; the second one sees the same voxels again."""
         hits = [(7.0 * i + 0.5, i % 3) for i in range(200)]

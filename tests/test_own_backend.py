@@ -50,6 +50,23 @@ def test_it_is_called_by_the_name_of_its_class_and_checked(folder) -> None:
     assert load_result(folder / "out").backend == "Mine"
 
 
+GROWS = """
+    def room(self):
+        return len(self.table())
+
+    def reserve(self, room):
+        with open("rooms.txt", "a") as file:
+            print(room, file=file)
+"""
+
+
+def test_a_backend_is_told_the_room_that_the_last_map_of_the_scene_had(tmp_path) -> None:
+    tiny_scene.write(tmp_path / "wall", models=("a", "b", "c"))
+    (tmp_path / "fusion.py").write_text(ALIKE.replace("    pass", GROWS), encoding="utf-8")
+    run(tmp_path, "--backend", "fusion.py:Mine", "--check", "none")
+    assert (tmp_path / "rooms.txt").read_text().split() == ["60", "60"]
+
+
 SLEEPS = """
     def integrate(self, frame):
         import time

@@ -7,6 +7,8 @@ import math
 
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 from simulated_events import grid, log_of, spots_of
 from statsmodels.stats.multitest import multipletests
 
@@ -42,6 +44,19 @@ def test_shared_rows_are_the_voxels_that_all_maps_hold():
     a = table_of([(0, 0, 0)])
     with pytest.raises(DataError, match="fuse both with the same settings"):
         shared_rows(a, dataclasses.replace(a, voxel_size=0.4))
+
+
+places = st.sets(st.tuples(*[st.integers(-2, 2)] * 3), min_size=1)
+
+
+@given(st.lists(places, min_size=2, max_size=4))
+def test_shared_rows_of_any_maps_are_the_intersection_of_their_voxels(maps):
+    tables = [table_of(sorted(voxels)) for voxels in maps]
+    shared = sorted(set.intersection(*maps))
+    assert all(
+        [*map(tuple, table.index[rows].tolist())] == shared
+        for table, rows in zip(tables, shared_rows(*tables), strict=True)
+    )
 
 
 def test_coverage_by_hand_and_holm_as_in_statsmodels():

@@ -129,3 +129,25 @@ def bound_groups(of: Any, bounds: Any) -> None:
     """Fill bounds[1:] of (n + 1,) with where each of n groups ends; of (m,) are numbers from 0 on, ascending."""
     for row in range(of.shape[0]):
         bounds[of[row] + 1] = row + 1
+
+
+# Compiled loop over voxels of two maps.
+
+
+@serial
+def mark_common(first: Any, second: Any, in_first: Any, in_second: Any) -> int:
+    """Write the rows of the voxels that two maps share, (n,) and (m,), and return how many they share.
+
+    Voxel indices (n, 3) and (m, 3) are in order, and no voxel is there twice.
+    """
+    i = j = shared = 0
+    while i < len(first) and j < len(second):
+        order = first[i, 0] - second[j, 0]
+        order = first[i, 1] - second[j, 1] if order == 0 else order
+        order = first[i, 2] - second[j, 2] if order == 0 else order
+        if order == 0:
+            in_first[shared], in_second[shared] = i, j
+            shared += 1
+        i += order <= 0
+        j += order >= 0
+    return shared

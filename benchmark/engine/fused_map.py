@@ -44,6 +44,7 @@ def fused_map(live: LiveMap, watch: Stopwatch) -> FusedMap:
     """Return the tables of a map, whose backend is let go: the statistics have its memory."""
     assert live.backend is not None
     config, classes = live.config, live.task.mapping.target.classes
+    live.remember_room()
     with watch("table"):
         table = replace(live.backend.table(), classes=classes)
         _check_evidence(table, live.name)

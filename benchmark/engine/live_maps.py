@@ -7,6 +7,7 @@ import dataclasses
 import json
 import math
 import time
+import weakref
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import partial
@@ -92,6 +93,7 @@ class LiveMap:
         live = cls(work, task, frames=_as_set(work.frames))
         if work.fuses:
             live.backend = live.new_map()
+            live._reserve(scene)
             if unit.compares_truth and truth_task(task) is not None:
                 live.truth = live.new_truth_map()
             if unit.sampled:
@@ -130,6 +132,22 @@ class LiveMap:
             size, K = self.config.voxel_size, len(self.task.mapping.target)
             return create(name, voxel_size=size, num_classes=K, within=self.work.within)
         return self.new_map(log=False, by_rule=False)
+
+    def _reserve(self, scene: Scene) -> None:
+        """Make as much room as the last map of these frames had, where growth costs the backend much."""
+        room = _rooms.get(scene, {}).get(self._room_key())
+        if room is not None and (reserve := getattr(self.backend, "reserve", None)) is not None:
+            reserve(room)
+
+    def remember_room(self) -> None:
+        """Let further maps of these frames begin with the room of this one."""
+        if (room := getattr(self.backend, "room", None)) is not None:
+            _rooms.setdefault(self.task.scene, {})[self._room_key()] = room()
+
+    def _room_key(self) -> tuple[object, ...]:
+        config, tile = self.config, self.work.tile
+        frames = tuple(self.task.indices), config.pixel_stride
+        return self.name.backend, config.voxel_size, *frames, None if tile is None else tile.name
 
     def warm_up(self, frame: Frame) -> None:
         """Let the backend load and compile what it needs for such frames, once a process: no frame is timed with it."""
@@ -222,6 +240,9 @@ class LiveMap:
 
 
 _warm: set[tuple[str, str, int, bool]] = set()
+
+_rooms: weakref.WeakKeyDictionary[Scene, dict[tuple[object, ...], int]] = weakref.WeakKeyDictionary()
+"""The room that the last map of a scene's frames had."""
 
 
 # --- Frames -----------------------------------------------------------------------------------------------------------

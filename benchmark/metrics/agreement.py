@@ -6,7 +6,6 @@ import dataclasses
 import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
-from functools import reduce
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -16,7 +15,6 @@ from semstab.core.types import Float64, Int32, Int64, Mask
 from semstab.data.events import Events
 from semstab.data.measures import dominant, measures
 from semstab.data.results import Agreement, Deviation, Mismatch, UnitName
-from semstab.data.voxel_keys import voxel_keys
 from semstab.data.voxels import VoxelTable
 from semstab.errors import DataError
 
@@ -32,17 +30,15 @@ def shared_rows(*tables: VoxelTable) -> list[Int64]:
     require_same_grid(*tables)
     if same_voxels(*tables):
         return [np.arange(len(tables[0]))] * len(tables)
-    keys = voxel_keys(*(table.index for table in tables))
-    common = reduce(_intersection, keys)
-    return [np.searchsorted(table_keys, common).astype(np.int64) for table_keys in keys]
+    from semstab.data.kernels import mark_common
 
-
-def _intersection(a: Int64, b: Int64) -> Int64:
-    """Return the common keys of two ascending arrays."""
-    if not len(b):
-        return b
-    common: Int64 = a[b[np.minimum(np.searchsorted(b, a), len(b) - 1)] == a]
-    return common
+    first = tables[0].index
+    rows = [np.arange(len(first))]
+    for table in tables[1:]:
+        in_first, in_table = np.empty((2, min(len(first), len(table))), np.int64)
+        n = mark_common(first, table.index, in_first, in_table)
+        first, rows = first[in_first[:n]], [*(of[in_first[:n]] for of in rows), in_table[:n]]
+    return rows
 
 
 def same_voxels(first: VoxelTable, *others: VoxelTable) -> bool:

@@ -49,7 +49,7 @@ from semstab.recording.voxel_maps import (
     verdict_report,
 )
 from semstab.report.narrative import not_assessed
-from semstab.statistics.moving import states_of
+from semstab.statistics.moving import has_movers, states_of
 from semstab.task import Task, read
 
 logger = logging.getLogger("semstab")
@@ -383,18 +383,17 @@ class Recording(Observer):
             self._opened()[0].log(path(scene, "log"), rr.TextLog(text))
 
     def _log_unit(self, group: GroupLog, record: Record, table: VoxelTable, factor: int = 1) -> None:
-        moved, unit = states_of(record, table.centers), record.unit
-        stream, background = self._opened()
+        unit, (stream, background) = record.unit, self._opened()
         self._logged.add(unit)
         if not_assessed(record):
             self._not_assessed.add((unit.scene, unit.model))
-        if moved is not None:
+        if has_movers(record):
             self._with_movers.add((unit.scene, unit.model))
         tolerance = self._plan.config.tolerance
 
         def job() -> None:
             self._series.send()
-            group.log_unit(stream, record, table, tolerance, factor, moved)
+            group.log_unit(stream, record, table, tolerance, factor, states_of(record, table.centers))
             self._scenes[unit.scene].see(stream, group.task, table)
             self._outdated = True
             if self._sent == 1:  # later layouts wait for the end: each has all scenes

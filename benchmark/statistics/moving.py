@@ -83,16 +83,20 @@ def states_at(spots: SpotObservations, point: Float64) -> UInt8:
     if spots.votes is None or not len(spots.point):
         return np.full(len(point), UNTOLD, np.uint8)
     states[:-1][spots.votes.static], states[:-1][spots.votes.moved] = STAYED, MOVED
-    _, nearest = cKDTree(spots.point).query(point, distance_upper_bound=spots.spacing)
+    _, nearest = cKDTree(spots.point).query(point, distance_upper_bound=spots.spacing, workers=-1)
     return np.asarray(states[nearest], np.uint8)
+
+
+def has_movers(record: Record) -> bool:
+    """Return whether movers were found in a unit, and its spots are there to tell where."""
+    found = record.statistics is not None and record.statistics.static is not None
+    return found and record.observations_file is not None
 
 
 def states_of(record: Record, point: Float64) -> UInt8 | None:
     """Return the state (n,) of points (n, 3) of a unit's map, see `states_at`; None if no movers were found."""
     file = record.observations_file
-    if record.statistics is None or record.statistics.static is None or file is None:
-        return None
-    return states_at(SpotObservations.load(file), point)
+    return None if file is None or not has_movers(record) else states_at(SpotObservations.load(file), point)
 
 
 def share_of_disagreement(spots: SpotObservations, moved: Mask, static: Mask) -> float:

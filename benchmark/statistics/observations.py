@@ -296,7 +296,8 @@ class SpotObservations:
             about["distances"] = self.distances.tolist()
         content = pa.table(columns)
         text = json.dumps({"schema": SCHEMA, "kind": "SpotObservations", **about, "views": self.views.rows().tolist()})
-        with atomic_path(path) as temporary, pq.ParquetWriter(temporary, content.schema, compression="zstd") as file:
+        packed = {"compression": "zstd", "use_dictionary": False}  # dictionaries take more time, and more space
+        with atomic_path(path) as temporary, pq.ParquetWriter(temporary, content.schema, **packed) as file:
             file.write_table(content)
             file.add_key_value_metadata({"semstab": text})  # metadata of a schema would be written twice
 

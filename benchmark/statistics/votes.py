@@ -80,9 +80,10 @@ def next_to_moved(point: Float64, moved: Mask, static: Mask, spacing: float, wit
         unknown, of_moved = np.flatnonzero(~moved & ~static & ~next_to), point[moved | next_to]
         if not len(unknown) or len(of_moved) < LEAST_NEXT_TO:
             break
-        trees = cKDTree(of_moved), stayed
-        near = [tree.query_ball_point(point[unknown], within * spacing, return_length=True) for tree in trees]
-        next_to[unknown] = (near[0] >= LEAST_NEXT_TO) & (near[0] >= near[1])
+        near = cKDTree(of_moved).query_ball_point(point[unknown], within * spacing, return_length=True)
+        asked = unknown[near >= LEAST_NEXT_TO]
+        near_stayed = stayed.query_ball_point(point[asked], within * spacing, return_length=True)
+        next_to[asked] = near[near >= LEAST_NEXT_TO] >= near_stayed
     return next_to
 
 

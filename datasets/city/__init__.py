@@ -11,7 +11,7 @@ import hashlib
 import json
 import threading
 from collections.abc import Mapping
-from functools import cached_property
+from functools import cached_property, lru_cache
 
 import numpy as np
 from pydantic import BaseModel
@@ -20,7 +20,7 @@ from semstab.config import nearest
 from semstab.core.types import Float64, UInt8
 from semstab.data.frames import Frame, Intrinsics
 from semstab.data.labels import LabelSpace
-from semstab.datasets.city.flight import FLIGHTS
+from semstab.datasets.city.flight import FLIGHTS, Flight
 from semstab.datasets.city.labellers import relabelled
 from semstab.datasets.city.mesh import uavid8
 from semstab.datasets.city.options import CityOptions, SimulatedModel
@@ -42,6 +42,12 @@ FIELD_OF_VIEW = 60.0
 
 USUAL_LIGHT = "noon"
 """The light of which digests say nothing."""
+
+
+@lru_cache(maxsize=2)
+def _still_part(seed: int, flight: Flight) -> CityCaster:
+    """Return what stands still in a town, which takes long to build; the same for every camera."""
+    return CityCaster(build_town(seed, flight).still)
 
 
 class City(Dataset):
@@ -165,7 +171,7 @@ class CityScene(Scene):
     @cached_property
     def still(self) -> CityCaster:
         """The still part of the town, at which rays are cast."""
-        return CityCaster(self.town.still)
+        return _still_part(self._options.seed, self._flight)
 
     def _share(self, index: int) -> float:
         """Return the share of the flight that is over at a frame."""
