@@ -12,7 +12,7 @@ from simulated_events import grid, log_of, log_of_evidence, soft
 from striped_floor import K, fused, sampled
 from striped_floor import flight as over_stripes
 
-from semstab.core.arrays import distinct_keys
+from semstab.core.arrays import distinct_keys, stable_order
 from semstab.core.json_form import to_json
 from semstab.data.measures import Measure, dominant, entropy, margin, registered, sbd, vss
 from semstab.errors import DataError
@@ -348,6 +348,12 @@ def test_measures_of_the_register_have_sums_of_their_own(tmp_path):
     assert difference(old, again, "psa").value == 0
 
 
+@pytest.mark.parametrize("count", [3, 255, 256, 70_000, 2**33])
+def test_the_order_of_small_numbers_is_that_of_numpy(count: int) -> None:
+    number = np.random.default_rng(count).integers(0, count, 500)
+    assert stable_order(number, count).tolist() == np.argsort(number, kind="stable").tolist()
+
+
 @pytest.mark.parametrize("reach", [3, 2**40])
 def test_rows_are_counted_as_they_are_told_apart(reach) -> None:
     rng = np.random.default_rng(0)
@@ -356,6 +362,15 @@ def test_rows_are_counted_as_they_are_told_apart(reach) -> None:
         np.testing.assert_array_equal(distinct, np.unique(rows, axis=0))
         np.testing.assert_array_equal(distinct[of], rows)
         assert count_distinct(rows) == len(distinct)
+
+
+def test_frames_may_have_any_numbers() -> None:
+    labels = [[0, 1, 2, 0], [1, 1, -1, 2], [2, 2, 2, 2]]
+    logs = [log_of(labels, frames=frames) for frames in ([0, 1, 2, 3], [-7, -6, -5, -4])]
+    first, earlier = (cluster_sums_of(log.table(), log) for log in logs)
+    of_frame = first.frame >= 0
+    assert np.array_equal(first.columns[of_frame], earlier.columns[earlier.frame != -1])
+    assert np.array_equal(first.frame[of_frame] - 7, earlier.frame[earlier.frame != -1])
 
 
 @pytest.mark.parametrize("most", [3, 40, 200, 10**12])

@@ -33,10 +33,11 @@ def test_keys_are_one_to_one_and_ascend_with_the_index():
         voxel_keys(np.array([[-(2**31), -(2**31), -(2**31)], [2**31 - 1] * 3]))
 
 
+@pytest.mark.parametrize("far", [0, 10**6])
 @pytest.mark.parametrize("spread", [3, 40, 100_000])
-def test_cubes_are_the_smallest_of_which_few_enough_hold_the_voxels(spread):
+def test_cubes_are_the_smallest_of_which_few_enough_hold_the_voxels(spread, far):
     rng = np.random.default_rng(spread)
-    index = np.unique(rng.integers(-spread, spread, size=(6000, 3)), axis=0).astype(np.int32)
+    index = np.unique(far + rng.integers(-spread, spread, size=(6000, 3)), axis=0).astype(np.int32)
     some = rng.random(len(index)) < 0.5
     cell, of, edge = cubes_of(tuple(index.T), 0.3, counted=some)
     at = {size: np.floor((index[some] + 0.5) * (0.3 / size)) for size in (edge, edge / 2)}

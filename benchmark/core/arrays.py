@@ -168,6 +168,11 @@ def evenly(length: int, count: int) -> list[int]:
     return sorted({round(position) for position in np.linspace(0, length - 1, min(length, count)).tolist()})
 
 
+def stable_order(number: npt.NDArray[np.integer[Any]], count: int) -> Int64:
+    """Return the order (n,) of numbers (n,) below a count, equal ones as they are; small ones NumPy sorts by digits."""
+    return np.argsort(number.astype(np.min_scalar_type(count)), kind="stable")
+
+
 def distinct_keys(key: Int64) -> tuple[Int64, Int64]:
     """Return each of the numbers (n,), none below 0, once, ascending, and which of them each is: np.unique.
 

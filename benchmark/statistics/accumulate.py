@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from semstab.core.arrays import distinct_keys, stable_order
 from semstab.core.types import Float64, Int32, Int64, Mask
 from semstab.data.events import Events
 from semstab.data.evidence import ByEntry, Evidence
@@ -200,12 +201,15 @@ def _sums_of_log(
     from semstab.core.compiled import in_chunks
     from semstab.statistics.loops.clusters import add_influences
 
-    K, truth, step, groups = events.K, true_label is not None, 1, np.unique(events.frame)
-    while len(groups) > most_groups(K):
-        step, groups = 2 * step, np.unique(groups // 2)
-    group = np.searchsorted(groups, events.frame // step).astype(np.int32)
+    K, truth, step = events.K, true_label is not None, 1
+    earliest = int(events.frame.min(initial=0))
+    frames, of = distinct_keys(events.frame.astype(np.int64) - earliest)
+    frames = frames + earliest
+    while len(groups := np.unique(frames // step)) > most_groups(K):
+        step *= 2
+    group = np.searchsorted(groups, frames // step)[of].astype(np.int32)
     again = np.flatnonzero(cubes.at >= 0)
-    order = again[np.argsort(cubes.at[again], kind="stable")]
+    order = again[stable_order(cubes.at[again], cubes.count)]
     bounds = np.concatenate([[0], np.cumsum(np.bincount(cubes.at[again], minlength=cubes.count))])
     slices = layout(K, truth=truth, meaning=distances is not None)
     sums = np.zeros((cubes.count * len(groups), width(slices)))
@@ -234,7 +238,7 @@ def _sums_of_log(
         step,
         events.voxel_size,
         events.classes,
-        len(np.unique(events.frame)),
+        len(frames),
     )
 
 

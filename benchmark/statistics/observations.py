@@ -252,8 +252,9 @@ class SpotObservations:
         index, number[spots] = distinct_rows(self.places(spots))
         at = np.empty(len(index), np.int64)
         at[number[spots]] = spots
-        order = np.lexsort((self.view[rows], number[spot]))
-        return index, at, rows[order], number[spot[order]]
+        by_view = rows[arrays.stable_order(self.view[rows], len(self.views))]
+        in_order = by_view[arrays.stable_order(number[self.spot[by_view]], len(index))]
+        return index, at, in_order, number[self.spot[in_order]]
 
     def _log(self, label: UInt16, square: Float32 | None = None) -> tuple[Events, Float64]:
         """Return a log of these labels, and (m,) squared distances."""

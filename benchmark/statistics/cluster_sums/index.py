@@ -107,14 +107,30 @@ def cubes_of(
     it is given, is the smallest power of 2 metres, no smaller than a voxel, that leaves at most MOST_CELLS cubes.
     """
     rows = np.arange(len(index[0])) if counted is None else np.flatnonzero(counted)
-    doubled = edge is None
-    edge = 2.0 ** math.ceil(math.log2(voxel_size) - 1e-9) if edge is None else edge
+    given, edge = edge, 2.0 ** math.ceil(math.log2(voxel_size) - 1e-9) if edge is None else edge
     scale = voxel_size / edge
     cell = np.stack([np.floor((axis[rows] + 0.5) * scale) for axis in index], axis=1).astype(np.int64)
-    cubes, number = distinct_rows(cell)
-    while doubled and len(cubes) > MOST_CELLS:
-        cubes, joined = distinct_rows(cubes // 2)
-        number, edge = joined[number], 2 * edge
+    (cubes, number), doublings = (distinct_rows(cell), 0) if given is not None else _few_cubes(cell)
     of = np.full(len(index[0]), -1, np.int32)
     of[rows] = number
-    return cubes.astype(np.int32), of, edge
+    return cubes.astype(np.int32), of, edge * 2**doublings
+
+
+def _few_cubes(cell: Int64) -> tuple[tuple[Int64, Int64], int]:
+    """Return the distinct cubes of cells (n, 3) and which each cell is in, and how often their edge was doubled.
+
+    The smallest cubes are sought that are at most MOST_CELLS, beginning with large ones: few are quickly counted.
+    """
+    doublings = 0
+    if len(cell) <= MOST_CELLS:
+        return distinct_rows(cell), doublings
+    low, high = cell.min(axis=0), cell.max(axis=0)
+    while math.prod(((high >> doublings) - (low >> doublings) + 1).tolist()) > MOST_CELLS:
+        doublings += 1
+    cubes = distinct_rows(cell >> doublings)
+    while doublings > 0:
+        smaller = distinct_rows(cell >> (doublings - 1))
+        if len(smaller[0]) > MOST_CELLS:
+            break
+        cubes, doublings = smaller, doublings - 1
+    return cubes, doublings
