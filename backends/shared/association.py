@@ -69,7 +69,9 @@ def check_frame(frame: Frame, num_classes: int) -> None:
             )
     else:
         assert frame.labels is not None
-        highest = int(frame.labels.max(initial=0, where=frame.valid))
+        highest = int(frame.labels.max(initial=0))
+        if highest >= num_classes:  # 255 for 'ignore', in most frames
+            highest = int(np.where(frame.valid, frame.labels, 0).max(initial=0))
         if highest >= num_classes:
             raise DataError(
                 f"{frame.where('labels')}: label id {highest} is outside 0 to {num_classes - 1}; map it or ignore it"
