@@ -145,9 +145,10 @@ class LiveMap:
             _rooms.setdefault(self.task.scene, {})[self._room_key()] = room()
 
     def _room_key(self) -> tuple[object, ...]:
+        """Return what the room of a map depends on, besides its scene."""
         config, tile = self.config, self.work.tile
-        frames = tuple(self.task.indices), config.pixel_stride
-        return self.name.backend, config.voxel_size, *frames, None if tile is None else tile.name
+        backend = self.name.backend, json.dumps(config.backends[0].options, sort_keys=True)
+        return *backend, config.voxel_size, config.pixel_stride, tuple(self.task.indices), tile and tile.name
 
     def warm_up(self, frame: Frame) -> None:
         """Let the backend load and compile what it needs for such frames, once a process: no frame is timed with it."""
