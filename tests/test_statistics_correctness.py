@@ -11,7 +11,7 @@ from simulated_events import grid, log_of, log_of_evidence
 from semstab.data.information import normalise
 from semstab.errors import DataError
 from semstab.statistics import consistent_wrong, correctness, describe, join_truth, reliability
-from semstab.statistics.agreement import consistency_posterior
+from semstab.statistics.agreement import consistency_posterior, shares_of
 from semstab.statistics.correctness import Predictions, by_stratum
 
 
@@ -111,6 +111,15 @@ def test_quadrants_by_hand():
     assert found.voxels == 0
     assert math.isnan(found.consistent_wrong.value)
     assert math.isnan(correctness(np.zeros((0, 3)), np.zeros(0, dtype=int)).accuracy)
+
+
+def test_a_part_of_a_map_has_the_bits_of_the_whole() -> None:
+    rng = np.random.default_rng(4)
+    labels = np.where(np.arange(9) < rng.integers(2, 10, (400, 1)), rng.random((400, 9)) < 0.3, -1)
+    table = log_of(labels.astype(int), K=2).table()
+    whole, shares = consistency_posterior(table), shares_of(table)
+    for part in ([0], [5], [*range(7)], [*range(200, 400)]):
+        assert np.array_equal(consistency_posterior(table.rows(np.array(part)), shares), whole[part])
 
 
 @pytest.mark.parametrize("q", [0.8, 0.95])

@@ -349,7 +349,8 @@ def consistency_posterior(
     posterior = _likelihood(num_frames, most) * (shares_of(table) if shares is None else shares)
     posterior /= posterior.sum(axis=1, keepdims=True)
     likely = np.full(len(table), np.nan)
-    likely[table.op >= 2] = posterior[:, consistent_share(consistent) <= STEPS_OF_P].sum(axis=1)[of]
+    enough = posterior[:, consistent_share(consistent) <= STEPS_OF_P]
+    likely[table.op >= 2] = np.ascontiguousarray(enough).sum(axis=1)[of]  # else a part's order would differ
     return likely
 
 
