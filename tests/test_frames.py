@@ -79,6 +79,11 @@ def test_a_frame_that_contradicts_itself_is_refused(field, changes, message):
         assert "\n" not in str(error.value)
 
 
+def test_an_index_below_0_is_refused() -> None:
+    with pytest.raises(DataError, match=r"^frame -3: its index is below 0; number frames from 0$"):
+        a_frame(index=-3)
+
+
 def test_what_has_one_meaning_is_taken() -> None:
     matrix = [[2, 0, 1], [0, 3, 0.5], [0, 0, 1]]
     assert a_frame(intrinsics=matrix).intrinsics == CAMERA

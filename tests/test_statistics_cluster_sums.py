@@ -24,6 +24,7 @@ from semstab.statistics.cluster_sums import (
     FUNCTIONALS,
     MOST_CLASSES,
     ClusterSums,
+    FrameGroups,
     aligned,
     count_distinct,
     distinct_rows,
@@ -364,19 +365,19 @@ def test_rows_are_counted_as_they_are_told_apart(reach) -> None:
         assert count_distinct(rows) == len(distinct)
 
 
-def test_frames_may_have_any_numbers() -> None:
-    labels = [[0, 1, 2, 0], [1, 1, -1, 2], [2, 2, 2, 2]]
-    logs = [log_of(labels, frames=frames) for frames in ([0, 1, 2, 3], [-7, -6, -5, -4])]
-    first, earlier = (cluster_sums_of(log.table(), log) for log in logs)
-    of_frame = first.frame >= 0
-    assert np.array_equal(first.columns[of_frame], earlier.columns[earlier.frame != -1])
-    assert np.array_equal(first.frame[of_frame] - 7, earlier.frame[earlier.frame != -1])
+@pytest.mark.parametrize(("most", "step"), [(9, 1), (8, 1), (7, 2), (4, 4), (2, 8), (1, 16)])
+def test_groups_of_frames_are_the_smallest_that_are_few_enough(most: int, step: int) -> None:
+    frame = np.array([9, 0, 3, 3, 5, 6, 8, 1, 2, 0], np.int32)
+    found = FrameGroups.at_most(most, frame)
+    assert (found.step, found.frames) == (step, 8)
+    assert found.groups.tolist() == sorted({*(frame // step).tolist()})
+    assert found.groups[found.of].tolist() == (frame // step).tolist()
 
 
 @pytest.mark.parametrize("most", [3, 40, 200, 10**12])
 def test_distinct_keys_are_those_of_numpy_whether_they_are_counted_or_put_in_order(most: int) -> None:
     for n in (0, 1, 50, 100):
-        key = np.random.default_rng([most, n]).integers(0, most, n)
+        key = np.random.default_rng([most, n]).integers(-most // 2, most // 2 + 1, n)
         keys, of = distinct_keys(key)
         expected, expected_of = np.unique(key, return_inverse=True)
         assert keys.tolist() == expected.tolist()

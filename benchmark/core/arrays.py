@@ -174,13 +174,14 @@ def stable_order(number: npt.NDArray[np.integer[Any]], count: int) -> Int64:
 
 
 def distinct_keys(key: Int64) -> tuple[Int64, Int64]:
-    """Return each of the numbers (n,), none below 0, once, ascending, and which of them each is: np.unique.
+    """Return each of the numbers (n,) once, ascending, and which of them each is: np.unique.
 
-    Numbers below COUNTED * n are counted, which takes a tenth of the time of putting them in order.
+    Numbers in a range below COUNTED * n are counted, which takes a tenth of the time of putting them in order.
     """
-    if not len(key) or (most := int(key.max())) >= COUNTED * len(key):
+    if not len(key) or int(key.max()) - (least := int(key.min())) >= COUNTED * len(key):
         keys, of = np.unique(key, return_inverse=True)
         return keys, of
-    is_there = np.zeros(most + 1, np.bool_)
-    is_there[key] = True
-    return np.flatnonzero(is_there), (np.cumsum(is_there) - 1)[key]
+    from_least = key - least
+    is_there = np.zeros(int(from_least.max()) + 1, np.bool_)
+    is_there[from_least] = True
+    return np.flatnonzero(is_there) + least, (np.cumsum(is_there) - 1)[from_least]

@@ -114,7 +114,7 @@ class Frame:
     arrays may be given without that row, as (N, 3), (N,) and (N, K).
 
     Attributes:
-        index: Number in the sequence.
+        index: Number in the sequence, from 0.
         depth: (H, W) float32, metres along the optical axis (planar z); 0, negative, NaN and inf are invalid. Of a
             scan it is each point's distance from the sensor, computed by default.
         intrinsics: Intrinsics of the depth image; or its 3x3 camera matrix. A scan has none.
@@ -166,6 +166,8 @@ class Frame:
     features: Features | None = None
 
     def __post_init__(self) -> None:
+        if self.index < 0:
+            raise DataError(f"frame {self.index}: its index is below 0; number frames from 0")
         if self.points is not None:
             self._set_scan(np.asarray(self.points))
         self._set("depth", self._checked_depth())

@@ -135,7 +135,7 @@ def bound_groups(of: Any, bounds: Any) -> None:
 
 
 @serial
-def mark_common(first: Any, second: Any, in_first: Any, in_second: Any) -> int:
+def find_common(first: Any, second: Any, in_first: Any, in_second: Any) -> int:
     """Write the rows of the voxels that two maps share, (n,) and (m,), and return how many they share.
 
     Voxel indices (n, 3) and (m, 3) are in order, and no voxel is there twice.

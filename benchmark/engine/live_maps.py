@@ -93,7 +93,7 @@ class LiveMap:
         live = cls(work, task, frames=_as_set(work.frames))
         if work.fuses:
             live.backend = live.new_map()
-            live._reserve(scene)
+            live._reserve()
             if unit.compares_truth and truth_task(task) is not None:
                 live.truth = live.new_truth_map()
             if unit.sampled:
@@ -133,9 +133,9 @@ class LiveMap:
             return create(name, voxel_size=size, num_classes=K, within=self.work.within)
         return self.new_map(log=False, by_rule=False)
 
-    def _reserve(self, scene: Scene) -> None:
-        """Make as much room as the last map of these frames had, where growth costs the backend much."""
-        room = _rooms.get(scene, {}).get(self._room_key())
+    def _reserve(self) -> None:
+        """Make as much room as the last map of these frames had, if growth costs the backend much."""
+        room = _rooms.get(self.task.scene, {}).get(self._room_key())
         if room is not None and (reserve := getattr(self.backend, "reserve", None)) is not None:
             reserve(room)
 

@@ -30,13 +30,13 @@ def shared_rows(*tables: VoxelTable) -> list[Int64]:
     require_same_grid(*tables)
     if same_voxels(*tables):
         return [np.arange(len(tables[0]))] * len(tables)
-    from semstab.data.kernels import mark_common
+    from semstab.data.kernels import find_common
 
     first = tables[0].index
     rows = [np.arange(len(first))]
     for table in tables[1:]:
         in_first, in_table = np.empty((2, min(len(first), len(table))), np.int64)
-        n = mark_common(first, table.index, in_first, in_table)
+        n = find_common(first, table.index, in_first, in_table)
         first, rows = first[in_first[:n]], [*(of[in_first[:n]] for of in rows), in_table[:n]]
     return rows
 

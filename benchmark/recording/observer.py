@@ -383,7 +383,8 @@ class Recording(Observer):
             self._opened()[0].log(path(scene, "log"), rr.TextLog(text))
 
     def _log_unit(self, group: GroupLog, record: Record, table: VoxelTable, factor: int = 1) -> None:
-        unit, (stream, background) = record.unit, self._opened()
+        unit = record.unit
+        stream, background = self._opened()
         self._logged.add(unit)
         if not_assessed(record):
             self._not_assessed.add((unit.scene, unit.model))

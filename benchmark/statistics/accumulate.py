@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from semstab.core.arrays import distinct_keys, stable_order
+from semstab.core.arrays import stable_order
 from semstab.core.types import Float64, Int32, Int64, Mask
 from semstab.data.events import Events
 from semstab.data.evidence import ByEntry, Evidence
@@ -24,6 +24,7 @@ from semstab.statistics.cluster_sums import (
     MOST_CLASSES,
     ClusterSums,
     FirstColumns,
+    FrameGroups,
     Functional,
     Scale,
     Statistic,
@@ -201,13 +202,9 @@ def _sums_of_log(
     from semstab.core.compiled import in_chunks
     from semstab.statistics.loops.clusters import add_influences
 
-    K, truth, step = events.K, true_label is not None, 1
-    earliest = int(events.frame.min(initial=0))
-    frames, of = distinct_keys(events.frame.astype(np.int64) - earliest)
-    frames = frames + earliest
-    while len(groups := np.unique(frames // step)) > most_groups(K):
-        step *= 2
-    group = np.searchsorted(groups, frames // step)[of].astype(np.int32)
+    K, truth = events.K, true_label is not None
+    groups, of, step, frames = FrameGroups.at_most(most_groups(K), events.frame)
+    group = of.astype(np.int32)
     again = np.flatnonzero(cubes.at >= 0)
     order = again[stable_order(cubes.at[again], cubes.count)]
     bounds = np.concatenate([[0], np.cumsum(np.bincount(cubes.at[again], minlength=cubes.count))])
@@ -238,7 +235,7 @@ def _sums_of_log(
         step,
         events.voxel_size,
         events.classes,
-        len(frames),
+        frames,
     )
 
 

@@ -9,7 +9,6 @@ import dataclasses
 import itertools
 import math
 from collections.abc import Callable, Iterator, Sequence
-from typing import Any
 
 import numpy as np
 
@@ -18,7 +17,15 @@ from semstab.core.types import Float64, Int64, UInt16
 from semstab.data.events import Events
 from semstab.data.statistics import UNKNOWN, Correlogram, LagBin
 from semstab.statistics.agreement import alpha_of
-from semstab.statistics.cluster_sums import ALPHA_SUMS, MOST_GROUPS, ClusterSums, Functional, cubes_of, side_by_side
+from semstab.statistics.cluster_sums import (
+    ALPHA_SUMS,
+    MOST_GROUPS,
+    ClusterSums,
+    FrameGroups,
+    Functional,
+    cubes_of,
+    side_by_side,
+)
 from semstab.statistics.intervals import estimate, scope_of
 from semstab.statistics.observations import SpotObservations
 
@@ -81,13 +88,11 @@ def in_bins(
         number: The number, which is of `ALPHA_SUMS`.
     """
     log = spots.observations()
-    cubes, of, edge = _cubes(log)
-    step, most = 1, min(MOST_GROUPS, max(1, MOST_SUMS // (max(len(cubes), 1) * (4 + K))))
-    while len(frames := np.unique(log.frame // step)) > most:
-        step *= 2
-    group = np.searchsorted(frames, log.frame // step)
-    keys, cluster = distinct_keys(of[log.voxel].astype(np.int64) * len(frames) + group)
-    cube, group = np.divmod(keys, max(len(frames), 1))
+    cubes, of, edge = cubes_of((log.ix, log.iy, log.iz), log.voxel_size, most=MOST_CUBES)
+    most = min(MOST_GROUPS, max(1, MOST_SUMS // (max(len(cubes), 1) * (4 + K))))
+    groups, group, step, _ = FrameGroups.at_most(most, log.frame)
+    keys, cluster = distinct_keys(of[log.voxel].astype(np.int64) * len(groups) + group)
+    cube, group = np.divmod(keys, max(len(groups), 1))
     pairs, distance = np.zeros((2, len(BINS) + 1))
     by_lag = []
     for first, second, apart in _pairs(spots, log):
@@ -102,7 +107,7 @@ def in_bins(
         occupied = np.flatnonzero(sums[0][k, :, 1])
         if len(np.unique(cube[occupied])) < LEAST_CUBES:
             continue
-        where = cubes[cube[occupied]], frames[group[occupied]]
+        where = cubes[cube[occupied]], groups[group[occupied]].astype(np.int32)
         answers = tuple(ClusterSums(*where, of_answer[k, occupied], columns, edge, step) for of_answer in sums)
         of_bin = dataclasses.replace(answers[0], answers=answers)
         alpha = estimate(of_bin, number, scope=scope_of(of_bin, key=number))
@@ -126,14 +131,6 @@ def _sums(
     for first, second, bins in by_lag:
         add_pairs(first, second, bins, cluster, entries, square, sums)
     return sums
-
-
-def _cubes(log: Events) -> tuple[Any, Any, float]:
-    index = log.ix, log.iy, log.iz
-    cubes, of, edge = cubes_of(index, log.voxel_size)
-    while len(cubes) > MOST_CUBES:
-        cubes, of, edge = cubes_of(index, log.voxel_size, 2 * edge)
-    return cubes, of, edge
 
 
 def _pairs(spots: SpotObservations, log: Events) -> Iterator[tuple[Int64, Int64, Float64]]:

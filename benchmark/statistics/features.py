@@ -24,6 +24,7 @@ from semstab.statistics.cluster_sums import (
     ALPHA_SUMS,
     FUNCTIONALS,
     ClusterSums,
+    FrameGroups,
     Functional,
     distinct_rows,
     layout_of_features,
@@ -95,10 +96,7 @@ def feature_sums(seen: FeatureObservations, of: Likeness, edge: float | None = N
     P + 2 (T - 1) / (T - 2) (a_t - P), where a_t is the mean cosine of view t with the others.
     """
     log = seen.log
-    cubes, step, groups = Cubes.of_log(log, edge), 1, np.unique(log.frame)
-    while len(groups) > most_groups(1):
-        step, groups = 2 * step, np.unique(groups // 2)
-    group = np.searchsorted(groups, log.frame // step)
+    cubes, (groups, group, step, frames) = Cubes.of_log(log, edge), FrameGroups.at_most(most_groups(1), log.frame)
     at = cubes.at[log.voxel].astype(np.int64) * max(len(groups), 1) + group
     counted = np.flatnonzero((cubes.at[log.voxel] >= 0) & (of.views >= 2))
     T, spot, twice = of.views[counted], of.spot[counted], (of.views[counted] == 2).astype(np.float64)
@@ -114,8 +112,7 @@ def feature_sums(seen: FeatureObservations, of: Likeness, edge: float | None = N
     cell, frame = np.divmod(rows, max(len(groups), 1))
     return ClusterSums(
         cubes.cell[cell], groups[frame].astype(np.int32), sums[rows],
-        layout_of_features(), cubes.edge, step, log.voxel_size, (),
-        len(np.unique(log.frame)),
+        layout_of_features(), cubes.edge, step, log.voxel_size, (), frames,
     )  # fmt: skip
 
 

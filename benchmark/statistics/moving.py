@@ -83,7 +83,7 @@ def states_at(spots: SpotObservations, point: Float64) -> UInt8:
     if spots.votes is None or not len(spots.point):
         return np.full(len(point), UNTOLD, np.uint8)
     states[:-1][spots.votes.static], states[:-1][spots.votes.moved] = STAYED, MOVED
-    _, nearest = cKDTree(spots.point).query(point, distance_upper_bound=spots.spacing, workers=-1)
+    _, nearest = cKDTree(spots.point).query(point, distance_upper_bound=spots.spacing)
     return np.asarray(states[nearest], np.uint8)
 
 

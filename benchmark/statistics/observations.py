@@ -283,7 +283,7 @@ class SpotObservations:
         import pyarrow as pa
         import pyarrow.parquet as pq
 
-        order = np.argsort(self.spot, kind="stable")
+        order = arrays.stable_order(self.spot, len(self.point))
         ends = np.concatenate([[0], np.cumsum(np.bincount(self.spot, minlength=len(self.point)))]).astype(np.int32)
         columns = dict(zip("xyz", map(arrays.column, self.point.T), strict=True)) | {"drawn": arrays.column(self.drawn)}
         for name in COLUMNS[1:]:

@@ -81,9 +81,8 @@ def next_to_moved(point: Float64, moved: Mask, static: Mask, spacing: float, wit
         if not len(unknown) or len(of_moved) < LEAST_NEXT_TO:
             break
         near = cKDTree(of_moved).query_ball_point(point[unknown], within * spacing, return_length=True)
-        asked = unknown[near >= LEAST_NEXT_TO]
-        near_stayed = stayed.query_ball_point(point[asked], within * spacing, return_length=True)
-        next_to[asked] = near[near >= LEAST_NEXT_TO] >= near_stayed
+        unknown, near = unknown[near >= LEAST_NEXT_TO], near[near >= LEAST_NEXT_TO]
+        next_to[unknown] = near >= stayed.query_ball_point(point[unknown], within * spacing, return_length=True)
     return next_to
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -98,39 +99,71 @@ def _keys(rows: npt.NDArray[np.integer]) -> Int64 | None:
     return key
 
 
+class FrameGroups(NamedTuple):
+    """Groups of as many successive frames each, in which observations are.
+
+    Attributes:
+        groups: (F,) their numbers, ascending: the index of a frame divided by `step`, rounded down.
+        of: (m,) the row in `groups` of each observation.
+        step: Frames of a group, a power of 2.
+        frames: The number of frames.
+    """
+
+    groups: Int64
+    of: Int64
+    step: int
+    frames: int
+
+    @classmethod
+    def at_most(cls, most: int, frame: npt.NDArray[np.integer]) -> FrameGroups:
+        """Return the smallest groups, at most that many, of observations by the index (m,) of their frame."""
+        frames, at = distinct_keys(frame.astype(np.int64))
+        step = 1
+        while len(groups := np.unique(frames // step)) > most:
+            step *= 2
+        return cls(groups, np.searchsorted(groups, frames // step)[at], step, len(frames))
+
+
 def cubes_of(
-    index: tuple[Int32, Int32, Int32], voxel_size: float, edge: float | None = None, counted: Mask | None = None
+    index: tuple[Int32, Int32, Int32],
+    voxel_size: float,
+    edge: float | None = None,
+    counted: Mask | None = None,
+    most: int = MOST_CELLS,
 ) -> tuple[Int32, Int32, float]:
     """Return the cubes (G, 3) that hold voxels of index columns (n,), the cube (n,) of each voxel, and their edge.
 
     A cube is floor(voxel centre / edge). Only the voxels `counted` (n,) count, the others are in -1. The edge, unless
-    it is given, is the smallest power of 2 metres, no smaller than a voxel, that leaves at most MOST_CELLS cubes.
+    it is given, is the smallest power of 2 metres, no smaller than a voxel, that leaves at most `most` cubes.
     """
     rows = np.arange(len(index[0])) if counted is None else np.flatnonzero(counted)
-    given, edge = edge, 2.0 ** math.ceil(math.log2(voxel_size) - 1e-9) if edge is None else edge
-    scale = voxel_size / edge
+    smallest = 2.0 ** math.ceil(math.log2(voxel_size) - 1e-9)
+    scale = voxel_size / (smallest if edge is None else edge)
     cell = np.stack([np.floor((axis[rows] + 0.5) * scale) for axis in index], axis=1).astype(np.int64)
-    (cubes, number), doublings = (distinct_rows(cell), 0) if given is not None else _few_cubes(cell)
+    if edge is None:
+        cubes, number, doublings = _few_cubes(cell, most)
+        edge = smallest * 2**doublings
+    else:
+        cubes, number = distinct_rows(cell)
     of = np.full(len(index[0]), -1, np.int32)
     of[rows] = number
-    return cubes.astype(np.int32), of, edge * 2**doublings
+    return cubes.astype(np.int32), of, edge
 
 
-def _few_cubes(cell: Int64) -> tuple[tuple[Int64, Int64], int]:
+def _few_cubes(cell: Int64, most: int) -> tuple[Int64, Int64, int]:
     """Return the distinct cubes of cells (n, 3) and which each cell is in, and how often their edge was doubled.
 
-    The smallest cubes are sought that are at most MOST_CELLS, beginning with large ones: few are quickly counted.
+    The smallest cubes are sought that are at most `most`, beginning with large ones: few are quickly counted.
     """
     doublings = 0
-    if len(cell) <= MOST_CELLS:
-        return distinct_rows(cell), doublings
-    low, high = cell.min(axis=0), cell.max(axis=0)
-    while math.prod(((high >> doublings) - (low >> doublings) + 1).tolist()) > MOST_CELLS:
-        doublings += 1
-    cubes = distinct_rows(cell >> doublings)
+    if len(cell) > most:
+        low, high = cell.min(axis=0), cell.max(axis=0)
+        while math.prod(((high >> doublings) - (low >> doublings) + 1).tolist()) > most:
+            doublings += 1
+    cubes, of = distinct_rows(cell >> doublings)
     while doublings > 0:
-        smaller = distinct_rows(cell >> (doublings - 1))
-        if len(smaller[0]) > MOST_CELLS:
+        smaller, of_smaller = distinct_rows(cell >> (doublings - 1))
+        if len(smaller) > most:
             break
-        cubes, doublings = smaller, doublings - 1
-    return cubes, doublings
+        cubes, of, doublings = smaller, of_smaller, doublings - 1
+    return cubes, of, doublings
