@@ -27,6 +27,7 @@ from semstab.backends.numba_loops import (
     most_slots,
     place_observations,
     read_chain,
+    read_records,
     record_types,
     rehash,
     update,
@@ -85,6 +86,13 @@ class History:
         evidence = Evidence(starts, label, weight, self.num_classes)
         return Events(**index, voxel=voxels, frame=frame, evidence=evidence, pixels=pixels, voxel_size=self.voxel_size)
 
+
+COLUMNS = ("key", "op", "pixels", "first_frame", "last_frame", "drift_sum", "self_sum", "frame_entropy_sum")
+"""The columns of a record that a table has, and the key that its index follows from."""
+
+LARGE = 1_000_000
+"""Voxels of a map from which on memory counts more than the time of building its hash again: a growing map is drawn
+several times."""
 
 FULL = 0.7
 """Largest share of a partition's slots in use."""
@@ -223,15 +231,16 @@ class NumbaHash:
     def table(self) -> VoxelTable:
         """Return the map so far.
 
-        The hash and the spare room of the records are freed first, to make room for the map. A further frame
-        allocates both again.
+        The hash and the spare room of the records of a large map are freed first, to make room for the table. A further
+        frame allocates both again.
         """
-        self._slots = np.empty((PARTITIONS, 0), dtype=SLOT)
-        self._records.resize(max(len(self), 1), refcheck=False)
+        if len(self) >= LARGE:
+            self._slots = np.empty((PARTITIONS, 0), dtype=SLOT)
+            self._records.resize(len(self), refcheck=False)
         order = self._order()
-        index = columns_of_keys(self._records["key"][order], self.origin)
-        columns = ("op", "drift_sum", "pixels", "first_frame", "last_frame", "self_sum", "frame_entropy_sum")
-        values: dict[str, Any] = {name: self._records[name][order] for name in columns}
+        values: dict[str, Any] = {name: np.empty(len(order), self._records.dtype[name]) for name in COLUMNS}
+        read_records(self._records, order, *values.values())
+        index = columns_of_keys(values.pop("key"), self.origin)
         evidence = self._evidence_of(order)
         return VoxelTable(**index, **values, evidence=evidence, voxel_size=self.voxel_size)
 

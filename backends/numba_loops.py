@@ -257,6 +257,17 @@ def update(
         sums[p, 0], sums[p, 1], sums[p, 2], sums[p, 3] = vss, entropy, drift, reached
 
 
+@serial
+def read_records(records, order, key, op, pixels, first_frame, last_frame, drift_sum, self_sum, frame_entropy_sum):
+    """Read these records' columns (n,) in order: each record is looked at once."""
+    for i in range(order.shape[0]):
+        record = records[order[i]]
+        key[i], op[i], pixels[i] = record.key, record.op, record.pixels
+        first_frame[i], last_frame[i] = record.first_frame, record.last_frame
+        drift_sum[i], self_sum[i] = record.drift_sum, record.self_sum
+        frame_entropy_sum[i] = record.frame_entropy_sum
+
+
 @parallel
 def count_chain(records, nodes, dense, order, count):
     """Count the classes that the records in that order have evidence of: count[1:] of (n + 1,)."""

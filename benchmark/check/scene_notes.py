@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
 
 from semstab.check.inspection import Inspection
 from semstab.check.labels import Ordered, label_findings
@@ -27,15 +28,21 @@ def scene_notes(
     """
     if scene.folder is None or scene.of_scans:
         return ()
-    stored = stored_labels(scene, model, config)
+    stored, options = stored_labels(scene, model, config), config.dataset.options
+    with ThreadPoolExecutor(1, thread_name_prefix="semstab-notes") as beside:
+        of_images = beside.submit(_image_notes, scene, indices, model, stored)
+        findings = [] if stored is None else label_findings(scene, indices, [model], options, known, thorough=False)
+        return (
+            *(line for of_model in findings for line in (*of_model.wrong, *of_model.remarks)),
+            *of_images.result(),
+        )
+
+
+def _image_notes(scene: Scene, indices: Sequence[int], model: str, stored: str | None) -> tuple[str, ...]:
+    """Return what looks wrong where depth and labels are compared with the images."""
     inspection = Inspection(scene, indices, stored, (), POINTS, fused=REGISTERED_FRAMES)
     views = [inspection.views[position] for position in sorted(inspection.views)]
-    options = config.dataset.options
-    findings = [] if stored is None else label_findings(scene, indices, [model], options, known, thorough=False)
-    return (
-        *(line for of_model in findings for line in (*of_model.wrong, *of_model.remarks)),
-        *notes(scene, views, model),
-    )
+    return tuple(notes(scene, views, model))
 
 
 def stored_labels(scene: Scene, model: str, config: Config) -> str | None:

@@ -75,6 +75,8 @@ def _finished_unit(live: LiveMap, stream: Stream, files: Files, watch: Stopwatch
         files.write_ahead(observation_savers(live.task, observations))
     if not config.statistics:
         files.write_ahead(_map_savers(live, fused))
+    up = live.sampling.submit(partial(_up_axis, live, stream, fused))
+    places = live.sampling.submit(partial(_pictured_places, live, stream, fused, observations))
     with watch("statistics"):
         sample, analysis = _sample(live, fused), None
         if sample is not None:
@@ -82,9 +84,9 @@ def _finished_unit(live: LiveMap, stream: Stream, files: Files, watch: Stopwatch
         trim_malloc(least=SMALL)
     result = _result(live, stream, fused, sample)
     with watch("measure"):
-        record, of_frames = _record(live, stream, fused, result, analysis)
+        record, of_frames = _record(live, stream, result, analysis, up.result())
     with watch("write"):
-        files.write(_unit_savers(live, stream, fused, observations, analysis, of_frames))
+        files.write(_unit_savers(live, stream, analysis, of_frames, places.result()))
         if config.statistics:
             files.write(_map_savers(live, fused, analysis))
     table = fused.table if fused is not None and work.watched else None
@@ -138,11 +140,10 @@ def _result(live: LiveMap, stream: Stream, fused: FusedMap | None, sample: MapSa
 
 
 def _record(
-    live: LiveMap, stream: Stream, fused: FusedMap | None, result: TileResult, analysis: Analysis | None
+    live: LiveMap, stream: Stream, result: TileResult, analysis: Analysis | None, up: UpAxis | None
 ) -> tuple[Record, OfFrames]:
     """Return the record of a unit, and how often each of its frames stands alone."""
-    points = np.zeros((0, 3)) if fused is None else fused.table
-    record = record_of(live.work.unit, live.task, live.rows, result, analysis, points)
+    record = record_of(live.work.unit, live.task, live.rows, result, analysis, up)
     if stream.pixels is None:
         return record, OfFrames({} if analysis is None else analysis.of_frames())
     pixels, of_frames = pixel_statistics(live.task, stream.pixels)
@@ -217,9 +218,9 @@ def record_of(
     rows: Series,
     result: TileResult,
     analysis: Analysis | None,
-    points: VoxelTable | Float64,
+    up: UpAxis | None,
 ) -> Record:
-    """Return the record of a unit from its time series, its result, the statistics of its map and its points (n, 3)."""
+    """Return the record of a unit from its time series, its result, the statistics of its map and its up axis."""
     config, target = unit.config, task.mapping.target
     of_map = TableSums.read(result.sums).summary(
         config.voxel_size if unit.fuses else math.nan, target.classes, config.strata
@@ -251,7 +252,6 @@ def record_of(
     image_space = ImageSpaceMeter(result.image).result(record.flicker_percent)
     if of_features:
         image_space = image_space.without_classes()
-    up = up_axis(task.scene, points, result.poses) if task.scene.posed else None
     return replace(record, image_space=image_space, up=up, quality=result.quality, video_measures=result.video_measures)
 
 
@@ -259,8 +259,18 @@ def _reduced(sums: Float64) -> ReducedScores:
     return ReducedScores(float(ratio_of(sums[:2])), float(ratio_of(sums[2:4])), float(alpha_of(sums[4:])))
 
 
-def up_axis(scene: Scene, points: VoxelTable | Float64, poses: Float64) -> tuple[float, float, float] | None:
-    """Return the scene's up axis, given or estimated, or None if the estimate fails."""
+UpAxis = tuple[float, float, float]
+
+
+def _up_axis(live: LiveMap, stream: Stream, fused: FusedMap | None) -> UpAxis | None:
+    """Return the up axis of the scene, where the unit states it."""
+    if not live.work.unit.image_space or not live.task.scene.posed:
+        return None
+    return up_axis(live.task.scene, np.zeros((0, 3)) if fused is None else fused.table, stream.poses)
+
+
+def up_axis(scene: Scene, points: VoxelTable | Float64, poses: Float64) -> UpAxis | None:
+    """Return the scene's up axis, given or estimated from its points (n, 3); None if the estimate fails."""
     try:
         x, y, z = (float(value) for value in (estimate_up(points, poses) if scene.up is None else scene.up))
     except DataError:
@@ -271,21 +281,27 @@ def up_axis(scene: Scene, points: VoxelTable | Float64, poses: Float64) -> tuple
 # --- Files ------------------------------------------------------------------------------------------------------------
 
 
+Pictures = dict[str, npt.NDArray[Any]]
+
+
+def _pictured_places(
+    live: LiveMap, stream: Stream, fused: FusedMap | None, observations: SpotObservations | None
+) -> Pictures:
+    """Return pictures of the worst places of a map; of scans there are none."""
+    task, pictured = live.task, live.work.unit.image_space and stream.overview
+    if not pictured or fused is None or observations is None or task.scene.of_scans:
+        return {}
+    places = worst_places((fused.table,), observations, PICTURED_PLACES)
+    return pictures_of_places(task, places, live.config.pixel_stride)
+
+
 def _unit_savers(
-    live: LiveMap,
-    stream: Stream,
-    fused: FusedMap | None,
-    observations: SpotObservations | None,
-    analysis: Analysis | None,
-    of_frames: OfFrames,
+    live: LiveMap, stream: Stream, analysis: Analysis | None, of_frames: OfFrames, places: Pictures
 ) -> Savers:
     """Return the files of a unit except those of its map."""
     task, unit, savers = live.task, live.work.unit, Savers()
     if unit.image_space and stream.overview:
-        pictures = pictures_of_outlying(task, live.config, of_frames)
-        if fused is not None and observations is not None and not task.scene.of_scans:
-            places = worst_places((fused.table,), observations, PICTURED_PLACES)
-            pictures |= pictures_of_places(task, places, live.config.pixel_stride)
+        pictures = pictures_of_outlying(task, live.config, of_frames) | places
         savers[overview_file(task)] = partial(save_overview, stream.overview | pictures)
     return savers | unit_savers(task, live.rows, analysis, of_frames) if unit.stored else savers
 

@@ -27,6 +27,7 @@ from semstab.engine.measurement import (
     save_overview,
     save_voxels,
     unit_savers,
+    up_axis,
 )
 from semstab.engine.series import Series
 from semstab.engine.tiles import TILE_FEATURES, TILE_OBSERVATIONS, TileResult, joined_series
@@ -155,10 +156,10 @@ def assembled(
     savers = _savers(work, tiles, rows, observations, analysis, pictured=overview_file(task) in whole.files)
     files = {name: digest for name, digest in whole.files.items() if not name.startswith(tiles[0].folder)}
     files |= written(work.start, savers)[0]
-    points = np.zeros((0, 3))
+    up = None
     if unit.image_space:
-        points = _centers(folder, files, unit.config.voxel_size, int(sums.total[2]))
-    return record_of(unit, task, rows, dataclasses.replace(whole, files=files), analysis, points)
+        up = up_axis(task.scene, _centers(folder, files, unit.config.voxel_size, int(sums.total[2])), whole.poses)
+    return record_of(unit, task, rows, dataclasses.replace(whole, files=files), analysis, up)
 
 
 def _savers(

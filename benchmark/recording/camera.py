@@ -8,6 +8,7 @@ from __future__ import annotations
 import functools
 import io
 import math
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -122,20 +123,19 @@ class SceneLog:
             return
         pose = self._poses[frame.index] = frame.T_wc.copy()
         pose[:3, 3] -= self._translation
+        n = len(self._poses)  # a long track is not logged with every frame: the size would grow with its square
+        track = [camera_pose[:3, 3] for camera_pose in self._poses.values()] if n % (n // 100 + 1) == 0 else []
+        background.submit(frame.index, frame.timestamp, functools.partial(self._log_posed, stream, frame, pose, track))
+
+    def _log_posed(self, stream: rr.RecordingStream, frame: Frame, pose: Float64, track: Sequence[Float64]) -> None:
         if self._intrinsics != (frame.intrinsics, frame.shape):
             self._intrinsics = frame.intrinsics, frame.shape
             if not frame.is_scan:
                 stream.log(path(self.name, "camera"), _pinhole(frame))
         stream.log(path(self.name, "camera"), rr.Transform3D(translation=pose[:3, 3], mat3x3=pose[:3, :3]))
-        n = len(self._poses)
-        if (
-            n % (n // 100 + 1) == 0
-        ):  # a long track is not logged with every frame: the size would grow with the square of the length
-            track = rr.LineStrips3D(
-                [[camera_pose[:3, 3] for camera_pose in self._poses.values()]], colors=(255, 255, 255)
-            )
-            stream.log(path(self.name, "trajectory"), track)
-        background.submit(frame.index, frame.timestamp, functools.partial(self._log_images, stream, frame))
+        if track:
+            stream.log(path(self.name, "trajectory"), rr.LineStrips3D([track], colors=(255, 255, 255)))
+        self._log_images(stream, frame)
 
     def _log_images(self, stream: rr.RecordingStream, frame: Frame) -> None:
         if frame.is_scan:

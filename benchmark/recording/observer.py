@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import dataclasses
+import functools
 import logging
 import threading
 from collections.abc import Callable, Mapping, Sequence
@@ -82,13 +83,13 @@ class GroupLog:
     ) -> None:  # fmt: skip
         """Log the rows of a fused frame, its labels, the changes that it made to the map, and the map of its voxels."""
         self.last = frame.index, frame.timestamp
-        drift, jobs = None, list[Callable[[], None]]()
+        changes, jobs = None, list[Callable[[], None]]()
         if self._fused is not None:
             jobs = self._map(drawn(self.task)).update(stream, voxels, self._fused.table)
-            if (changes := changes_of(self._fused)) is not None:
-                drift = self._drift.follow(frame, changes)
+            changes = changes_of(self._fused)
 
         def job() -> None:
+            drift = None if changes is None else self._drift.follow(frame, changes)
             for unit, row in rows.items():
                 series.add(unit, self.task, frame.index, frame.timestamp, row.cells())
             if frame.is_scan:
@@ -338,12 +339,15 @@ class Recording(Observer):
             self._stream = self.target.open()
             self._background = FrameJobs(self._stream, self._clock)
             self._series = SeriesLog(self._stream, self._clock)
-            for scene in self._scenes.values():
-                scene.log_static(self._stream)
-                self._stream.log(path(scene.name, VERDICT), rr.TextDocument(PENDING), static=True)
-            timeline.log_styles(self._stream, self._plan)
-            self._send_layout(self._stream)
+            self._background.begin(functools.partial(self._log_static, self._stream))
         return self._stream, self._background
+
+    def _log_static(self, stream: rr.RecordingStream) -> None:
+        for scene in self._scenes.values():
+            scene.log_static(stream)
+            stream.log(path(scene.name, VERDICT), rr.TextDocument(PENDING), static=True)
+        timeline.log_styles(stream, self._plan)
+        self._send_layout(stream)
 
     def _begin(self, task: Task, position: Float64 | None = None) -> GroupLog:
         """Begin the log of a model on a scene, with all backends of the plan."""

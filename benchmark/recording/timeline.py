@@ -75,6 +75,10 @@ class FrameJobs:
         self._clock = clock
         self._jobs = Background("semstab-recording", MOST_PENDING)
 
+    def begin(self, job: Callable[[], None]) -> None:
+        """Submit the first job, which logs what holds at all times."""
+        self._jobs.submit(job)
+
     def submit(self, frame: int, timestamp: float | None, job: Callable[[], None]) -> None:
         """Submit a job, and wait while too many are pending; an error of an earlier job is raised here."""
 

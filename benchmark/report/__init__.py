@@ -18,9 +18,13 @@ from semstab.engine.observer import Observer
 from semstab.report.tables import write_tables
 
 if TYPE_CHECKING:
+    from semstab.backends import FusionBackend
+    from semstab.config import Config
+    from semstab.data.results import UnitName
     from semstab.data.voxels import VoxelTable
     from semstab.engine.units import Unit
     from semstab.report.places import ShownMap
+    from semstab.task import Task
 
 __all__ = ["Reporting", "write_report"]
 
@@ -32,6 +36,13 @@ class Reporting(Observer):
         self._folder = Path(folder)
         self._beside = Background("semstab-report", 0)
         self._shown: dict[str, Future[ShownMap]] = {}
+        self._loads = False
+
+    def group_started(self, task: Task, config: Config, backends: Mapping[UnitName, FusionBackend]) -> None:
+        """Load what writes the page, once, while frames are fused."""
+        if not self._loads:
+            self._loads = True
+            self._beside.submit(load)
 
     def unit_finished(
         self, unit: Unit, record: Record | RegionFlicker | None, table: VoxelTable | None, error: str | None
@@ -63,6 +74,13 @@ def digest_of(folder: Path) -> str:
     """Return the digest of the version and the summary that a page is made from."""
     summary = folder / "summary.json"
     return hashlib.sha256(version("semstab").encode() + (summary.read_bytes() if summary.exists() else b"")).hexdigest()
+
+
+def load() -> None:
+    """Load the modules and the templates that a page is made with."""
+    from semstab.report.page import load_templates
+
+    load_templates()
 
 
 def write_report(result: Result, folder: str | Path, shown: Mapping[str, ShownMap] = MappingProxyType({})) -> Path:

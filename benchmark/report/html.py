@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import base64
+import functools
 import io
 import itertools
 import json
 import re
 from collections.abc import Iterator, Sequence
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import numpy.typing as npt
@@ -18,6 +19,9 @@ from semstab.core.types import Int64, Mask, UInt8
 from semstab.report.charts import colors_css
 from semstab.report.figures.style import COLUMN, DPI, PINS, Figure
 from semstab.report.tables.table import ARROWS, Table, relations, sections
+
+if TYPE_CHECKING:
+    from jinja2 import Environment
 
 SCREEN_DPI = 200
 """The pixels per inch of embedded figures, which have 256 colours: a quarter of the file's size."""
@@ -29,17 +33,23 @@ ABSENT = "absent"
 """A table's note of a class that covers no voxel: the page names such classes in a line."""
 
 
-def filled(template: str, **content: Any) -> str:
-    """Return a page from its template; `style` and `script` are added."""
+HERE = Path(__file__).parent
+
+
+@functools.cache
+def templates() -> Environment:
+    """Return the templates of pages, each of which is compiled once."""
     from jinja2 import Environment, FileSystemLoader, StrictUndefined
 
-    here = Path(__file__).parent
-    environment = Environment(
-        loader=FileSystemLoader(here), autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True
+    return Environment(
+        loader=FileSystemLoader(HERE), autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True
     )
-    style, script = ((here / name).read_text(encoding="utf-8") for name in ("style.css", "page.js"))
-    page: str = environment.get_template(template).render(style=f"{style}\n{colors_css()}", script=script, **content)
-    return page
+
+
+def filled(template: str, **content: Any) -> str:
+    """Return a page from its template; `style` and `script` are added."""
+    style, script = ((HERE / name).read_text(encoding="utf-8") for name in ("style.css", "page.js"))
+    return templates().get_template(template).render(style=f"{style}\n{colors_css()}", script=script, **content)
 
 
 def blocks(own: Sequence[Table], shown: Sequence[Figure], folder: Path) -> Iterator[dict[str, Any]]:

@@ -27,7 +27,7 @@ from semstab.report.charts import Joint, Line, dot_chart, line_chart, sample, tr
 from semstab.report.figures.located import Located
 from semstab.report.figures.maps import Overview, TopViews
 from semstab.report.filter_study import advice, filter_studies, of_interest
-from semstab.report.html import filled, jpeg, lone_pictures, png, table_block
+from semstab.report.html import filled, jpeg, lone_pictures, png, table_block, templates
 from semstab.report.means import ENOUGH, by_model, describe, levels, over_recurrent, pooled, swept
 from semstab.report.narrative import not_assessed, noted, notes, outlying_line, warnings
 from semstab.report.places import LISTED, ShownMap, described_places, map_frame
@@ -40,6 +40,9 @@ from semstab.statistics.correctness import MIOU
 from semstab.statistics.moving import STATE_COLORS, STATE_NAMES, states_of
 from semstab.statistics.places import places_of
 from semstab.statistics.verdict import LIMITS
+
+TEMPLATE, PARTS = "report.html.j2", "parts.html.j2"
+"""The template of the page, and the one that it takes parts from."""
 
 MOST_NAMED = 3
 """The most scenes that are named in the title."""
@@ -55,6 +58,12 @@ UNKNOWN = 255
 """The code of a value that is not defined; as a category, the code of a cell without a voxel."""
 
 
+def load_templates() -> None:
+    """Compile the templates of the page, so that `render` need not."""
+    for name in (TEMPLATE, PARTS):
+        templates().get_template(name)
+
+
 def render(result: Result, folder: Path, digest: str = "", shown: Mapping[str, ShownMap] = MappingProxyType({})) -> str:
     """Return the page of the result whose files lie in the folder, with the digest of what it is made from.
 
@@ -67,7 +76,7 @@ def render(result: Result, folder: Path, digest: str = "", shown: Mapping[str, S
     everything, result = result, of_interest(result)
     scenes, views = list(_scenes(result, folder, shown)), [table_block(table) for table in tables(everything)]
     return filled(
-        "report.html.j2",
+        TEMPLATE,
         kind="Study of temporal semantic stability" if result.sweeps() else "Temporal semantic stability",
         digest=digest,
         confidence=CONFIDENCE,

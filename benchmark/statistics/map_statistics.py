@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import math
 from collections.abc import Callable, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -270,14 +271,16 @@ def _of_spots(
 ) -> dict[str, Any]:
     """Return the sections `OF_SPOTS` by name."""
     outlying = None if lone is None else outlying_frames(lone, len(spots.views), name=frame_name)
-    return {
-        "spots": spot_agreement(spots, sums, table, scope, critical, limits),
-        "correlogram": correlogram(spots),
-        "outlying_frames": outlying,
-        "ranges": range_agreement(spots, scope, limits),
-        "groupings": groupings(spots, sums, scope, limits),
-        "moved": moved_spots(spots, alpha, scope, frame_name),
-    }
+    with ThreadPoolExecutor(1, thread_name_prefix="semstab-correlogram") as beside:  # it takes as long as the others
+        by_distance = beside.submit(correlogram, spots)
+        return {
+            "spots": spot_agreement(spots, sums, table, scope, critical, limits),
+            "outlying_frames": outlying,
+            "ranges": range_agreement(spots, scope, limits),
+            "groupings": groupings(spots, sums, scope, limits),
+            "moved": moved_spots(spots, alpha, scope, frame_name),
+            "correlogram": by_distance.result(),
+        }
 
 
 def _with_features(
