@@ -34,7 +34,7 @@ FAR, DISTINCT = 100.0, 8
 """Depth is in millimetres if all values are whole numbers, at least DISTINCT differ, and most exceed FAR metres."""
 
 FEW = 1 << 15
-"""Pixels that are back-projected together, about: the results stay in a core's cache."""
+"""The most pixels that are back-projected together: the results stay in a core's cache."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -149,17 +149,16 @@ def pixels_held(frame: Frame, pixels: Mask, voxel_size: float, holds: Callable[[
 
 
 def _points(frame: Frame, pixels: Mask) -> Iterator[Float64]:
-    """Yield world coordinates (3, n) of some pixels, of a few rows at a time: a large frame would take much memory."""
+    """Yield world coordinates (3, n) of some pixels, of FEW at a time: a large frame would take much memory."""
     if frame.points is not None:
         yield in_world(frame.points[pixels].T.astype(np.float64), frame.T_wc)
         return
-    H, W = frame.shape
     across, down = frame.rays
-    step = max(1, FEW // W)
-    for rows in (slice(first, first + step) for first in range(0, H, step)):
-        row, column = np.nonzero(pixels[rows])
-        z = frame.depth[rows][row, column].astype(np.float64)
-        yield in_world((across[column] * z, down[rows][row] * z, z), frame.T_wc)
+    at = np.flatnonzero(pixels)
+    for first in range(0, max(len(at), 1), FEW):
+        row, column = np.divmod(at[first : first + FEW], frame.shape[1])
+        z = frame.depth[row, column].astype(np.float64)
+        yield in_world((across[column] * z, down[row] * z, z), frame.T_wc)
 
 
 def in_world(points: Sequence[Float64] | Float64, T_wc: Float64) -> Float64:
