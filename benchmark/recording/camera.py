@@ -38,7 +38,6 @@ def stride_of(shape: tuple[int, int], side: int = IMAGE_SIDE) -> int:
     return int(2 ** max(0, math.ceil(math.log2(max(shape) / side))))
 
 
-@functools.cache
 def over_camera(stride: int) -> rr.Transform3D:
     """Return the transform that lays a picture of every stride-th pixel over the camera's image."""
     shift = (1 - stride) / 2
@@ -77,6 +76,7 @@ class SceneLog:
         self._translation: Float64 = np.zeros(3)
         self._poses: dict[int, Float64] = {}
         self._intrinsics: tuple[Intrinsics, tuple[int, int]] | None = None
+        self._scale: tuple[float, float, float] | None = None  # of the last colour image
         self._unread, self._posed = False, tasks[0].scene.posed
 
     def log_static(self, stream: rr.RecordingStream) -> None:
@@ -157,8 +157,10 @@ class SceneLog:
         if jpeg is not None:
             (H, W), stride = frame.shape, stride_of(frame.shape)
             image = rr.EncodedImage(contents=jpeg, media_type="image/jpeg", draw_order=-20)
-            scale = rr.Transform3D(scale=[W / -(-W // stride), H / -(-H // stride), 1])
-            stream.log(path(self.name, "camera", "color"), image, scale)
+            scale = W / -(-W // stride), H / -(-H // stride), 1.0
+            placed = [] if scale == self._scale else [rr.Transform3D(scale=scale)]
+            self._scale = scale
+            stream.log(path(self.name, "camera", "color"), image, *placed)
 
 
 def color_of(frame: Frame) -> bytes | None:

@@ -74,18 +74,15 @@ class FrameChanges:
     changes: Changes
     voxel_size: float
 
-    def pictures(self, stride: int) -> dict[str, UInt8]:
-        """Return each of PICTURES, of every stride-th pixel (H', W'); the stride is a power of 2."""
-        frame = self.frame.every(stride)  # rays divided by a power of 2 stay exact: each pixel falls into its voxel
-        return self.values(frame)
-
-    def values(self, frame: Frame) -> dict[str, UInt8]:
-        """Return each of PICTURES for the pixels or points (H, W) of the frame, or of every n-th."""
-        values = {name: np.full(frame.shape, NO_VOXEL, np.uint8) for name in PICTURES}
+    def pictures(self, stride: int = 1) -> dict[str, UInt8]:
+        """Return each of PICTURES, of every stride-th pixel or point (H', W')."""
+        frame = self.frame
+        size = tuple(-(-side // stride) for side in frame.shape)
+        values = {name: np.full(size, NO_VOXEL, np.uint8) for name in PICTURES}
         points = np.zeros((0, 0, 3), np.float32) if frame.points is None else frame.points
         draw_changes(
             fixed(frame.depth), fixed(points), fixed(frame.valid), fixed(frame.predicted), *frame.rays,
-            fixed(frame.T_wc), self.voxel_size, fixed(self.changes.index), fixed(self.changes.before),
+            fixed(frame.T_wc), self.voxel_size, stride, fixed(self.changes.index), fixed(self.changes.before),
             fixed(self.changes.drift), LEVEL_EDGES[1:-1], values["contradictions"], values["drift"],
         )  # fmt: skip
         return values
@@ -100,7 +97,7 @@ def log_points(stream: rr.RecordingStream, entity: str, frame: Frame, drift: Fra
     assert frame.points is not None
     values: dict[str, npt.NDArray[Any]] = {"labels": frame.predicted}
     if drift is not None:
-        values |= drift.values(frame)
+        values |= drift.pictures()
     for name, of_name in values.items():
         points = rr.Points3D(
             frame.points[frame.valid], class_ids=of_name[frame.valid], radii=rr.Radius.ui_points(POINT_RADIUS)

@@ -20,9 +20,9 @@ AXIS = 21
 
 @serial
 def draw_changes(
-    depth, points, valid, labels, ray_x, ray_y, T, size, index, before, moved, edges, contradictions, drift
+    depth, points, valid, labels, ray_x, ray_y, T, size, stride, index, before, moved, edges, contradictions, drift
 ):
-    """Draw the valid pixels into pictures (H, W) that hold NO_VOXEL: a label against the map's, the level of drift.
+    """Draw valid pixels, every n-th of (H, W), into pictures that hold NO_VOXEL: label against map, level of drift.
 
     - `points`: (H, W, 3) of a scan, for which rays do not count; (0, 0, 3) of an image
     - `index`, `before`, `moved`: (n, 3) indices of each voxel, (n,) the map's class, (n,) its drift, bits
@@ -32,9 +32,9 @@ def draw_changes(
     for row in range(len(index)):
         key[row], level[row] = key_of(index[row, 0], index[row, 1], index[row, 2]), level_of(moved[row], edges)
         rows[find(key[row], key, rows)] = row
-    H, W = depth.shape
-    for v in range(H):
-        for u in range(W):
+    for line in range(drift.shape[0]):
+        for column in range(drift.shape[1]):
+            v, u = line * stride, column * stride
             if not valid[v, u]:
                 continue
             if points.shape[0]:
@@ -47,8 +47,8 @@ def draw_changes(
             c = np.floor(in_voxels(T[2, 0], T[2, 1], T[2, 2], T[2, 3], x, y, z, size))
             row = rows[find(key_of(np.int64(a), np.int64(b), np.int64(c)), key, rows)]
             if row >= 0:
-                contradictions[v, u] = CONTRADICTS if labels[v, u] != before[row] else AGREES
-                drift[v, u] = level[row]
+                contradictions[line, column] = CONTRADICTS if labels[v, u] != before[row] else AGREES
+                drift[line, column] = level[row]
 
 
 @serial

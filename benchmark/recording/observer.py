@@ -73,6 +73,7 @@ class GroupLog:
         self._drift = DriftLog(voxel_size)
         self._maps: dict[str, VoxelLogger] = {}
         self._colours: FeatureColours | None = None
+        self._strides = dict[str, int]()  # of the last picture of each name
         self._tables: dict[str, VoxelTable] = {}  # by backend, as they are finished
         self.last: tuple[int, float | None] = (task.indices[-1], None)
         """The number and timestamp of the last frame."""
@@ -111,14 +112,21 @@ class GroupLog:
             pictures |= {name: (picture, coarse) for name, picture in drift.pictures(coarse).items()}
         for name, (picture, picture_stride) in pictures.items():
             image = rr.SegmentationImage(picture, draw_order=-10)
-            stream.log(path(self._scene, "camera", self.task.model, name), image, over_camera(picture_stride))
+            stream.log(self._picture(name), image, *self._placed(name, picture_stride))
         if frame.features is not None:  # in the colours of the first frame
             self._colours = self._colours or FeatureColours.of(frame.features)
         if frame.features is not None and self._colours is not None and self._colours.fit(frame.features):
             colours = frame.features.image(self._colours(frame.features), frame.shape, 0)[::stride, ::stride]
             image_of_features = rr.Image(np.ascontiguousarray(colours), draw_order=-5).compress(jpeg_quality=90)
-            where = path(self._scene, "camera", self.task.model, "features")
-            stream.log(where, image_of_features, over_camera(stride))
+            stream.log(self._picture("features"), image_of_features, *self._placed("features", stride))
+
+    def _picture(self, name: str) -> str:
+        return path(self._scene, "camera", self.task.model, name)
+
+    def _placed(self, name: str, stride: int) -> list[rr.Transform3D]:
+        """Return the transform that lays a picture over the camera's image, where the last one of its name differs."""
+        before, self._strides[name] = self._strides.get(name), stride
+        return [] if before == stride else [over_camera(stride)]
 
     def log_unit(
         self, stream: rr.RecordingStream, record: Record, table: VoxelTable, tolerance: float, factor: int = 1,
