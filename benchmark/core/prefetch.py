@@ -35,8 +35,8 @@ def default_threads() -> int:
 
 
 def prefetch(
-    read: Callable[[int], T],
-    indices: Sequence[int],
+    read: Callable[[K], T],
+    indices: Sequence[K],
     *,
     threads: int | None = None,
     size: Callable[[T], int] = lambda item: 0,

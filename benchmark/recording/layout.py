@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import itertools
 import math
 from collections.abc import Iterable, Mapping, Sequence, Set
@@ -68,6 +69,7 @@ class SceneBounds:
     up: Float64 | None
 
 
+@functools.lru_cache(maxsize=16)  # the maps of a scene share it
 def camera_pose(bounds: SceneBounds | None, aspect: float) -> rrb.EyeControls3D | None:
     """Return the pose of a view of a scene, of that width by height; None if the viewer chooses it."""
     if bounds is None:

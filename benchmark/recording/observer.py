@@ -222,10 +222,8 @@ class Recording(Observer):
             self._scenes[name] = SceneLog([task for task in plan.tasks if task.scene.name == name])
 
     def group_started(self, task: Task, config: Config, backends: Mapping[UnitName, FusionBackend]) -> None:
-        """Follow the map that is drawn."""
+        """Follow the map that is drawn. The one before is let go of within a few frames: few jobs may wait."""
         self._end_group()
-        if self._background is not None:
-            self._background.drain()  # it lets go of the maps before
         self._unfinished = {*backends}
         self._fused = next((backend for unit, backend in backends.items() if unit.backend == self._drawn(task)), None)
 

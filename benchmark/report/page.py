@@ -5,6 +5,7 @@ from __future__ import annotations
 import itertools
 import json
 import math
+import threading
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from types import MappingProxyType
@@ -13,6 +14,7 @@ from typing import Any
 import numpy as np
 
 from semstab.core.palette import KINDS
+from semstab.core.prefetch import prefetch
 from semstab.core.types import UInt8
 from semstab.data.features import OF_FEATURES
 from semstab.data.georeference import Georeference
@@ -50,6 +52,9 @@ MOST_NAMED = 3
 CELLS, BYTES, ALL_BYTES = 1_200_000, 1_000_000, 12_000_000
 """The most cells of a map in the page, and the most bytes of the images of one map and of all maps; a larger map is
 reduced to every n-th cell."""
+
+AT_ONCE = 2
+"""Maps whose images are made at once; one more may be in memory."""
 
 SBD_END = 0.25
 """The SBD, bits, that the largest code of a map's image stands for."""
@@ -224,7 +229,7 @@ def _of_images(records: Sequence[Record]) -> Iterator[tuple[str, str, str]]:
 
 
 def _scenes(result: Result, folder: Path, shown: Mapping[str, ShownMap]) -> Iterator[dict[str, Any]]:
-    views = TopViews()
+    views, reading = TopViews(), threading.Lock()
     stored = [record for record in result.select() if record.voxels_file is not None]
     share = min(BYTES, ALL_BYTES // max(1, len(stored)))
     for scene in result.scenes:
@@ -237,19 +242,16 @@ def _scenes(result: Result, folder: Path, shown: Mapping[str, ShownMap]) -> Iter
         up, colors = result.up.get(scene), {name: k for k, name in enumerate(result.models)}
         labelled = [record for record in records if record.taxonomy != OF_FEATURES.name]
         mapped = [] if up is None else [record for record in labelled if record.voxels_file is not None]
+
+        def map_of(record: Record, up: Any = up, overviews: Mapping[str, Overview] = overviews) -> dict[str, Any]:
+            with reading:
+                seen = shown.get(record.unit.slug) or ShownMap(views.above(record, up), places_of(record, LISTED))
+            scene, model = record.unit.scene, record.unit.model
+            return _map(record, seen, overviews.get(model), result.georeference.get(scene), share)
+
         yield {
             "name": scene,
-            "maps": [
-                _map(
-                    record,
-                    shown.get(record.unit.slug)
-                    or ShownMap(views.above(record, result.up[scene]), places_of(record, LISTED)),
-                    overviews.get(record.unit.model),
-                    result.georeference.get(scene),
-                    share,
-                )
-                for record in mapped
-            ],
+            "maps": [fetched.item for fetched in prefetch(map_of, mapped, threads=AT_ONCE)],
             "unknown_up": up is None,
             "video": all(record.pixels is not None for record in records),
             "models": _legend(result.models) if len(result.models) > 1 else [],
