@@ -100,36 +100,38 @@ class Fusion:
                 observers.tell(lambda observer: observer.group_started(task, config, backends))  # noqa: B023
 
     def decoded_frames(self) -> Generator[Fetched[Decodings], None, None]:
-        """Yield frames in order, decoded ahead by threads."""
+        """Yield frames in order, decoded and prepared ahead by threads."""
         fetched = prefetch(
             self._decode,
             self.order,
             threads=self._threads,
-            size=lambda decodings: sum(decoded.nbytes for decoded in _of(decodings)),
+            size=lambda item: sum(decoded.nbytes for decoded in item.values() if isinstance(decoded, Decoded)),
         )
         with contextlib.ExitStack() as stack:
             for model in dict.fromkeys(stream.task.model for stream in self.streams):
                 stack.enter_context(self._scene.reading(self.order, model))
             for fetched_frame in stack.enter_context(contextlib.closing(fetched)):
-                in_network = min(
-                    fetched_frame.waited,
-                    sum(decoded.network for decoded in _of(fetched_frame.item) if decoded.network > 0),
-                )
+                network = {
+                    stream.task.model: decoded.network
+                    for stream, decoded in fetched_frame.item.items()
+                    if isinstance(decoded, Decoded) and decoded.network > 0
+                }
+                in_network = min(fetched_frame.waited, sum(network.values()))
                 self.watch.seconds["read"] += fetched_frame.waited - in_network
                 if in_network:
                     self.watch.seconds["network"] += in_network
                 yield fetched_frame
 
     def _decode(self, index: int) -> Decodings:
-        """Decode a frame in a worker thread, with the labels of each model; its image and truth are decoded once."""
+        """Decode a frame in a worker thread, and prepare it for each stream; its image and truth are decoded once."""
         wanting = [stream for stream in self.streams if index in stream.frames]
         color = self._observers.want_color or any(stream.wants_color or stream.shown == index for stream in wanting)
         decodings: dict[str, Decoded | Exception] = {}
         for model in dict.fromkeys(stream.task.model for stream in wanting):
             model_streams = [stream for stream in wanting if stream.task.model == model]
-            decoded_before = next(_of(decodings), None)
+            decoded_before = next((decoded for decoded in decodings.values() if isinstance(decoded, Decoded)), None)
             decodings[model] = self._decoded(index, model, model_streams, decoded_before, color=color)
-        return decodings
+        return {stream: _prepared(stream, decodings[stream.task.model]) for stream in wanting}
 
     def _decoded(
         self, index: int, model: str, wanting: Sequence[Stream], decoded_before: Decoded | None, *, color: bool
@@ -189,9 +191,14 @@ class Fusion:
         return any(stream.maps for stream in self.streams)
 
 
-def _of(decodings: Decodings) -> Iterator[Decoded]:
-    """Yield what could be decoded."""
-    return (decoded for decoded in decodings.values() if isinstance(decoded, Decoded))
+def _prepared(stream: Stream, decoded: Decoded | Exception) -> Decoded | Exception:
+    """Return a decoded frame as the stream's maps fuse it, or why there is none."""
+    if isinstance(decoded, Exception):
+        return decoded
+    try:
+        return stream.prepared(decoded)
+    except Exception as error:  # noqa: BLE001 - raised again by `Stream.prepare`
+        return error
 
 
 # --- Open scenes ------------------------------------------------------------------------------------------------------

@@ -251,18 +251,20 @@ _rooms: weakref.WeakKeyDictionary[Scene, dict[tuple[object, ...], int]] = weakre
 
 @dataclass(frozen=True, eq=False)
 class Decoded:
-    """A frame with the labels of a model, as its scene has it; `Stream.prepare` makes it one that maps fuse.
+    """A frame with the labels of a model: as its scene has it, or as the maps of a stream fuse it.
 
     Attributes:
         truth: Its ground truth.
         model: The model's frame before filters.
+        overview: What is saved of it for figures, of the frame that is shown.
         network: Seconds of the model's prediction on it; NaN if labels are read.
-        seconds, waited: Seconds of decoding, in a worker thread, and of waiting for it.
+        seconds, waited: Seconds of decoding and preparing it, in a worker thread, and of waiting for it.
     """
 
     frame: Frame
     truth: Frame | None = None
     model: Frame | None = None
+    overview: dict[str, Any] = field(default_factory=dict)
     network: float = math.nan
     seconds: float = math.nan
     waited: float = math.nan
@@ -271,10 +273,6 @@ class Decoded:
     def nbytes(self) -> int:
         """Bytes that it keeps in memory."""
         return sum(frame.nbytes for frame in (self.frame, self.truth, self.model) if frame is not None)
-
-
-Decodings = Mapping[str, Decoded | Exception]
-"""A frame with the labels of each model that is measured in one pass: one, or of a video all; or why there is none."""
 
 
 class Stream:
@@ -309,23 +307,28 @@ class Stream:
         """(F, 3, 3) down, forward and centre of cameras in the world; of none where up need not be estimated."""
         return self._poses.table().reshape(-1, 3, 3)
 
-    def prepare(self, fetched: Fetched[Decodings]) -> Decoded:
-        """Return the frame as the stream's maps fuse it: labels in the run's label space, without moving objects.
+    def prepared(self, decoded: Decoded) -> Decoded:
+        """Return a frame as the stream's maps fuse it: labels in the run's label space, without moving objects.
 
         It has its colour only where an observer wants it.
         """
-        decoded = fetched.item[self.task.model]
-        if isinstance(decoded, Exception):
-            raise decoded
-        frame, truth = prepare(self.task, decoded.frame, self.pixel_stride), None
+        frame, truth, overview = prepare(self.task, decoded.frame, self.pixel_stride), None, dict[str, Any]()
         if self.truth_task is not None and decoded.truth is not None:
             truth = prepare(self.truth_task, decoded.truth, self.pixel_stride)
         if decoded.frame.index == self.shown:
-            self.overview = _overview(self.task, decoded.frame)
+            overview = _overview(self.task, decoded.frame)
             needs_color = self._observers.want_color or self.wants_color
             frame = frame if needs_color else dataclasses.replace(frame, color=None)
-        seconds, waited = fetched.seconds, fetched.waited
-        return dataclasses.replace(decoded, frame=frame, truth=truth, seconds=seconds, waited=waited)
+        _ = frame.valid  # known from here on
+        return dataclasses.replace(decoded, frame=frame, truth=truth, overview=overview)
+
+    def prepare(self, fetched: Fetched[Decodings]) -> Decoded:
+        """Return the frame that was prepared ahead; what was raised then is raised now."""
+        decoded = fetched.item[self]
+        if isinstance(decoded, Exception):
+            raise decoded
+        self.overview = decoded.overview or self.overview
+        return dataclasses.replace(decoded, seconds=fetched.seconds, waited=fetched.waited)
 
     def measure(self, now: Decoded, reports: Mapping[LiveMap, FrameReport]) -> dict[LiveMap, FrameRow]:
         """Return flicker and stability in image coordinates with the reports of the maps: a row of each series."""
@@ -377,6 +380,10 @@ class Stream:
             if live.work.tile is None:
                 what = live.name.stated
                 self._observers.tell(lambda observer, what=what: observer.advanced(1, what))  # type: ignore[misc]
+
+
+Decodings = Mapping[Stream, Decoded | Exception]
+"""A frame as each stream's maps fuse it, or why there is none."""
 
 
 def streams_of(maps: Iterable[LiveMap], watch: Stopwatch, observers: Observers) -> list[Stream]:
