@@ -196,7 +196,7 @@ def _prepared(stream: Stream, decoded: Decoded | Exception) -> Decoded | Excepti
     if isinstance(decoded, Exception):
         return decoded
     try:
-        return stream.prepared(decoded)
+        return stream.prepare_ahead(decoded)
     except Exception as error:  # noqa: BLE001 - raised again by `Stream.prepare`
         return error
 

@@ -307,7 +307,7 @@ class Stream:
         """(F, 3, 3) down, forward and centre of cameras in the world; of none where up need not be estimated."""
         return self._poses.table().reshape(-1, 3, 3)
 
-    def prepared(self, decoded: Decoded) -> Decoded:
+    def prepare_ahead(self, decoded: Decoded) -> Decoded:
         """Return a frame as the stream's maps fuse it: labels in the run's label space, without moving objects.
 
         It has its colour only where an observer wants it.
