@@ -39,9 +39,18 @@ def numba_map(voxel_size, num_classes, **options):
 
 
 class TestNumba(BackendConformance):
-    """With the log of observations; the oracle below compares a map without one."""
+    """With the log of observations, and as a large map, whose table takes the memory of its hash.
+
+    The oracle below compares a map without a log.
+    """
 
     reach = 2**20
+
+    @pytest.fixture(autouse=True, scope="class")
+    @classmethod
+    def large(cls):
+        with patch("semstab.backends.numba_hash.LARGE", 1):
+            yield
 
     def create(self, voxel_size, num_classes):
         return numba_map(voxel_size, num_classes, history=True)
