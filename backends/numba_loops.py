@@ -259,7 +259,7 @@ def update(
 
 @serial
 def read_records(records, order, key, op, pixels, first_frame, last_frame, drift_sum, self_sum, frame_entropy_sum):
-    """Read these records' columns (n,) in order: each record is looked at once."""
+    """Read these records' key and columns (n,), in order, in one pass."""
     for i in range(order.shape[0]):
         record = records[order[i]]
         key[i], op[i], pixels[i] = record.key, record.op, record.pixels

@@ -29,8 +29,8 @@ def scene_notes(
     if scene.folder is None or scene.of_scans:
         return ()
     stored, options = stored_labels(scene, model, config), config.dataset.options
-    with ThreadPoolExecutor(1, thread_name_prefix="semstab-notes") as beside:
-        of_images = beside.submit(_image_notes, scene, indices, model, stored)
+    with ThreadPoolExecutor(1, thread_name_prefix="semstab-notes") as pool:
+        of_images = pool.submit(_image_notes, scene, indices, model, stored)
         findings = [] if stored is None else label_findings(scene, indices, [model], options, known, thorough=False)
         return (
             *(line for of_model in findings for line in (*of_model.wrong, *of_model.remarks)),

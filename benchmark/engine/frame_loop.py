@@ -7,7 +7,7 @@ import functools
 import itertools
 import json
 from collections import defaultdict
-from collections.abc import Generator, Iterator, Mapping, Sequence
+from collections.abc import Generator, Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -105,7 +105,7 @@ class Fusion:
             self._decode,
             self.order,
             threads=self._threads,
-            size=lambda item: sum(decoded.nbytes for decoded in item.values() if isinstance(decoded, Decoded)),
+            size=lambda decodings: sum(decoded.nbytes for decoded in _of(decodings.values())),
         )
         with contextlib.ExitStack() as stack:
             for model in dict.fromkeys(stream.task.model for stream in self.streams):
@@ -129,7 +129,7 @@ class Fusion:
         decodings: dict[str, Decoded | Exception] = {}
         for model in dict.fromkeys(stream.task.model for stream in wanting):
             model_streams = [stream for stream in wanting if stream.task.model == model]
-            decoded_before = next((decoded for decoded in decodings.values() if isinstance(decoded, Decoded)), None)
+            decoded_before = next(_of(decodings.values()), None)
             decodings[model] = self._decoded(index, model, model_streams, decoded_before, color=color)
         return {stream: _prepared(stream, decodings[stream.task.model]) for stream in wanting}
 
@@ -189,6 +189,11 @@ class Fusion:
                 with self.failing([largest]):
                     raise self._budget.outgrown(largest)
         return any(stream.maps for stream in self.streams)
+
+
+def _of(decodings: Iterable[Decoded | Exception]) -> Iterator[Decoded]:
+    """Yield what could be decoded."""
+    return (decoded for decoded in decodings if isinstance(decoded, Decoded))
 
 
 def _prepared(stream: Stream, decoded: Decoded | Exception) -> Decoded | Exception:

@@ -274,6 +274,7 @@ class Recording(Observer):
     def log_finished(self, result: Result, *, pictures: bool = False) -> None:
         """Log the units in the run's folder that are not logged yet; with pictures read their frames again."""
         stream, background = self._opened()
+        background.drain()  # "the verdict follows" is logged before the verdict
         for task in self._plan.tasks:
             scene, model = task.scene.name, task.model
             records = [

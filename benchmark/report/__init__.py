@@ -42,7 +42,7 @@ class Reporting(Observer):
         """Load what writes the page, once, while frames are fused."""
         if not self._loads:
             self._loads = True
-            self._beside.submit(load)
+            self._beside.submit(_load)
 
     def unit_finished(
         self, unit: Unit, record: Record | RegionFlicker | None, table: VoxelTable | None, error: str | None
@@ -76,7 +76,7 @@ def digest_of(folder: Path) -> str:
     return hashlib.sha256(version("semstab").encode() + (summary.read_bytes() if summary.exists() else b"")).hexdigest()
 
 
-def load() -> None:
+def _load() -> None:
     """Load the modules and the templates that a page is made with."""
     from semstab.report.page import load_templates
 

@@ -271,8 +271,8 @@ def _of_spots(
 ) -> dict[str, Any]:
     """Return the sections `OF_SPOTS` by name."""
     outlying = None if lone is None else outlying_frames(lone, len(spots.views), name=frame_name)
-    with ThreadPoolExecutor(1, thread_name_prefix="semstab-correlogram") as beside:  # it takes as long as the others
-        by_distance = beside.submit(correlogram, spots)
+    with ThreadPoolExecutor(1, thread_name_prefix="semstab-correlogram") as pool:  # it takes as long as the others
+        by_distance = pool.submit(correlogram, spots)
         return {
             "spots": spot_agreement(spots, sums, table, scope, critical, limits),
             "outlying_frames": outlying,
