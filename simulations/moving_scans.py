@@ -12,7 +12,7 @@ from moving import CLASSES, HEADS, Counts, Street
 from scipy.spatial import cKDTree
 
 import semstab
-from semstab.core.types import Float64, Int64, Mask
+from semstab.core.types import Float64, Int64, UInt8
 from semstab.data.frames import Frame
 from semstab.datasets import Scene
 from semstab.statistics import Sampler
@@ -24,8 +24,11 @@ RINGS, COLUMNS, UP, DOWN = 64, 720, 2.0, -24.8
 SIDE, HEIGHT, RANGE = -3.2, 1.8, 60.0
 """Where in the street the LiDAR drives, and how high it is and how far it sees, metres."""
 
-MOVING = range(252, 260)
-"""Stored ids of SemanticKITTI's moving things."""
+MOVING, UNLABELLED = range(252, 260), (0, 1)
+"""Stored ids of SemanticKITTI's moving things; and of points of which nobody said what they are: far cars are such."""
+
+STAYS, MOVES, WENT, UNSAID = range(4)
+"""The truth of a point: its thing stays, moves, or went by its own length; or nothing is said of it."""
 
 
 def scans(street: Street, noise: float, rng: np.random.Generator) -> Iterator[tuple[Frame, Int64]]:
@@ -89,7 +92,8 @@ def first_answers(sampler: Sampler) -> Int64:
 def streets(data: Path) -> None:
     """Print a row for each street that has movers, and sums, by scans and by images.
 
-    Spots on things whose stored id moves are of movers; recall is of those that went by their own length.
+    Spots on things whose stored id moves are of movers; recall is of those that went by their own length. Spots at
+    points without a label do not count.
     """
     of_scans = _opened("semantickitti", data)
     for name in ("semantickitti", "semantickitti_images"):
@@ -109,38 +113,38 @@ def _opened(name: str, data: Path) -> dict[str, Scene]:
     return dict(open_scenes(semstab.load_config({"dataset": {"name": name, "options": {"root": str(data)}}})))
 
 
-def _instances(folder: Path, scene: Scene) -> list[tuple[Float64, Mask, Mask]]:
-    """Return of each scan its points in the world (N, 3), those that move, and those whose thing went by its length."""
-    world, moves, things = [], [], []
+def _instances(folder: Path, scene: Scene) -> list[tuple[Float64, UInt8]]:
+    """Return of each scan its points in the world (N, 3), and what is said of them (N,): STAYS, MOVES, ..."""
+    world, said, things = [], [], []
     for index, file in enumerate(sorted((folder / "labels").glob("*.label"))):
         stored = np.fromfile(file, np.uint32)
         frame = scene.frame(index, "gt", color=False)
         assert frame.points is not None
         world.append(frame.points.reshape(-1, 3) @ frame.T_wc[:3, :3].T + frame.T_wc[:3, 3])
-        moves.append(np.isin(stored & 0xFFFF, MOVING))
+        said.append(np.where(np.isin(stored & 0xFFFF, UNLABELLED), UNSAID, STAYS).astype(np.uint8))
+        said[-1][np.isin(stored & 0xFFFF, MOVING)] = MOVES
         things.append(stored >> 16)
     far = set()
-    for thing in np.unique(np.concatenate([own[mask] for own, mask in zip(things, moves, strict=True)])):
-        parts = [p[(own == thing) & mask, :2] for p, own, mask in zip(world, things, moves, strict=True)]
+    for thing in np.unique(np.concatenate([own[of == MOVES] for own, of in zip(things, said, strict=True)])):
+        parts = [p[(own == thing) & (of == MOVES), :2] for p, own, of in zip(world, things, said, strict=True)]
         middles = np.array([(part.min(axis=0) + part.max(axis=0)) / 2 for part in parts if len(part)])
         length = max(float(np.hypot(*np.ptp(part, axis=0))) for part in parts if len(part))
         if np.hypot(*np.ptp(middles, axis=0)) >= length:
             far.add(int(thing))
-    went = [mask & np.isin(own, list(far)) for own, mask in zip(things, moves, strict=True)]
-    return list(zip(world, moves, went, strict=True))
+    for own, of in zip(things, said, strict=True):
+        of[(of == MOVES) & np.isin(own, list(far))] = WENT
+    return list(zip(world, said, strict=True))
 
 
-def _of_street(scene: Scene, scans: list[tuple[Float64, Mask, Mask]]) -> tuple[Counts, float]:
+def _of_street(scene: Scene, scans: list[tuple[Float64, UInt8]]) -> tuple[Counts, float]:
     """Return counts of the spots of a street, and the share of its spots of which it is told whether they moved."""
-    sampler = Sampler(3)
-    for index, (world, moves, far) in enumerate(scans):
+    sampler = Sampler(4)
+    for index, (world, said) in enumerate(scans):
         frame = scene.frame(index, "gt", color=False)
-        own = moves.astype(np.uint8) + far
-        if not frame.is_scan:
-            own = _on_image(frame, world, own)
+        own = said if frame.is_scan else _on_image(frame, world, said)
         sampler.add(dataclasses.replace(frame, labels=own.reshape(frame.shape), mask=None))
     spots, first, counts = sampler.sample(), first_answers(sampler), Counts()
-    counts.add(spots, first >= 1, first == 2, first >= 0)
+    counts.add(spots, (first == MOVES) | (first == WENT), first == WENT, (first >= 0) & (first != UNSAID))
     assert spots.votes is not None
     return counts, float(spots.votes.known[first >= 0].mean())
 

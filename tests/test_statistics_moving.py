@@ -296,11 +296,12 @@ def spot_at(column: float, row: float, depth: float) -> np.ndarray:
 
 
 @pytest.mark.parametrize(("near", "kind"), [
-    ({}, THROUGH), ({(4, 4): 10.0}, SEEN), ({(4, 4): 10.25}, UNKNOWN), ({(6, 4): 10.0}, SEEN),
+    ({}, THROUGH), ({(4, 4): 10.1}, SEEN), ({(4, 4): 10.2}, THROUGH), ({(4, 4): 6.0}, UNKNOWN),
+    ({(5, 5): 10.0}, SEEN), ({(5, 5): 6.0}, UNKNOWN), ({(3, 3): 10.0}, THROUGH), ({(3, 3): 6.0}, THROUGH),
     ({(8, 4): 10.0}, THROUGH), ({(row, 4): 0.0 for row in range(5)}, THROUGH),
     ({(row, column): 0.0 for row in range(5) for column in range(9)}, UNKNOWN),
 ])  # fmt: skip
-def test_a_view_of_points_sees_through_a_spot_if_all_points_around_are_farther(
+def test_a_view_sees_through_a_spot_if_farther_points_are_around_it_and_others_not_so_close(
     near: dict[tuple[int, int], float], kind: int
 ) -> None:
     """A spot 10 m away, points 14 m away, and others in some directions."""
@@ -311,7 +312,7 @@ def test_a_view_of_points_sees_through_a_spot_if_all_points_around_are_farther(
 
 
 @pytest.mark.parametrize(("left", "right", "kind"), [
-    (9.7, 10.4, SEEN), (6.0, 16.0, UNKNOWN), (9.0, 9.5, HIDDEN), (10.4, 10.8, THROUGH), (10.2, 10.8, UNKNOWN),
+    (9.7, 10.4, SEEN), (6.0, 16.0, UNKNOWN), (9.0, 9.5, HIDDEN), (10.2, 10.8, THROUGH), (10.1, 10.8, SEEN),
 ])  # fmt: skip
 def test_a_view_sees_a_spot_between_points_of_a_steep_surface_but_not_between_two_surfaces(
     left: float, right: float, kind: int
@@ -322,8 +323,8 @@ def test_a_view_sees_a_spot_between_points_of_a_steep_surface_but_not_between_tw
 
 def test_limits_of_points_grow_with_how_depth_differs_between_views() -> None:
     view = view_of(np.full((9, 9), 10.5))
-    votes = [int(view.votes(spot_at(4, 4, 10.0), sigma)[0] & 3) for sigma in (0.001, 0.035, 0.06)]
-    assert votes == [THROUGH, UNKNOWN, SEEN]
+    votes = [int(view.votes(spot_at(4, 4, 10.0), sigma)[0] & 3) for sigma in (0.001, 0.05, 0.06)]
+    assert votes == [THROUGH, THROUGH, SEEN]
 
 
 def test_points_of_a_scan_close_a_circle() -> None:
@@ -350,10 +351,10 @@ def test_the_points_of_256_views_take_64_megabytes() -> None:
 
 
 @pytest.mark.parametrize(("around", "spacing", "is_lone"), [
-    ("mm", 1.0, False), ("m", 1.0, True), ("mmssss", 1.0, False), ("mmsssss", 1.0, True), ("mm", 0.5, True),
-    ("mm?????", 1.0, False), ("", 1.0, True),
+    ("m", 1.0, False), ("msss", 1.0, False), ("mssss", 1.0, True), ("mmssssss", 1.0, False), ("mm", 0.5, True),
+    ("m?????", 1.0, False), ("", 1.0, True),
 ])  # fmt: skip
-def test_a_spot_that_moved_is_lone_without_two_more_and_a_third_of_those_around(
+def test_a_spot_that_moved_is_lone_without_another_one_and_a_quarter_of_those_around(
     around: str, spacing: float, is_lone: bool
 ) -> None:
     """Moved, static and unknown spots lie 2 m around a spot that moved, next to each other."""

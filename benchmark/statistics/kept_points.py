@@ -15,22 +15,23 @@ PIXELS, WIDER = 125_000, 1.1
 """Most pixels, about, of a view's image of directions, and the edge of a pixel by the distance of the points, at least:
 256 views take 64 MB."""
 
-REACH = 2.5
+REACH = 2.0
 """Distances of the points within which points around a spot tell of it: most have a ring above and a ring below."""
 
-GAP, GAP_SIGMAS = 0.03, 1.5
-"""Points are farther than a spot if they are by more than GAP, relative, and by more than GAP_SIGMAS standard
-deviations of how depth differs between views. These hold errors of the planes through points, which votes have not."""
+LIMIT, LIMIT_SIGMAS = 0.015, 0.9
+"""A point is at a spot's depth if it differs by at most LIMIT, relative, or by LIMIT_SIGMAS standard deviations of how
+depth differs between views. These hold errors of the planes through points, which votes have not."""
 
-NEAR_BY, NEAR_BY_SIGMAS = 0.018, 0.9
-"""A view sees a spot if a point's depth differs by at most NEAR_BY, relative, or by NEAR_BY_SIGMAS deviations."""
+CLEAR = 1.2
+"""A view sees through a spot if farther points are around it, and all others are CLEAR times as far away in the image,
+at least: a fence in front of a car, or a wall beside it, does not keep the view from telling that the car left."""
 
 SPAN = 0.3
-"""It does, too, if the spot is between points whose depths differ by at most SPAN, relative: a steep surface."""
+"""A view sees a spot between points whose depths differ by at most SPAN, relative, too: a steep surface."""
 
-SAME, SAME_REACH = 0.5, 1.25
+SAME, SAME_REACH = 0.6, 1.25
 """A spot is at a point if a point at most SAME_REACH distances of the points away has its depth, up to SAME of what
-NEAR_BY allows. A plane through points of two surfaces has other places, too, at which there is nothing."""
+LIMIT allows. A plane through points of two surfaces has other places, too, at which there is nothing."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -83,29 +84,26 @@ class KeptPoints:
 
     def gap(self, sigma: float) -> float:
         """Return how much farther than a spot points are at least, relative, if a view sees through it."""
-        return max(GAP, GAP_SIGMAS * sigma)
+        return max(LIMIT, LIMIT_SIGMAS * sigma)
 
     def votes(self, point: Float64, sigma: float) -> npt.NDArray[np.uint8]:
         """Return the vote (n,) on points (n, 3); depth of a surface differs by `sigma`, relative, between views."""
-        return self._votes(point, REACH, self.gap(sigma), _near_by(sigma), SPAN)
+        return self._votes(point, REACH, self.gap(sigma), SPAN)
 
     def at_points(self, point: Float64, sigma: float) -> Mask:
         """Return which places (n, 3) that this view found lie at its points, and not between two surfaces."""
         from semstab.statistics.loops.moving import SEEN
 
-        same = SAME * _near_by(sigma)
-        return np.asarray(self._votes(point, SAME_REACH, same, same, 0.0) & 3 == SEEN, np.bool_)
+        return np.asarray(self._votes(point, SAME_REACH, SAME * self.gap(sigma), 0.0) & 3 == SEEN, np.bool_)
 
-    def _votes(
-        self, point: Float64, distances: float, gap: float, near_by: float, span: float
-    ) -> npt.NDArray[np.uint8]:
+    def _votes(self, point: Float64, distances: float, limit: float, span: float) -> npt.NDArray[np.uint8]:
         """Return the vote (n,) on points (n, 3), by the points within `distances` distances of points."""
         from semstab.statistics.loops.moving_points import vote_by_points
 
         votes = np.empty(len(point), np.uint8)
         place = self.T_wc, self.camera, self.around, self.stride, self.top, self.near
-        limits = (codes(farther) for farther in (gap, near_by, span))
-        vote_by_points(point, *place, distances * self.spacing / self.stride, *limits, votes)
+        reach = distances * self.spacing / self.stride
+        vote_by_points(point, *place, reach, CLEAR, codes(limit), codes(span), votes)
         return votes
 
 
@@ -114,8 +112,3 @@ def codes(farther: float) -> int:
     from semstab.statistics.loops.moving import STEP
 
     return math.ceil(math.log1p(farther) / STEP)
-
-
-def _near_by(sigma: float) -> float:
-    """Return how much nearer or farther than a spot, relative, a point is at most that is on the spot's surface."""
-    return max(NEAR_BY, NEAR_BY_SIGMAS * sigma)

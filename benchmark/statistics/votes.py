@@ -37,9 +37,9 @@ moved: what errors do to one spot they seldom do to the spots next to it."""
 NEXT_TO_OF_POINTS = 2.5
 """Spacings of spots within which an unknown spot is next to others, of points: more of these are unknown."""
 
-LONE, LEAST_OF_LONE, SHARE_OF_LONE = 2.5, 2, 1 / 3
-"""A spot that moved, by points, is lone if fewer than LEAST_OF_LONE other spots within LONE spacings moved, or less
-than SHARE_OF_LONE of the known ones there: few rays meet leaves and wires. Views that see through it do not count."""
+LONE, SHARE_OF_LONE = 2.5, 1 / 4
+"""A spot that moved, by points, is lone if no other spot within LONE spacings moved, or less than SHARE_OF_LONE of the
+known ones there: few rays meet leaves and wires. Views that see through it do not count."""
 
 NEIGHBOURS = round(math.pi * NEXT_TO**2) - 1
 """Spots, about, within NEXT_TO spacings of a spot."""
@@ -94,7 +94,7 @@ def lone(point: Float64, moved: Mask, static: Mask, spacing: float) -> Mask:
     trees = cKDTree(of_moved), cKDTree(point[static])
     near, stayed = (tree.query_ball_point(of_moved, LONE * spacing, return_length=True) for tree in trees)
     near = near - 1  # without the spot itself
-    lone[moved] = (near < LEAST_OF_LONE) | (near < SHARE_OF_LONE * (near + stayed))
+    lone[moved] = (near == 0) | (near < SHARE_OF_LONE * (near + stayed))
     return lone
 
 

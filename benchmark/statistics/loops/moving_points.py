@@ -11,8 +11,8 @@ from semstab.core.compiled import serial
 from semstab.statistics.loops.moving import HIDDEN, SEEN, SIDES, THROUGH, UNKNOWN, code_of
 from semstab.statistics.loops.surface import in_sensor
 
-RIGHT, DOWN, LEFT, UP = 1, 2, 4, 8
-"""Sides of a spot to which points lie, as bits."""
+RIGHT, DOWN, LEFT, UP = 0, 1, 2, 3
+"""Sides of a spot to which points lie."""
 
 
 @serial
@@ -66,38 +66,45 @@ def side_of(dx, dy):
 
 
 @serial
-def vote_by_points(point, T, camera, around, stride, top, near, reach, gap, near_by, span, votes):
+def vote_by_points(point, T, camera, around, stride, top, near, reach, clear, limit, span, votes):
     """Write the vote of a view on each point (n, 3), by its own points within `reach` pixels of the place in the image.
 
-    A view sees through a point if all of these are farther by more than `gap`, in codes, and some lie to each of the
-    four sides. It sees the point if one has its depth, but for `near_by` codes, or if they are on both sides of it and
-    at most `span` codes apart. It has the point hidden if all of them are nearer.
+    They are at the depth of the point, but for `limit` codes, or nearer, or farther. A view sees through the point if
+    it has farther ones to each of the four sides, and all others are `clear` times as far away in the image, at least.
+    It sees the point if one is at its depth, or if they are on both sides of it and at most `span` codes apart. It has
+    the point hidden if all of them are nearer.
     """
     rows, columns = near.shape
-    most = np.int64(np.ceil(reach + 0.5))
+    most, farther = np.int64(np.ceil(reach + 0.5)), np.empty(4)
     for i in range(len(point)):
         votes[i] = UNKNOWN
         x, y, depth = place_of(point, i, T, camera, around, stride, top, near.shape)
         if depth == 0.0:
             continue
         column, row, here = np.int64(np.floor(x + 0.5)), np.int64(np.floor(y + 0.5)), code_of(depth)
-        nearest, farthest, sides, same = np.int64(0xFFFF), np.int64(0), 0, False
+        nearest, farthest, same = np.int64(0xFFFF), np.int64(0), False
+        farther[:], other = np.inf, np.inf  # squared distances of the closest ones in the image
         for b in range(row - most, row + most + 1):
             for a in range(column - most, column + most + 1):
                 if b < 0 or b >= rows or (not around and (a < 0 or a >= columns)):
                     continue
-                code = np.int64(near[b, a % columns])
-                if code == 0 or (a - x) ** 2 + (b - y) ** 2 > reach * reach:
+                code, away = np.int64(near[b, a % columns]), (a - x) ** 2 + (b - y) ** 2
+                if code == 0 or away > reach * reach:
                     continue
                 nearest, farthest = min(nearest, code), max(farthest, code)
-                same |= abs(code - here) <= near_by
-                sides |= side_of(a - x, b - y)
+                if code > here + limit:
+                    side = side_of(a - x, b - y)
+                    farther[side] = min(farther[side], away)
+                else:
+                    same |= code >= here - limit
+                    other = min(other, away)
         if farthest == 0:
             continue
         part = np.uint8(4 * (SIDES * (SIDES * row // rows) + SIDES * (column % columns) // columns))
-        if nearest > here + gap:
-            votes[i] = THROUGH + part if sides == RIGHT + DOWN + LEFT + UP else UNKNOWN
+        around_it = farther.max()
+        if around_it < np.inf and other > clear * clear * around_it:
+            votes[i] = THROUGH + part
         elif same or (nearest <= here <= farthest and farthest - nearest <= span):
             votes[i] = SEEN + part
-        elif farthest < here - near_by:
+        elif farthest < here - limit:
             votes[i] = HIDDEN + part
