@@ -2,12 +2,13 @@
 BIN := .venv/bin
 TESTS := $(BIN)/pytest -n auto --maxprocesses 4 --dist loadfile --no-loadscope-reorder
 
-.PHONY: help setup setup-dev bench quick test docs fuzz fuzz-short combinations faults mutants lint format clean
+.PHONY: help setup setup-dev bench quick record test docs fuzz fuzz-short combinations faults mutants lint format clean
 
 help:
 	@echo 'make bench   set up, then fuse the built-in city with Open3D: semstab-bench --backend open3d'
 	@echo 'make test    set up, then lint, types and import contract beside a minute of damaged files, and the test suite'
 	@echo 'make quick   between edits, a minute at most: ruff, and the tests of what changed since the last commit'
+	@echo 'make record  run the suite under coverage.py, and note which tests call which function: make quick and make mutants begin with these'
 	@echo 'make fuzz    damage files of every kind for an hour (FUZZ_SECONDS=3600 FUZZ_SEED=1); fuzz-short: the same 10,000 inputs everywhere'
 	@echo 'make combinations  the tests that make test leaves out: combinations of what it tests one by one; make fuzz begins with them'
 	@echo 'make faults  kill 315 runs (of 30 scenes, over videos, too), studies, predictions, exports and conversions (FAULTS=315), fill their disk, and see that nothing is lost'
@@ -34,6 +35,9 @@ quick: setup-dev
 	@$(BIN)/ruff check --quiet .
 	@$(BIN)/ruff format --check --quiet .
 	@$(BIN)/python scripts/quick.py
+
+record: setup-dev
+	$(BIN)/python scripts/recorded.py
 
 docs: setup-dev
 	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict

@@ -4,11 +4,11 @@
     python scripts/mutate.py --lines 30 --seed 1 benchmark/metrics backends
     python scripts/mutate.py --at benchmark/metrics/summary.py:143  # all mutants of a line
 
-A mutant lives in a copy of the repository. It meets the tests that `make quick` runs after a change of its file, those
-that name its function or class first, of equally near ones those that take less time, until one fails. A test is said
-to have killed it only if it passes without it, and one that hangs only if it soon ends without it: else it stays open.
-Mutants that survive either do what the code did, or show that a test is missing: at most a quarter of those that change
-behaviour may. Where the time is over before all tests have started, a mutant stays open.
+A mutant lives in a copy of the repository. It meets the tests that `make quick` runs after a change of its function,
+test files that name its function or class first, of equally near ones those that take less time, until one fails. A
+test is said to have killed it only if it passes without it, and one that hangs only if it soon ends without it: else it
+stays open. Mutants that survive either do what the code did, or show that a test is missing: at most a quarter of those
+that change behaviour may. Where the time is over before all tests have started, a mutant stays open.
 """
 
 from __future__ import annotations
@@ -33,6 +33,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from quick import FOLDERS, ROOT, module_of, selected
+from recorded import functions_at, tests_of
 
 HANGS = 120
 """Seconds after the last moment at which a test may start until it counts as one that hangs, ..."""
@@ -183,12 +184,11 @@ class Copy:
 
         If a test is still at work `longest` seconds later, it is that test, after HANG.
         """
-        options = ("-x", "-v", "--tb=no", "-rfE", "--durations=0", "-p", "no:cacheprovider")
-        command, until = [sys.executable, "-m", "pytest", *options, *tests], time.time() + seconds
-        own = {"PYTHONPATH": str(self.folder / "src"), "SEMSTAB_TESTS_UNTIL": str(until), "COLUMNS": "300"}
-        with subprocess.Popen(
-            command, cwd=self.folder, env=os.environ | own, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True,
-        ) as process:  # fmt: skip
+        asked = ("-x", "-v", "--tb=no", "-rfE", "--durations=0", "-p", "no:cacheprovider")
+        command, until = [sys.executable, "-m", "pytest", *asked, *tests], time.time() + seconds
+        settings = {"PYTHONPATH": str(self.folder / "src"), "SEMSTAB_TESTS_UNTIL": str(until), "COLUMNS": "300"}
+        options = {"stdout": subprocess.PIPE, "stderr": subprocess.STDOUT, "text": True}
+        with subprocess.Popen(command, cwd=self.folder, env=os.environ | settings, **options) as process:
             try:
                 said, _ = process.communicate(timeout=seconds + longest)
             except subprocess.TimeoutExpired as ended:
@@ -213,7 +213,7 @@ def record(said: str) -> None:
     seconds = collections.Counter[str]()
     for taken, file in re.findall(r"^ *([\d.]+)s (?:call|setup|teardown) +([^:\s]+)::", said, re.MULTILINE):
         seconds[file] += float(taken)
-    TAKEN.update({file: max(own, TAKEN.get(file, 0.0)) for file, own in seconds.items()})
+    TAKEN.update({file: max(now, TAKEN.get(file, 0.0)) for file, now in seconds.items()})
 
 
 def cost(test: Path) -> float:
@@ -233,11 +233,12 @@ def met(mutant: Mutant, copies: queue.Queue[Copy], seconds: float) -> str | None
     """Return the test that kills a mutant, None if the mutant survives, OPEN if time was over."""
     module = module_of(mutant.file)
     assert module is not None
-    own = f"src/{module.replace('.', '/')}"
+    examples = f"src/{module.replace('.', '/')}"
+    content, copied, passed = (ROOT / mutant.file).read_bytes(), copies.get(), list[str]()
     nearest = selected({mutant.file}, cost)
     tests = sorted(nearest, key=lambda test: mutant.within not in (ROOT / test).read_text("utf-8"))
-    words = [*map(str, tests), own + (".py" if (ROOT / f"{own}.py").exists() else "/__init__.py")]
-    content, copied, passed = (ROOT / mutant.file).read_bytes(), copies.get(), list[str]()
+    words = tests_of(mutant.file, functions_at(content.decode(), [mutant.line]))
+    words += [*map(str, tests), examples + (".py" if (ROOT / f"{examples}.py").exists() else "/__init__.py")]
     until = time.time() + seconds
     try:
         while True:
@@ -282,19 +283,20 @@ def main() -> int:
     parser.add_argument("--jobs", type=int, default=2, help="mutants that are tested at once")
     parser.add_argument("--seconds", type=float, default=300, help="no test of a mutant starts later")
     parser.add_argument("--at", metavar="FILE:LINE", action="append", help="all mutants of this line, instead of drawn")
-    own = parser.parse_args()
-    if own.at:
+    arguments = parser.parse_args()
+    if arguments.at:
         places = [
-            (Path(file).resolve().relative_to(ROOT), int(line)) for file, _, line in (x.rpartition(":") for x in own.at)
+            (Path(file).resolve().relative_to(ROOT), int(line))
+            for file, _, line in (x.rpartition(":") for x in arguments.at)
         ]
-        chosen = [each for file, line in places for each in mutants(file) if each.line == line]
+        chosen = [mutant for file, line in places for mutant in mutants(file) if mutant.line == line]
     else:
-        chosen = drawn(product(own.paths), own.lines, random.Random(own.seed))
+        chosen = drawn(product(arguments.paths), arguments.lines, random.Random(arguments.seed))
     told, copies = collections.Counter[str](), queue.Queue[Copy]()
-    with tempfile.TemporaryDirectory(prefix="semstab-mutants-") as folder, ThreadPoolExecutor(own.jobs) as pool:
-        for k in range(own.jobs):
+    with tempfile.TemporaryDirectory(prefix="semstab-mutants-") as folder, ThreadPoolExecutor(arguments.jobs) as pool:
+        for k in range(arguments.jobs):
             copies.put(Copy(Path(folder) / str(k)))
-        fates = {pool.submit(met, mutant, copies, own.seconds): mutant for mutant in chosen}
+        fates = {pool.submit(met, mutant, copies, arguments.seconds): mutant for mutant in chosen}
         for fate in _each(pool, fates):
             killer = fate.result()
             became = "survived" if killer is None else "open" if killer == OPEN else "killed"

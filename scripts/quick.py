@@ -3,20 +3,23 @@
     python scripts/quick.py             # since HEAD; where nothing changed, the core alone
     python scripts/quick.py HEAD~3      # since another commit
 
-A test file is near a changed file if the test file changed itself, or if it has the name of the changed file
-(test_readers_odm.py for odm.py). Else the fewest imports from the test file to the changed module count. `make test`
-runs all.
+Tests that changed come first, then those that call a changed function, if there is a record of that (recorded.py), then
+those that are near a changed file: a test file is near a file if it has its name (test_readers_odm.py for odm.py), else
+by the fewest imports from the test file to the changed module. `make test` runs all.
 """
 
 from __future__ import annotations
 
 import ast
 import os
+import re
 import subprocess
 import sys
 import time
 from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
+
+from recorded import functions_at, tests_of
 
 ROOT = Path(__file__).resolve().parents[1]
 SECONDS = 40
@@ -41,6 +44,25 @@ def changed(since: str) -> set[Path]:
         listed = subprocess.run(["git", *words], cwd=ROOT, capture_output=True, text=True, check=True).stdout
         found.update(map(Path, listed.splitlines()))
     return found
+
+
+def changed_lines(file: Path, since: str) -> list[int]:
+    """Return the lines of a file that differ from a commit, all of a new file."""
+    listed = subprocess.run(
+        ["git", "diff", "-U0", since, "--", file], cwd=ROOT, capture_output=True, text=True, check=True
+    )
+    hunks = re.findall(r"^@@ -\S+ \+(\d+)(?:,(\d+))? @@", listed.stdout, re.MULTILINE)
+    if not hunks:
+        return [*range(1, len((ROOT / file).read_text("utf-8").splitlines()) + 1)]
+    return [line for first, number in hunks for line in range(int(first), int(first) + max(int(number or 1), 1))]
+
+
+def calling(files: Iterable[Path], since: str) -> list[str]:
+    """Return the recorded tests that call functions that changed, a few of each file."""
+    found = []
+    for file in sorted(file for file in files if module_of(file) is not None and (ROOT / file).exists()):
+        found += tests_of(file, functions_at((ROOT / file).read_text("utf-8"), changed_lines(file, since)))
+    return list(dict.fromkeys(found))
 
 
 def module_of(file: Path) -> str | None:
@@ -101,12 +123,16 @@ def selected(files: set[Path], cost: Callable[[Path], float] = lambda test: 0.0)
 
 def main() -> int:
     """Run them; return the exit code of pytest."""
-    tests = selected(changed(sys.argv[1] if len(sys.argv) > 1 else "HEAD"))
-    print(f"{len(tests)} test files, until {SECONDS} s are over: {', '.join(path.stem for path in tests[:6])} ...")
+    since = sys.argv[1] if len(sys.argv) > 1 else "HEAD"
+    files = changed(since)
+    near, calls = selected(files), calling(files, since)
+    tests = [*(str(test) for test in near if test in files), *calls, *(str(test) for test in near if test not in files)]
+    print(f"{len(calls)} tests that call what changed, {len(near)} test files, until {SECONDS} s are over:")
+    print(f"{', '.join(test.removeprefix('tests/') for test in tests[:6])} ...")
     options = ("-q", "-n", "2", "--dist", "load", "--maxfail", "5", "-rN")
-    command = [sys.executable, "-m", "pytest", *options, *map(str, tests)]
-    known = os.environ | {"SEMSTAB_TESTS_UNTIL": str(time.time() + SECONDS)}
-    return subprocess.run(command, cwd=ROOT, env=known, check=False).returncode
+    command = [sys.executable, "-m", "pytest", *options, *tests]
+    environment = os.environ | {"SEMSTAB_TESTS_UNTIL": str(time.time() + SECONDS)}
+    return subprocess.run(command, cwd=ROOT, env=environment, check=False).returncode
 
 
 if __name__ == "__main__":
