@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import numpy.typing as npt
 
-from semstab.backends.rules import MEAN, Rule, Seen
+from semstab.backends.rules import MEAN, Rule, VoxelObservations
 from semstab.backends.shared.association import (
     INDEX_LIMIT,
     Observations,
@@ -103,13 +103,13 @@ class FromObservations(ABC):
         observations = self._checked(self.observe(frame), frame)
         return self.add(frame, observations, started, time.perf_counter())
 
-    def add(self, frame: Frame, seen: Observations, started: float, observed: float = math.nan) -> FrameReport:
+    def add(self, frame: Frame, observations: Observations, started: float, observed: float = math.nan) -> FrameReport:
         """Fuse what a frame observes, each voxel once, and report it; the seconds are those of `perf_counter`."""
         num_voxels = len(self._row)
-        voxels = np.ascontiguousarray(seen.index, dtype=np.int64).view("V24").ravel().tolist()
+        voxels = np.ascontiguousarray(observations.index, dtype=np.int64).view("V24").ravel().tolist()
         rows = np.fromiter(map(self._row.__getitem__, voxels), dtype=np.int64, count=len(voxels))
         try:
-            return self._update(frame, seen, rows, started, observed)
+            return self._update(frame, observations, rows, started, observed)
         except BaseException:
             for voxel in voxels:
                 if self._row.get(voxel, -1) >= num_voxels:
@@ -125,7 +125,7 @@ class FromObservations(ABC):
         before, op, frame_index = self._state[rows], columns["op"][rows], frame.index
         distance = np.linalg.norm((observations.index + 0.5) * self.voxel_size - frame.T_wc[:3, 3], axis=1)
         age = np.where(op > 0, np.maximum(frame_index - columns["last_frame"][rows], 0), 0)
-        after = self._rule(before, Seen(observations.s_bar, observations.pixels, op, age, distance, frame))
+        after = self._rule(before, VoxelObservations(observations.s_bar, observations.pixels, op, age, distance, frame))
         e_before, e_after, is_repeated = self._rule.reads(before), self._rule.reads(after), op > 0
         self._state[rows] = after
         columns["drift_sum"][rows[is_repeated]] += js_divergence(

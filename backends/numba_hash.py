@@ -59,12 +59,12 @@ class History:
         self._seen: list[tuple[int, Int32, Int32, UInt16, UInt16, Float64]] = []
         """The index, rows of the map, pixels, and entries as in `Observed`, without empty ones, of each frame."""
 
-    def append(self, seen: Observed, row: Int64, frame: int) -> None:
+    def append(self, observed: Observed, row: Int64, frame: int) -> None:
         """Store a copy of the observations of the map's rows that outlives the next frame."""
-        filled, n = seen.weight > 0, len(seen.key)
-        entries = np.add.reduceat(filled, seen.start[:-1], dtype=np.uint16) if n else np.zeros(0, np.uint16)
-        rows, pixels = row.astype(np.int32), seen.pixels.astype(np.int32)
-        self._seen.append((frame, rows, pixels, entries, seen.label[filled], seen.weight[filled]))
+        filled, n = observed.weight > 0, len(observed.key)
+        entries = np.add.reduceat(filled, observed.start[:-1], dtype=np.uint16) if n else np.zeros(0, np.uint16)
+        rows, pixels = row.astype(np.int32), observed.pixels.astype(np.int32)
+        self._seen.append((frame, rows, pixels, entries, observed.label[filled], observed.weight[filled]))
 
     def events(self, order: Int32, index: dict[str, Any]) -> Events:
         """Return the observations in order of integration within a voxel; voxels are the map's rows in that order."""

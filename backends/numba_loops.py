@@ -104,14 +104,14 @@ def make_nodes(ranges, bounds, start, used):
     Returns how many nodes are given away then; `used` were before.
     """
     for p in range(PARTITIONS):
-        own = ranges[p]
-        if own[0] == own[1]:
-            own[0], own[1] = own[2], own[3]
-            own[2] = own[3] = 0
+        room = ranges[p]
+        if room[0] == room[1]:
+            room[0], room[1] = room[2], room[3]
+            room[2] = room[3] = 0
         entries = start[bounds[p + 1]] - start[bounds[p]]
-        if (own[1] - own[0]) + (own[3] - own[2]) < entries:
-            own[2], own[3] = used, used + max(256, 2 * entries)
-            used = own[3]
+        if (room[1] - room[0]) + (room[3] - room[2]) < entries:
+            room[2], room[3] = used, used + max(256, 2 * entries)
+            used = room[3]
     return used
 
 
@@ -213,7 +213,7 @@ def update(
     for p in nb.prange(PARTITIONS):
         s, few, node = np.zeros(dense.shape[1]), np.zeros((2, dense.shape[1])), np.zeros(dense.shape[1], np.int64)
         out = np.zeros(8)
-        own = ranges[p]
+        room = ranges[p]
         vss = entropy = drift = 0.0
         reached = 0
         for v in range(bounds[p], bounds[p + 1]):
@@ -237,7 +237,7 @@ def update(
                 if record.next <= DENSE:
                     _observe_dense(record, dense[DENSE - record.next], s, label, weight, first, last, pixels[v], out)
                 else:
-                    _observe_voxel(record, nodes, own, s, few, node, label, weight, first, last, pixels[v], op, out)
+                    _observe_voxel(record, nodes, room, s, few, node, label, weight, first, last, pixels[v], op, out)
                 vss += out[0]
                 entropy += out[1]
                 drift += out[2]
@@ -334,12 +334,12 @@ def place_observations(
 
 @parallel
 def update_dense(
-    key, pixels, seen, seen_sums, bounds, frame, row, slot, voxels, base, dense_base, slots, records, nodes, dense,
+    key, pixels, offset, frame_sums, bounds, frame, row, slot, voxels, base, dense_base, slots, records, nodes, dense,
     sums, drift_of, dominant_before, dominant_after,
 ):  # fmt: skip
     """Add the frame's observations, whose voxels get dense rows from `dense_base` of their partition on.
 
-    - `seen`, `seen_sums`: row and sums of `ObservedScores`; the others as in `update`
+    - `offset`, `frame_sums`: where its sums begin, and sums of `ObservedScores`; the others as in `update`
     """
     stride = dense.shape[1]
     flat = dense.reshape(-1)
@@ -349,7 +349,7 @@ def update_dense(
         reached = 0
         free = dense_base[p]
         for v in range(bounds[p], bounds[p + 1]):
-            _touch_ahead_dense(v, bounds[p + 1] - 1, row, records, flat, stride, seen, seen_sums)
+            _touch_ahead_dense(v, bounds[p + 1] - 1, row, records, flat, stride, offset, frame_sums)
             r = row[v]
             if r < 0:
                 r = voxels + base[p] - r - 1
@@ -362,7 +362,9 @@ def update_dense(
                 record.next = DENSE - free
                 free += 1
             op = record.op
-            observe_dense(record, dense[DENSE - record.next], seen_sums[seen[v] : seen[v] + stride], pixels[v], out)
+            observe_dense(
+                record, dense[DENSE - record.next], frame_sums[offset[v] : offset[v] + stride], pixels[v], out
+            )
             vss += out[0]
             entropy += out[1]
             drift += out[2]
@@ -380,14 +382,14 @@ def update_dense(
 
 
 @helper
-def _touch_ahead_dense(v, last, row, records, flat, stride, seen, seen_sums):
+def _touch_ahead_dense(v, last, row, records, flat, stride, offset, frame_sums):
     later = max(row[min(v + AHEAD, last)], 0)
     touch(records, later)
     touch(records, later + 1)
     soon = min(v + AHEAD // 2, last)
     start = max(DENSE - np.int64(records[max(row[soon], 0)].next), 0) * stride
     for k in range(0, stride, 8):
-        touch(seen_sums, seen[soon] + k)
+        touch(frame_sums, offset[soon] + k)
         touch(flat, start + k)
 
 

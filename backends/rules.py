@@ -31,7 +31,7 @@ MEAN = "mean"
 
 
 @dataclass(frozen=True, eq=False)
-class Seen:
+class VoxelObservations:
     """The observations of n voxels by one frame, as a rule reads them.
 
     Attributes:
@@ -56,20 +56,20 @@ class Seen:
         return self.op[:, None] == 0
 
 
-Update = Callable[[Float64, Seen], Float64]
+Update = Callable[[Float64, VoxelObservations], Float64]
 
 
-def mean(state: Float64, seen: Seen) -> Float64:
+def mean(state: Float64, observed: VoxelObservations) -> Float64:
     """Return e + s_bar: each frame counts once (the paper, Persistent Voxel Evidence)."""
-    return state + seen.s_bar
+    return state + observed.s_bar
 
 
-def votes(state: Float64, seen: Seen) -> Float64:
+def votes(state: Float64, observed: VoxelObservations) -> Float64:
     """Return e + |A| s_bar: each pixel counts once, so that near and large views weigh more (pySLAM)."""
-    return state + seen.pixels[:, None] * seen.s_bar
+    return state + observed.pixels[:, None] * observed.s_bar
 
 
-def bayes(state: Float64, seen: Seen, *, error: float = 0.1) -> Float64:
+def bayes(state: Float64, observed: VoxelObservations, *, error: float = 0.1) -> Float64:
     """Return log p + log sum_j s_bar_j P(j | k), with P(k | k) = 1 - error and the rest on the other classes.
 
     It is Bayes' theorem with frames that err independently (McCormac et al. 2017, SemanticFusion; Rosinol et al. 2020,
@@ -77,8 +77,8 @@ def bayes(state: Float64, seen: Seen, *, error: float = 0.1) -> Float64:
     """
     if not 0 < error < 1:
         raise ConfigError(f"rule bayes: error = {error:g}: use a number between 0 and 1")
-    other = error / (seen.s_bar.shape[1] - 1)
-    likelihood: Float64 = other + (1 - error - other) * seen.s_bar
+    other = error / (observed.s_bar.shape[1] - 1)
+    likelihood: Float64 = other + (1 - error - other) * observed.s_bar
     return state + np.log(likelihood)
 
 
@@ -92,39 +92,39 @@ def softmax(state: Float64) -> Float64:
 bayes.reads = softmax  # type: ignore[attr-defined]
 
 
-def weighted(state: Float64, seen: Seen, *, distance: float = 2.0, score: float = 0.0) -> Float64:
+def weighted(state: Float64, observed: VoxelObservations, *, distance: float = 2.0, score: float = 0.0) -> Float64:
     """Return e + w s_bar, w = (max_k s_bar_k)^score / d^distance: near and sure views weigh more.
 
     1 / d^2 is the weight of depth measurements in a TSDF (Curless and Levoy 1996; Oleynikova et al. 2017, Voxblox).
     """
-    w: Float64 = seen.s_bar.max(axis=1) ** score / np.maximum(seen.distance, NEAREST) ** distance
-    return state + w[:, None] * seen.s_bar
+    w: Float64 = observed.s_bar.max(axis=1) ** score / np.maximum(observed.distance, NEAREST) ** distance
+    return state + w[:, None] * observed.s_bar
 
 
 NEAREST = 1e-3
 """Metres: a voxel around the sensor itself weighs as one at this distance."""
 
 
-def recent(state: Float64, seen: Seen, *, half_life: float = 10.0) -> Float64:
+def recent(state: Float64, observed: VoxelObservations, *, half_life: float = 10.0) -> Float64:
     """Return 2^(-age / half_life) e + s_bar: evidence fades, age in frames since it was seen, by index."""
     if not half_life > 0:
         raise ConfigError(f"rule recent: half_life = {half_life:g}: use a number of frames above 0")
-    return 2.0 ** (-seen.age / half_life)[:, None] * state + seen.s_bar
+    return 2.0 ** (-observed.age / half_life)[:, None] * state + observed.s_bar
 
 
-def first(state: Float64, seen: Seen) -> Float64:
+def first(state: Float64, observed: VoxelObservations) -> Float64:
     """Return s_bar of the first frame that saw the voxel, whatever comes later: a belief that never drifts."""
-    return np.where(seen.new, seen.s_bar, state)
+    return np.where(observed.new, observed.s_bar, state)
 
 
-def last(state: Float64, seen: Seen) -> Float64:  # noqa: ARG001  every rule takes both
+def last(state: Float64, observed: VoxelObservations) -> Float64:  # noqa: ARG001  every rule takes both
     """Return s_bar of the last frame: the map as a single frame paints it."""
-    return seen.s_bar
+    return observed.s_bar
 
 
-def maximum(state: Float64, seen: Seen) -> Float64:
+def maximum(state: Float64, observed: VoxelObservations) -> Float64:
     """Return max(e, s_bar), class by class: the surest frame of each class counts (max pooling)."""
-    return np.maximum(state, seen.s_bar)
+    return np.maximum(state, observed.s_bar)
 
 
 RULES: dict[str, Callable[..., Float64]] = {
@@ -166,7 +166,7 @@ class Rule:
             rule(np.zeros((1, 2)), _ONE)  # a value that it does not take is found before a frame is read
         return rule
 
-    def __call__(self, state: Float64, seen: Seen) -> Float64:
+    def __call__(self, state: Float64, observed: VoxelObservations) -> Float64:
         """Return the new state.
 
         Raises:
@@ -174,7 +174,11 @@ class Rule:
         """
         if not len(state):
             return state
-        made = guarded(self.name, lambda: self.update(state, seen)) if is_code(self.name) else self.update(state, seen)
+        made = (
+            guarded(self.name, lambda: self.update(state, observed))
+            if is_code(self.name)
+            else self.update(state, observed)
+        )
         after = np.asarray(made, dtype=np.float64)
         if after.shape != state.shape:
             raise DataError(f"rule '{self.name}' returned shape {after.shape} of a state of {state.shape}; return one")
@@ -188,7 +192,7 @@ def _as_it_is(state: Float64) -> Float64:
     return state
 
 
-_ONE = Seen(
+_ONE = VoxelObservations(
     np.array([[1.0, 0.0]]), np.array([1]), np.array([0]), np.array([0]), np.array([1.0]),
     Frame(0, np.ones((1, 1), np.float32), np.eye(3), np.eye(4), labels=np.zeros((1, 1), np.uint8)),  # type: ignore[arg-type]
 )  # fmt: skip

@@ -155,11 +155,11 @@ def _uploaded(terms: list[npt.NDArray[Any]], dtype: torch.dtype, device: torch.d
 # --- Evidence ---------------------------------------------------------------------------------------------------------
 
 
-def count_labels(seen: Association, predicted: PixelLabels, num_classes: int) -> ViewEvidence:
+def count_labels(association: Association, predicted: PixelLabels, num_classes: int) -> ViewEvidence:
     """Return pixels of each class in each voxel."""
-    n, K, voxels = len(seen.keys), num_classes, seen.voxel.reshape(-1)
+    n, K, voxels = len(association.keys), num_classes, association.voxel.reshape(-1)
     sums = voxels.new_zeros(K * n)
-    flags = seen.keys.new_tensor([-1, 0, 0])
+    flags = association.keys.new_tensor([-1, 0, 0])
     for part in parts(len(voxels), chunk_of(sums.device)):
         voxel, label = voxels[part], predicted.ids[part].to(torch.int64)
         labelled = (label >= 0) & (label != predicted.ignore) & (voxel != NONE)
@@ -171,12 +171,12 @@ def count_labels(seen: Association, predicted: PixelLabels, num_classes: int) ->
     return ViewEvidence(sums, sums.sum(dim=0), 1.0, flags)
 
 
-def sum_scores(seen: Association, predicted: Scores, num_classes: int) -> ViewEvidence:
+def sum_scores(association: Association, predicted: Scores, num_classes: int) -> ViewEvidence:
     """Return sums of the normalised scores in each voxel."""
-    n, K, voxels = len(seen.keys), num_classes, seen.voxel.reshape(-1)
+    n, K, voxels = len(association.keys), num_classes, association.voxel.reshape(-1)
     scale = score_scale(len(voxels), double=predicted.values.dtype == torch.float64 or not predicted.softmax)
-    sums, pixels = seen.keys.new_zeros(K * n), seen.keys.new_zeros(n)
-    flags = seen.keys.new_tensor([-1, 0, 0])
+    sums, pixels = association.keys.new_zeros(K * n), association.keys.new_zeros(n)
+    flags = association.keys.new_tensor([-1, 0, 0])
     classes = torch.arange(K, device=sums.device)[:, None]
     for part in parts(len(voxels), chunk_of(sums.device) // K):
         voxel, values = voxels[part], predicted.values[:, part]

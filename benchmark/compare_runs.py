@@ -94,7 +94,9 @@ def _shown(comparison: ComparisonData) -> Iterator[tuple[SceneComparison, Agains
     return (changed for changed in _changed(comparison) if len(changed[2].shown.table))
 
 
-def maps(comparison: ComparisonData, known: Mapping[str, Georeference] = MappingProxyType({})) -> Iterator[Figure]:
+def maps(
+    comparison: ComparisonData, georeferences: Mapping[str, Georeference] = MappingProxyType({})
+) -> Iterator[Figure]:
     """Yield a map of each scene and run with known changes, in the coordinates of the exports."""
     for scene, against, changes in _shown(comparison):
         if scene.scene in comparison.up:
@@ -104,7 +106,9 @@ def maps(comparison: ComparisonData, known: Mapping[str, Georeference] = Mapping
                 "The map shows the largest change in each column of voxels that both saw twice or more: of agreement"
                 " between frames and, with ground truth, of correctness. Numbers name the areas that got worse.",
                 f"Maps of {scene.scene} from above: {against.other} is worse at orange places, better at blue places.",
-                partial(_draw, changes, comparison.up[scene.scene], scene.scene, against, known.get(scene.scene)),
+                partial(
+                    _draw, changes, comparison.up[scene.scene], scene.scene, against, georeferences.get(scene.scene)
+                ),
                 unit=slug(scene.scene, against.other),
             )
 
@@ -202,7 +206,7 @@ def georeferences(runs: Sequence[RunHandle]) -> Mapping[str, Georeference]:
     return {scene: entry.georeference for scene, entry in runs[0].scenes.items() if entry.georeference is not None}
 
 
-def located(result: RunComparison, known: Mapping[str, Georeference]) -> RunComparison:
+def located(result: RunComparison, georeferences: Mapping[str, Georeference]) -> RunComparison:
     """Return a comparison whose areas are in the coordinates of the exports."""
 
     def projected(area: Area, georeference: Georeference) -> Area:
@@ -210,7 +214,7 @@ def located(result: RunComparison, known: Mapping[str, Georeference]) -> RunComp
         return replace(area, centre=(x, y, z))
 
     def in_scene(scene: SceneComparison) -> SceneComparison:
-        if (georeference := known.get(scene.scene)) is None:
+        if (georeference := georeferences.get(scene.scene)) is None:
             return scene
         against = tuple(
             replace(run_against, areas=tuple(projected(area, georeference) for area in run_against.areas))
@@ -232,11 +236,11 @@ def load_comparison(folder: str | Path) -> RunComparison:
 
 
 def write(
-    comparison: ComparisonData, out: str | Path, known: Mapping[str, Georeference] = MappingProxyType({})
+    comparison: ComparisonData, out: str | Path, georeferences: Mapping[str, Georeference] = MappingProxyType({})
 ) -> None:
     """Write the folder, with the georeferences of scenes; nothing of an earlier comparison is left in it."""
-    result = located(comparison.result, known)
-    folder, made, figures = Path(out), tables(result), list(maps(comparison, known))
+    result = located(comparison.result, georeferences)
+    folder, made, figures = Path(out), tables(result), list(maps(comparison, georeferences))
     _require_own(folder)
     write_json(folder / CONTENT, result)
     write_text(folder / PAGE, markdown(result, made))

@@ -158,13 +158,13 @@ def frame_indices(scene: Scene, config: Config, sources: Sequence[str] = ()) -> 
 
 
 def selected(
-    wanted: list[str] | None, known: Sequence[str], extra: Sequence[str], kind: str, where: str
+    wanted: list[str] | None, available: Sequence[str], extra: Sequence[str], kind: str, where: str
 ) -> Sequence[str]:
     """Return the wanted names, by default all known names; `extra` names must be named."""
     for name in wanted or ():
-        if name not in (*known, *extra):
-            raise ConfigError(f"{where}: no {kind} '{name}'; {nearest(name, [*known, *extra])}")
-    return list(dict.fromkeys(wanted)) if wanted is not None else known
+        if name not in (*available, *extra):
+            raise ConfigError(f"{where}: no {kind} '{name}'; {nearest(name, [*available, *extra])}")
+    return list(dict.fromkeys(wanted)) if wanted is not None else available
 
 
 def read(task: Task, index: int, pixel_stride: int = 1, *, color: bool = False) -> Frame:

@@ -91,10 +91,10 @@ class _Mistaken(FromObservations):
     def observe(self, frame: Frame) -> Given:
         """Return the frame's observations, with the mistake."""
         frame, K = self._mistake.read(frame), self.num_classes
-        points, seen = self._mistake.points(frame, self.voxel_size), frame.valid
+        points, valid = self._mistake.points(frame, self.voxel_size), frame.valid
         q = self._mistake.index(points.T / np.array(self.voxel_size, points.dtype)).astype(np.int64)
         index, voxel, pixels = np.unique(q, axis=0, return_inverse=True, return_counts=True)
-        s = np.eye(K)[frame.labels[seen]] if frame.scores is None else frame.scores[seen].astype(np.float64)  # type: ignore[index]
+        s = np.eye(K)[frame.labels[valid]] if frame.scores is None else frame.scores[valid].astype(np.float64)  # type: ignore[index]
         evidence = np.zeros((len(index), K))
         np.add.at(evidence, voxel.ravel(), s / s.sum(axis=1, keepdims=True))
         return index, evidence, pixels

@@ -50,21 +50,21 @@ class Formula:
         for t in range(self.frames):
             voxel = self._voxels(t, wide)
             count = np.bincount(voxel * K + self._labels(t).ravel(), minlength=n * K).reshape(n, K)
-            seen = count.any(axis=1)
-            total = count[seen].sum(axis=1)
-            s_bar = count[seen] / total[:, None]
-            before, again = evidence[seen], op[seen] > 0
+            present = count.any(axis=1)
+            total = count[present].sum(axis=1)
+            s_bar = count[present] / total[:, None]
+            before, again = evidence[present], op[present] > 0
             after = before + s_bar
-            p, q = after / after.sum(axis=1, keepdims=True), before / np.maximum(op[seen], 1)[:, None]
+            p, q = after / after.sum(axis=1, keepdims=True), before / np.maximum(op[present], 1)[:, None]
             drift = _entropy((p + q) / 2) - (_entropy(p) + _entropy(q)) / 2
-            sums["drift"][seen] += np.where(again, drift, 0.0)
-            sums["own"][seen] += (s_bar**2).sum(axis=1)
-            sums["entropy"][seen] += _entropy(s_bar)
-            evidence[seen] = after
-            first_frame[seen] = np.where(again, first_frame[seen], t)
-            last_frame[seen] = t
-            op[seen] += 1
-            pixels[seen] += total
+            sums["drift"][present] += np.where(again, drift, 0.0)
+            sums["own"][present] += (s_bar**2).sum(axis=1)
+            sums["entropy"][present] += _entropy(s_bar)
+            evidence[present] = after
+            first_frame[present] = np.where(again, first_frame[present], t)
+            last_frame[present] = t
+            op[present] += 1
+            pixels[present] += total
         there = np.flatnonzero(op)
         ix, iy = np.divmod(np.arange(n), n // wide)
         columns: dict[str, Any] = {"op": op, "evidence": evidence, "drift_sum": sums["drift"], "pixels": pixels}

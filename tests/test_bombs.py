@@ -139,11 +139,11 @@ def frame_of(scene):
 def test_a_frame_with_a_large_image_may_have_large_maps(tmp_path):
     file = bombs.png(tmp_path / "l.png", 10000, 8000, 8)
     refused(read_labels, file, match="at most 67108864 are read")
-    assert read_labels(file, own=FrameSize(lambda: 80_000_000)).shape == (8000, 10000)
+    assert read_labels(file, allowed_sizes=FrameSize(lambda: 80_000_000)).shape == (8000, 10000)
     small = bombs.png(tmp_path / "s.png", 3000, 3000, 8)
-    assert read_labels(small, own=FrameSize(lambda: 2_300_000)).shape == (3000, 3000)
+    assert read_labels(small, allowed_sizes=FrameSize(lambda: 2_300_000)).shape == (3000, 3000)
     with pytest.raises(semstab.DataError, match="but the image has 2000000"):
-        read_labels(small, own=FrameSize(lambda: 2_000_000))
+        read_labels(small, allowed_sizes=FrameSize(lambda: 2_000_000))
 
 
 def test_a_large_photograph_is_read(tmp_path, monkeypatch):

@@ -31,7 +31,7 @@ def lowest_bit(mask):
     return ((bits_of(np.float64(mask & -mask)) >> 52) & 0x7FF) - 1023
 
 
-def update_rows(rows: Int64, seen: Observed, frame: int, **columns: Any) -> tuple[Change, BeliefChange]:
+def update_rows(rows: Int64, observed: Observed, frame: int, **columns: Any) -> tuple[Change, BeliefChange]:
     """Add a frame's observations to rows of dense columns, in place.
 
     columns are evidence (N, K), classes (N, `mask_words`), whose bits tell which evidence is not 0, and the others of
@@ -44,12 +44,12 @@ def update_rows(rows: Int64, seen: Observed, frame: int, **columns: Any) -> tupl
     sums = np.zeros((PARTITIONS, 5))
     changed = BeliefChange.room(len(rows))
     _update_rows(
-        rows, chunks, seen.start, seen.label, seen.weight, seen.pixels, frame, sums, columns["evidence"],
-        columns["classes"], columns["op"], columns["drift_sum"], columns["pixels"], columns["first_frame"],
-        columns["last_frame"], columns["self_sum"], columns["frame_entropy_sum"], *changed,
+        rows, chunks, observed.start, observed.label, observed.weight, observed.pixels, frame, sums,
+        columns["evidence"], columns["classes"], columns["op"], columns["drift_sum"], columns["pixels"],
+        columns["first_frame"], columns["last_frame"], columns["self_sum"], columns["frame_entropy_sum"], *changed,
     )  # fmt: skip
     vss, entropy, drift, new, recurrent = sums.sum(axis=0)
-    return Change.of((seen.pixels.sum(), len(rows), new, drift, vss, entropy, recurrent)), changed
+    return Change.of((observed.pixels.sum(), len(rows), new, drift, vss, entropy, recurrent)), changed
 
 
 @compiled(helper=True, forceinline=True)

@@ -215,11 +215,11 @@ def sum_scores(
         keys, table = row_keys[thread], tables[thread]
         first, last = band * ROWS, min(H, (band + 1) * ROWS)
         for v in range(first, last):
-            own = keys[v - first]
+            key_row = keys[v - first]
             if points.shape[0]:
-                lost[band] |= exact_keys_of_points(points[v], depth[v], labels, T, size, ox, oy, oz, 1, own)
+                lost[band] |= exact_keys_of_points(points[v], depth[v], labels, T, size, ox, oy, oz, 1, key_row)
             else:
-                lost[band] |= exact_keys_of_row(depth[v], labels, ray_x, ray_y[v], T, size, ox, oy, oz, 1, own)
+                lost[band] |= exact_keys_of_row(depth[v], labels, ray_x, ray_y[v], T, size, ox, oy, oz, 1, key_row)
         table[:] = -1
         own_key, own_count = key[band * room : (band + 1) * room], count[band * room : (band + 1) * room]
         own_sums = sums[band * room * stride : (band + 1) * room * stride]

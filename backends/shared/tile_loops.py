@@ -260,20 +260,21 @@ def find_words(
         n = lost = np.int64(0)
         for first in range(0, W, COLUMNS):
             to = min(first + COLUMNS, W)
-            own = words[: -(-(to - first) // LANES) * LANES + 1]
+            stretch_words = words[: -(-(to - first) // LANES) * LANES + 1]
             for y in range(band * ROWS, min(H, (band + 1) * ROWS)):
                 for u in range(to, min(W, to + COLUMNS), 16):
                     touch(depth[y], u)
                 touch(labels[y], min(W - 1, to))
                 touch(labels[y], min(W - 1, to + 64))
-                own[to - first :] = -1
+                stretch_words[to - first :] = -1
                 lost |= _words_of_stretch(
                     depth[y, first:to], labels[y, first:to], ray_x[first:to], ray_y[y], T, size, origin, corner,
-                    ignore, rays[0, first:to], rays[1, first:to], rays[2, first:to], down[y], begin, face, keys, own,
+                    ignore, rays[0, first:to], rays[1, first:to], rays[2, first:to], down[y], begin, face, keys,
+                    stretch_words,
                 )  # fmt: skip
                 if columns.shape[0]:
-                    _keep_columns(own, columns, corner)
-                n = _enter_runs(own, run_word, run_end, table, table_count, own_word, own_count, n)
+                    _keep_columns(stretch_words, columns, corner)
+                n = _enter_runs(stretch_words, run_word, run_end, table, table_count, own_word, own_count, n)
         entries[band] = _finish(
             table, table_count, own_word, own_count, n, lost, corner,
             partition[band * room : (band + 1) * room], spread[band], low[band], high[band],
@@ -314,19 +315,19 @@ def find_words_of_points(
         end = min(depth.shape[0], (band + 1) * POINTS)
         for first in range(band * POINTS, end, COLUMNS):
             to = min(first + COLUMNS, end)
-            own = words[: -(-(to - first) // LANES) * LANES + 1]
-            own[to - first :] = -1
-            some, seen, named = points[first:to], depth[first:to], labels[first:to]
+            stretch_words = words[: -(-(to - first) // LANES) * LANES + 1]
+            stretch_words[to - first :] = -1
+            some_points, some_depth, some_labels = points[first:to], depth[first:to], labels[first:to]
             _touch_points(points, depth, labels, to, end)
-            _split(some, x, y, z)
+            _split(some_points, x, y, z)
             if _words_of_points_fused(
-                x, y, z, seen, named, ignore, M, begin[0], begin[1], begin[2], face, own
+                x, y, z, some_depth, some_labels, ignore, M, begin[0], begin[1], begin[2], face, stretch_words
             ):  # fmt: skip
-                lost |= exact_keys_of_points(some, seen, named, T, size, ox, oy, oz, ignore, keys)
-                lost |= _words_of_keys(keys, named, corner, own)
+                lost |= exact_keys_of_points(some_points, some_depth, some_labels, T, size, ox, oy, oz, ignore, keys)
+                lost |= _words_of_keys(keys, some_labels, corner, stretch_words)
             if columns.shape[0]:
-                _keep_columns(own, columns, corner)
-            n = _enter_runs(own, run_word, run_end, table, table_count, own_word, own_count, n)
+                _keep_columns(stretch_words, columns, corner)
+            n = _enter_runs(stretch_words, run_word, run_end, table, table_count, own_word, own_count, n)
         entries[band] = _finish(
             table, table_count, own_word, own_count, n, lost, corner,
             partition[band * room : (band + 1) * room], spread[band], low[band], high[band],

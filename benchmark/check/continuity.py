@@ -89,10 +89,10 @@ class Neighbours:
         indices: Sequence[int],
         source: str | None,
         configured: Convention,
-        known: Mapping[int, View] | None = None,
+        views: Mapping[int, View] | None = None,
     ) -> None:
         self.scene, self.indices, self.source, self._configured = scene, indices, source, configured
-        self._known, self._read = known or {}, reader(scene, source)
+        self._known, self._read = views or {}, reader(scene, source)
 
     def spread(self, size: tuple[int, int], *, thorough: bool) -> list[int]:
         """Return the positions of the frames to compare: of large images (w, h) fewer, and of a quick check."""

@@ -204,7 +204,7 @@ def _findings(
     if (identical := _identical(runs)) is not None:
         return _Findings(LabelFindings(model, (f"labels of {model} {identical}",), remarks), clear=True)
     comparisons = compare(runs)
-    everywhere = max((each.edges.other for each in comparisons if each.is_better), default=math.nan)
+    everywhere = max((comparison.edges.other for comparison in comparisons if comparison.is_better), default=math.nan)
     if (turned := from_a_frame_on(scene, model, runs, everywhere)) is not None:
         return _Findings(LabelFindings(model, (f"labels of {model} {turned}",), remarks), doubted=True)
     better = sorted(
@@ -249,7 +249,7 @@ def label_findings(
     indices: Sequence[int],
     models: Sequence[str],
     options: Mapping[str, Any] | None = None,
-    known: Ordered | None = None,
+    ordered: Ordered | None = None,
     *,
     thorough: bool,
 ) -> Iterator[LabelFindings]:
@@ -260,7 +260,7 @@ def label_findings(
         indices: Indices of the selected frames.
         models: Label sources.
         options: The dataset's, for the convention of the poses.
-        known: Frames in order with their labels, by model, where they were compared already.
+        ordered: Frames in order with their labels, by model, where they were compared already.
         thorough: Whether as many frames are compared as `check` does.
     """
     for model in () if scene.of_scans else models:
@@ -270,7 +270,9 @@ def label_findings(
         findings = check_labels(scene, indices, model, space, LABEL_RUNS, thorough=thorough)
         if scene.surface is None:
             with contextlib.suppress(DataError):
-                chained = (known or {}).get(model) or chain_of(scene, indices, model, options or {}, thorough=thorough)
+                chained = (ordered or {}).get(model) or chain_of(
+                    scene, indices, model, options or {}, thorough=thorough
+                )
                 findings = with_order(findings, *chained)
         yield findings
 

@@ -320,8 +320,8 @@ def median_of_seen(errors: npt.NDArray[Any]) -> Float64:
     """Return the median of finite values along the last axis (the lower one of two), or NaN without finite values."""
     finite, median = np.isfinite(errors), np.full(errors.shape[:-1], np.nan)
     for row in np.ndindex(median.shape):
-        seen = errors[row][finite[row]]
-        if (middle := (len(seen) - 1) // 2) >= 0:
-            seen.partition(middle)
-            median[row] = seen[middle]
+        valid_errors = errors[row][finite[row]]
+        if (middle := (len(valid_errors) - 1) // 2) >= 0:
+            valid_errors.partition(middle)
+            median[row] = valid_errors[middle]
     return median

@@ -63,14 +63,14 @@ def wrong_order(ordered: InOrder) -> str | None:
 def contrast(ordered: InOrder, order: Order) -> FitContrast:
     """Return the agreement of labels as given and in another order, over scans: within each, and with later ones."""
     given, ignore = ordered.labels, ordered.ignore
-    other = {p: own for p in given if (own := order.of(given, p)) is not None}
+    other = {p: reordered for p in given if (reordered := order.of(given, p)) is not None}
 
     def of(labels: Labels, position: int) -> float:
-        own = labels[position]
+        scan_labels = labels[position]
         row, nearest = ordered.own[position]
-        within = agreement(own[row], own[nearest], ignore)
+        within = agreement(scan_labels[row], scan_labels[nearest], ignore)
         between = [
-            agreement(own[rows[0]], labels[b][rows[1]], ignore)
+            agreement(scan_labels[rows[0]], labels[b][rows[1]], ignore)
             for (a, b), rows in ordered.rows.items()
             if a == position and b in other
         ]

@@ -64,7 +64,7 @@ class InOrder:
 
 def in_order(scene: Scene, indices: Sequence[int], source: str | None) -> InOrder:
     """Read scans in order and compare them; those that cannot be read are passed over."""
-    links, rows, own = dict[Pair, Link](), dict[Pair, Int64](), dict[int, Int64]()
+    links, rows, nearest_in_scan = dict[Pair, Link](), dict[Pair, Int64](), dict[int, Int64]()
     labels, ignore, positions = dict[int, Int64](), -1, list[int]()
     last = deque[tuple[int, Float64, Cloud]](maxlen=APART_BY)
     for position, scan in _read(scene, indices, source):
@@ -73,7 +73,7 @@ def in_order(scene: Scene, indices: Sequence[int], source: str | None) -> InOrde
         positions.append(position)
         if source is not None:
             labels[position], ignore = scan.predicted.reshape(-1).astype(np.int64), scan.ignore_id
-            own[position] = _nearest_in(cloud)
+            nearest_in_scan[position] = _nearest_in(cloud)
         for other, T, before in last:
             if position - other in GAPS:
                 turn, shift = motion(T, scan.T_wc)
@@ -81,7 +81,7 @@ def in_order(scene: Scene, indices: Sequence[int], source: str | None) -> InOrde
         last.append((position, scan.T_wc, cloud))
     errors = [links[pair].error for pair in itertools.pairwise(positions) if pair in links]
     usual = float(np.nanmedian(errors)) if np.isfinite(errors).any() else math.nan
-    return InOrder(Chain(positions, links, usual, contradicting=CONTRADICTS), rows, own, labels, ignore)
+    return InOrder(Chain(positions, links, usual, contradicting=CONTRADICTS), rows, nearest_in_scan, labels, ignore)
 
 
 def _read(scene: Scene, indices: Sequence[int], source: str | None) -> Iterator[tuple[int, Frame]]:
@@ -154,10 +154,10 @@ def with_order(verdict: Verdict, scene: Scene, indices: Sequence[int], ordered: 
     return verdict.refuted(text) if error >= STRIKING_SHIFT * usual else verdict.remarking(text)
 
 
-def _said_of(misfits: Sequence[tuple[int, Pair]], chain: Chain, named: Callable[[int], str]) -> Iterator[str]:
+def _said_of(misfits: Sequence[tuple[int, Pair]], chain: Chain, name_of: Callable[[int], str]) -> Iterator[str]:
     for position, (before, after) in misfits[:MOST_NAMED]:
         yield (
-            f"scan {named(position)} does not fit scans {named(before)} and {named(after)} next to it: its points are"
-            f" {chain.error(before, position):.1%} of their range off, theirs {chain.error(before, after):.2%};"
-            f" its pose is wrong: correct it, or leave the scan out ({LEAVE_OUT})"
+            f"scan {name_of(position)} does not fit scans {name_of(before)} and {name_of(after)} next to it: its"
+            f" points are {chain.error(before, position):.1%} of their range off, theirs"
+            f" {chain.error(before, after):.2%}; its pose is wrong: correct it, or leave the scan out ({LEAVE_OUT})"
         )

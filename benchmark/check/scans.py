@@ -49,8 +49,8 @@ def assess_scans(sample: ScanSample) -> Verdict:
         return Verdict("unsound", text, () if mend is None else (mend,))
     now, trials, mistakes = sample.fit(), ranked(SCANS, sample), ranked(OF_SCANS, sample)
     frames, best = len({p for pair in pairs for p in pair}), likelier(trials[0], mistakes[0])
-    shown = trials[:4] if best is trials[0] else [best, *trials[:3]]
-    fits = (("as configured", now), *((trial.hypothesis.name, trial.fit) for trial in shown))
+    listed = trials[:4] if best is trials[0] else [best, *trials[:3]]
+    fits = (("as configured", now), *((trial.hypothesis.name, trial.fit) for trial in listed))
     about = Verdict("sound", "", (), now.error, now.share, frames, len(pairs), fits=fits)
     if best.is_right(sample, now, BETTER):
         reading = best.hypothesis

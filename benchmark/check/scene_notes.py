@@ -15,7 +15,7 @@ from semstab.predict.dataset import NAME as PREDICTED
 
 
 def scene_notes(
-    scene: Scene, indices: Sequence[int], model: str, config: Config, known: Ordered | None = None
+    scene: Scene, indices: Sequence[int], model: str, config: Config, ordered: Ordered | None = None
 ) -> tuple[str, ...]:
     """Return what looks wrong in depth and labels of a model, or its images, but may be right; in the words of `check`.
 
@@ -31,7 +31,7 @@ def scene_notes(
     stored, options = stored_labels(scene, model, config), config.dataset.options
     with ThreadPoolExecutor(1, thread_name_prefix="semstab-notes") as pool:
         of_images = pool.submit(_image_notes, scene, indices, model, stored)
-        findings = [] if stored is None else label_findings(scene, indices, [model], options, known, thorough=False)
+        findings = [] if stored is None else label_findings(scene, indices, [model], options, ordered, thorough=False)
         return (
             *(line for of_model in findings for line in (*of_model.wrong, *of_model.remarks)),
             *of_images.result(),

@@ -291,7 +291,7 @@ class Measurement:
 
 
 def chosen(
-    named: dict[str, Any],
+    values: dict[str, Any],
     settings: list[str] | None,
     options: list[str] | None,
     dataset: str | None = None,
@@ -303,7 +303,7 @@ def chosen(
     from semstab.config.groups import in_full
     from semstab.core.files import parse_yaml
 
-    content = {key: None if value == ["all"] else value for key, value in named.items() if value is not None}
+    content = {key: None if value == ["all"] else value for key, value in values.items() if value is not None}
     for option in options or ():
         if "=" not in option:
             raise ConfigError(f"--option {option}: write KEY=VALUE")

@@ -17,26 +17,26 @@ from semstab.engine.folder import load_result, run_and_model
 from semstab.errors import ConfigError
 
 
-def open_compared(named: Sequence[str | os.PathLike[str]]) -> tuple[RunHandle, ...]:
+def open_compared(sources: Sequence[str | os.PathLike[str]]) -> tuple[RunHandle, ...]:
     """Open runs that are compared, or the models of one run; also such as have features and no labels.
 
     Raises:
         ConfigError: If there are fewer than two, and as `open_runs` does.
         DataError: As `open_runs` does.
     """
-    handles = open_models(named[0]) if len(named) == 1 else open_runs(named)
+    handles = open_models(sources[0]) if len(sources) == 1 else open_runs(sources)
     if len(handles) < 2:
         raise ConfigError("there is nothing to compare the run with; name two runs or more, the base first")
     return handles
 
 
-def open_runs(named: Sequence[str | os.PathLike[str]]) -> tuple[RunHandle, ...]:
+def open_runs(sources: Sequence[str | os.PathLike[str]]) -> tuple[RunHandle, ...]:
     """Open folders of runs or studies, 'FOLDER:MODEL', and small summaries, under the shortest distinct names.
 
     Raises:
         ConfigError, DataError: As `open_run` does.
     """
-    runs = [open_run(source) for source in named]
+    runs = [open_run(source) for source in sources]
     folders = ["" if run.source is None else run.source.resolve().name for run in runs]
     models = [run.model for run in runs]
     folder_and_model = [f"{folder}:{model}" for folder, model in zip(folders, models, strict=True)]
@@ -53,7 +53,7 @@ def open_runs(named: Sequence[str | os.PathLike[str]]) -> tuple[RunHandle, ...]:
     return tuple(replace(run, name=name) for run, name in zip(runs, names, strict=True))
 
 
-def open_models(named: str | os.PathLike[str]) -> tuple[RunHandle, ...]:
+def open_models(location: str | os.PathLike[str]) -> tuple[RunHandle, ...]:
     """Open all label sources of one run that have the classes that most of them have; ground truth is left out.
 
     Models that give features alone are left out, too, unless there are no others.
@@ -61,10 +61,10 @@ def open_models(named: str | os.PathLike[str]) -> tuple[RunHandle, ...]:
     Raises:
         ConfigError, DataError: As `open_run` does.
     """
-    path, model_named = run_and_model(named)
+    path, model_named = run_and_model(location)
     if model_named is not None or not path.is_dir():
-        return (open_run(named),)
-    return models_of(load_result(path), path if isinstance(named, str | Path) else None)
+        return (open_run(location),)
+    return models_of(load_result(path), path if isinstance(location, str | Path) else None)
 
 
 def models_of(result: Result, source: Path | None = None) -> tuple[RunHandle, ...]:
@@ -83,14 +83,14 @@ def models_of(result: Result, source: Path | None = None) -> tuple[RunHandle, ..
     return tuple(handle for handle in handles if handle.model in shared)
 
 
-def open_run(named: str | os.PathLike[str]) -> RunHandle:
+def open_run(location: str | os.PathLike[str]) -> RunHandle:
     """Open a run's only label source, or the one that 'FOLDER:MODEL' selects, at the base settings and backend.
 
     Raises:
         ConfigError: If there is no such folder or label source, or several.
         DataError: If it is damaged.
     """
-    path, model_named = run_and_model(named)
+    path, model_named = run_and_model(location)
     model = model_named or ""
     if not path.exists():
         raise ConfigError(f"{path}: there is no such folder; give the folder of a run, or FOLDER:MODEL")
@@ -99,7 +99,7 @@ def open_run(named: str | os.PathLike[str]) -> RunHandle:
         _chosen(path, [small.model], model)
         return small
     result = load_result(path)
-    source = path if isinstance(named, str | Path) else None
+    source = path if isinstance(location, str | Path) else None
     return handle_of(result, _chosen(path, result.models, model), source)
 
 

@@ -58,7 +58,9 @@ def changed_vocabularies(result: Result) -> Iterator[ChangedVocabulary]:
         full = records.get((scene, name))
         if not changes or full is None:
             continue
-        files = [file for each in (full, record) if (file := each.observations_file) is not None and file.is_file()]
+        files = [
+            file for compared in (full, record) if (file := compared.observations_file) is not None and file.is_file()
+        ]
         if len(files) == 2:
             (first, first_time), (other, other_time) = ((file, file.stat().st_mtime_ns) for file in files)
             yield ChangedVocabulary(name, changes, record, _effect_of(first, other, changes, (first_time, other_time)))

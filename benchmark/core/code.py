@@ -128,12 +128,12 @@ def located(name: str) -> str:
 
 
 @contextmanager
-def only_named(where: str | Path, named: Collection[str]) -> Iterator[None]:
+def only_named(where: str | Path, allowed: Collection[str]) -> Iterator[None]:
     """While the block lasts, refuse all code but that which the user named, for settings that stand in a file `where`.
 
     Threads that `semstab.core.prefetch` starts in the block are bound, too.
     """
-    token = _allowed_only.set((str(where), frozenset(map(located, named))))
+    token = _allowed_only.set((str(where), frozenset(map(located, allowed))))
     try:
         yield
     finally:

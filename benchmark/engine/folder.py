@@ -224,13 +224,13 @@ class Folder:
             truth_file=self.path / truth if unit.image_space and has_truth else None,
         )
 
-    def save_result(self, result: Result, kept: Iterable[Record]) -> None:
+    def save_result(self, result: Result, saved: Iterable[Record]) -> None:
         """Write summary.json, manifest.json, and the digests of the settings and the units' files.
 
         Raises:
             DataError: If one of these files is gone.
         """
-        digests = {name: digest for record in kept for name, digest in record.files.items()}
+        digests = {name: digest for record in saved for name, digest in record.files.items()}
         if lost := next((name for name in digests if not (self.path / name).exists()), None):
             raise DataError(f"{self.path / lost}: was written, and is gone; run the same command again")
         if gone := sorted(_models_in(self.path) - {record.unit.model for record in result.records}):
@@ -315,20 +315,20 @@ def _in_tiles(record: Record, kind: str = VOXELS) -> list[str]:
     return [name for name in record.files if name.startswith(f"{kind}/{record.unit.slug}/")]
 
 
-def run_and_model(named: str | os.PathLike[str]) -> tuple[Path, str | None]:
+def run_and_model(location: str | os.PathLike[str]) -> tuple[Path, str | None]:
     """Return the folder of a run, and the model of 'FOLDER:MODEL' where the text names no folder or file itself."""
-    text = os.fspath(named)
+    text = os.fspath(location)
     folder, _, model = text.rpartition(":")
     return (Path(text), None) if Path(text).exists() or not folder else (Path(folder), model)
 
 
-def model_of(named: str | os.PathLike[str], model: str | None) -> tuple[Path, str | None]:
+def model_of(location: str | os.PathLike[str], model: str | None) -> tuple[Path, str | None]:
     """Return the folder of a run, and the model that 'FOLDER:MODEL' or else `model` names.
 
     Raises:
         ConfigError: If both name one, and not the same.
     """
-    folder, stated = run_and_model(named)
+    folder, stated = run_and_model(location)
     if stated is not None and model not in (None, stated):
         raise ConfigError(f"{folder}:{stated}: --model {model} names another model; use one of the two")
     return folder, model if stated is None else stated

@@ -233,17 +233,17 @@ def _view(
     )  # fmt: skip
 
 
-def outlined(seen: Mask, voxel: float, smallest: float) -> tuple[tuple[Float64, ...], Mask]:
+def outlined(pixels: Mask, voxel: float, smallest: float) -> tuple[tuple[Float64, ...], Mask]:
     """Return polygons around pixels (H, W), gaps up to the width of a voxel filled, and what they enclose.
 
     Args:
-        seen: (H, W) pixels to outline.
+        pixels: (H, W), those to outline.
         voxel: Width of a voxel, pixels.
         smallest: Area of an outline, square pixels.
     """
     width = int(np.clip(np.ceil(voxel), 3, 31)) | 1
     kernel = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (width, width))
-    closed = cv2.morphologyEx(np.pad(seen.astype(np.uint8), width), cv2.MORPH_CLOSE, kernel)
+    closed = cv2.morphologyEx(np.pad(pixels.astype(np.uint8), width), cv2.MORPH_CLOSE, kernel)
     closed = np.pad(closed[width:-width, width:-width], (0, 1))
     square = np.ones((2, 2), np.uint8)  # OpenCV's contours run through the centres of pixels: here, along their edges
     edged = cv2.dilate(closed, square, anchor=(1, 1))

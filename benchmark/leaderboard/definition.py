@@ -281,13 +281,13 @@ def _hash(content: Any) -> str:
     return hashlib.blake2b(text.encode(), digest_size=8).hexdigest()
 
 
-def load_benchmark(named: str | Path) -> Benchmark:
+def load_benchmark(source: str | Path) -> Benchmark:
     """Return a benchmark that ships with semstab, NAME@VERSION or NAME for the last version, or that of a YAML file.
 
     Raises:
         ConfigError: For an unknown one.
     """
-    text = str(named)
+    text = str(source)
     if text.endswith((".yaml", ".yml")):
         path = Path(text)
         return validated(Benchmark, read_yaml(path) | {"id": path.stem, "file": str(path.absolute())}, f"{path}: ")
@@ -295,5 +295,5 @@ def load_benchmark(named: str | Path) -> Benchmark:
     if text not in shipped and (versions := [name for name in shipped if name.partition("@")[0] == text]):
         text = versions[-1]
     if text not in shipped:
-        raise ConfigError(f"'{named}' is neither a benchmark that ships nor a .yaml file; {nearest(text, [*shipped])}")
+        raise ConfigError(f"'{source}' is neither a benchmark that ships nor a .yaml file; {nearest(text, [*shipped])}")
     return validated(Benchmark, read_yaml(shipped[text]) | {"id": text}, f"{text}.yaml: ")

@@ -83,15 +83,15 @@ class Spots:
         return int(self.table[:, 5].sum())
 
 
-def spots_of(seen: Iterable[Frame], truth: Iterable[Frame] | None, classes: tuple[str, ...]) -> Spots:
+def spots_of(views: Iterable[Frame], truth: Iterable[Frame] | None, classes: tuple[str, ...]) -> Spots:
     """Return the spots of a scene.
 
     Args:
-        seen: Its frames, in order, with one class everywhere.
+        views: Its frames, in order, with one class everywhere.
         truth: The same with ground truth in rows of `classes`, if there is any.
         classes: Names of the classes.
     """
-    sample, frames = _sampled(seen, 1)
+    sample, frames = _sampled(views, 1)
     sums, shares = sums_of_spots(sample), tuple[float, ...]()
     first, second, _ = sums.answers
     keys, answers = keys_of(first), first["observations"][:, 0]

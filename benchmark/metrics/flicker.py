@@ -60,7 +60,7 @@ class CompensatedFlicker:
 
 def compensated_flicker(
     previous: Frame, current: Frame, *, depth_tolerance: float = DEPTH_TOLERANCE, voxel_size: float = math.nan,
-    seen: Correspondence | None = None,
+    correspondence: Correspondence | None = None,
 ) -> CompensatedFlicker:  # fmt: skip
     """Return flicker after the previous frame's labels are warped into the current one: camera motion is not counted.
 
@@ -80,8 +80,9 @@ def compensated_flicker(
         return _between_scans(previous, current, voxel_size)
     from semstab.data.kernels import count_changed_at
 
-    seen = correspond(current, previous, depth_tolerance=depth_tolerance) if seen is None else seen
-    images = (seen.pixel, current.valid, current.predicted, previous.valid, previous.predicted)
+    if correspondence is None:
+        correspondence = correspond(current, previous, depth_tolerance=depth_tolerance)
+    images = (correspondence.pixel, current.valid, current.predicted, previous.valid, previous.predicted)
     num_covisible, changed = count_changed_at(*(flat(image) for image in images))
     return CompensatedFlicker(
         100.0 * changed / num_covisible if num_covisible else math.nan,
@@ -100,16 +101,17 @@ def _between_scans(previous: Frame, current: Frame, voxel_size: float) -> Compen
     )
 
 
-def covisible(previous: Frame, current: Frame, seen: Correspondence) -> Mask:
+def covisible(previous: Frame, current: Frame, correspondence: Correspondence) -> Mask:
     """Return the valid pixels (H, W) of the current frame that the previous one shows at a valid pixel."""
-    is_covisible: Mask = current.valid & seen.bring(previous.valid, fill=False)
+    is_covisible: Mask = current.valid & correspondence.bring(previous.valid, fill=False)
     return is_covisible
 
 
-def changed_pixels(previous: Frame, current: Frame, seen: Correspondence | None = None) -> Mask:
+def changed_pixels(previous: Frame, current: Frame, correspondence: Correspondence | None = None) -> Mask:
     """Return the co-visible pixels (H, W) whose label changed since the previous frame; see `compensated_flicker`."""
-    seen = correspond(current, previous) if seen is None else seen
-    changed: Mask = covisible(previous, current, seen) & (seen.bring(previous.predicted) != current.predicted)
+    correspondence = correspond(current, previous) if correspondence is None else correspondence
+    before = correspondence.bring(previous.predicted)
+    changed: Mask = covisible(previous, current, correspondence) & (before != current.predicted)
     return changed
 
 

@@ -97,7 +97,7 @@ class VideoFlickerMeter(ImageSpaceMeter):
         if self._earlier is not None:
             self.lone.append(lone_pixels(before, [self._earlier, (sample, to_next)]))
         self._earlier = before, correspondence
-        return compensated_flicker(before, sample, seen=correspondence)
+        return compensated_flicker(before, sample, correspondence=correspondence)
 
     def recall(self, sample: Frame) -> float:
         """Return NaN: there are no edges of depth."""

@@ -107,16 +107,16 @@ def _place(place: DifferingPlace) -> Row:
     return (str(place.number), place.ours, place.theirs, place.true, place.voxels, x, y, z, place.size)
 
 
-def lines(own: MapAgreement) -> Iterator[str]:
+def lines(agreement: MapAgreement) -> Iterator[str]:
     """Yield what to know about a map: what fits better, and how its classes were read."""
-    if own.outside:
-        yield f"{own.name}: {own.outside:.1%} of its points lie in no voxel of the run"
-    if own.unlabelled:
-        yield f"{own.name}: {own.unlabelled:.1%} of its points have no class of the run"
-    if own.better:
-        yield f"{own.name}: {own.better}"
-    for note in own.notes:
-        yield f"{own.name}: {note}"
+    if agreement.outside:
+        yield f"{agreement.name}: {agreement.outside:.1%} of its points lie in no voxel of the run"
+    if agreement.unlabelled:
+        yield f"{agreement.name}: {agreement.unlabelled:.1%} of its points have no class of the run"
+    if agreement.better:
+        yield f"{agreement.name}: {agreement.better}"
+    for note in agreement.notes:
+        yield f"{agreement.name}: {note}"
 
 
 def print_maps(agreements: tuple[MapAgreement, ...], run: str, console: Console, *, verbose: bool = False) -> None:

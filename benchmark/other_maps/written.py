@@ -116,15 +116,21 @@ RANK_OF_RIGHT = np.array([0.0, 3.0, 4.0, 4.0, 1.0])
 """Ranks of kinds: a column of voxels shows the voxel with the highest rank."""
 
 
-def draw(comparison: MapComparison, own: Voxelwise) -> Canvas:
+def draw(comparison: MapComparison, voxelwise: Voxelwise) -> Canvas:
     """Return the picture of a map next to the run's."""
-    union, run, georeference = own.laid_together(comparison.run), comparison.run, comparison.first.georeference
+    union, run, georeference = voxelwise.laid_together(comparison.run), comparison.run, comparison.first.georeference
     size, up = run.grid.size, comparison.first.up or (0.0, 0.0, 1.0)
     laid = centers(union.index, size)
     visible, axis, view = best_view_of(laid, size, up)
     laid = laid[visible]
     panels: list[tuple[str, Any, Any, Any, Any]] = [
-        (f"{short(own.agreement.name)}, {view}", union.kind[visible], RANK_OF_KIND, OF_KIND, tuple(KINDS.values()))
+        (
+            f"{short(voxelwise.agreement.name)}, {view}",
+            union.kind[visible],
+            RANK_OF_KIND,
+            OF_KIND,
+            tuple(KINDS.values()),
+        )
     ]
     if union.right is not None:
         panels.append(("which is right", union.right[visible], RANK_OF_RIGHT, OF_RIGHT, RIGHT))
@@ -137,8 +143,8 @@ def draw(comparison: MapComparison, own: Voxelwise) -> Canvas:
         located = Located.seen_along(axis, corner, (rows.shape[1] * cell, rows.shape[0] * cell), laid, georeference)
         mark_panel(panel, letter, title)
         framed(panel)
-        locate(panel, located, rows.shape, named=panel is axes[0])
-        listed = own.agreement.places[:MOST_NUMBERED]
+        locate(panel, located, rows.shape, numbers=panel is axes[0])
+        listed = voxelwise.agreement.places[:MOST_NUMBERED]
         number_places(
             panel, [place.number for place in listed], [place.centre for place in listed], [""] * len(listed), located,
             rows.shape,

@@ -84,15 +84,15 @@ class ImageFiles:
         return None
 
 
-def chosen(names: Sequence[str] | None, known: Sequence[str], where: str) -> Sequence[str]:
+def chosen(names: Sequence[str] | None, available: Sequence[str], where: str) -> Sequence[str]:
     """Return the named scenes, by default all.
 
     Raises:
         ConfigError: For one that is not there.
     """
-    if lost := [name for name in names or () if name not in known]:
-        raise ConfigError(f"{where}: no scene '{lost[0]}'; there is {', '.join(known)}")
-    return list(dict.fromkeys(names)) if names is not None else known
+    if lost := [name for name in names or () if name not in available]:
+        raise ConfigError(f"{where}: no scene '{lost[0]}'; there is {', '.join(available)}")
+    return list(dict.fromkeys(names)) if names is not None else available
 
 
 # The jobs of a prediction command: images of sequences, and the folders of their predictions.
@@ -182,7 +182,7 @@ class PredictionBar(PredictionObserver):
         self._bar.reset(self._work, total=frames, description=name, speed="")
         self._bar.start()
 
-    def frame_done(self, shown: Picture, seconds: float) -> None:
+    def frame_done(self, picture: Picture, seconds: float) -> None:
         """Advance by one frame."""
         reused = math.isnan(seconds)
         self._left -= 1

@@ -110,7 +110,7 @@ class Filter(ABC):
         self.value = value
 
     @abstractmethod
-    def __call__(self, belief: Belief, shown: Shown) -> Belief:
+    def __call__(self, belief: Belief, view: Shown) -> Belief:
         """Return the belief after the filter; the given array is not changed."""
 
 
@@ -266,7 +266,7 @@ class Ema(Filter):
         super().__init__(value)
         self._before: Belief | None = None
 
-    def __call__(self, belief: Belief, shown: Shown) -> Belief:
+    def __call__(self, belief: Belief, view: Shown) -> Belief:
         """See `Filter`."""
         self._before = belief if self._before is None else mixed(self._before, belief, self.value)
         return self._before
@@ -287,9 +287,9 @@ class EmaWarped(Filter):
         super().__init__(value)
         self._before: tuple[Belief, Frame] | None = None
 
-    def __call__(self, belief: Belief, shown: Shown) -> Belief:
+    def __call__(self, belief: Belief, view: Shown) -> Belief:
         """See `Filter`."""
-        now = shown.geometry
+        now = view.geometry
         if self._before is not None:
             belief = mixed(carry(*self._before, now), belief, self.value)
         self._before = belief, now
@@ -321,11 +321,11 @@ class Guided(Filter):
     parameter = Parameter("the radius of the windows in pixels", 8, 1, 500, whole=True)
     wants_color = True
 
-    def __call__(self, belief: Belief, shown: Shown) -> Belief:
+    def __call__(self, belief: Belief, view: Shown) -> Belief:
         """See `Filter`."""
         import cv2
 
-        grey = cv2.cvtColor(shown.image, cv2.COLOR_RGB2GRAY).astype(np.float32) / np.float32(255)
+        grey = cv2.cvtColor(view.image, cv2.COLOR_RGB2GRAY).astype(np.float32) / np.float32(255)
         labelled = belief.any(axis=2).astype(np.float32)
         count = np.maximum(self._sum(labelled), 1)
         mean = self._sum(grey * labelled) / count
@@ -363,7 +363,7 @@ class Vote(Filter):
         super().__init__(value)
         self._last: deque[UInt16] = deque(maxlen=int(value))
 
-    def __call__(self, belief: Belief, shown: Shown) -> Belief:
+    def __call__(self, belief: Belief, view: Shown) -> Belief:
         """See `Filter`."""
         K, N = belief.shape[2], int(self.value)
         rows = np.where(belief.any(axis=2), belief.argmax(axis=2), K).astype(np.uint16)

@@ -127,11 +127,11 @@ class Producer(PredictionObserver):
         last = max(map(self._frames.index, indices), default=-1)
         return [*self._frames[: last + 1]]
 
-    def frame_done(self, shown: Picture, seconds: float) -> None:
+    def frame_done(self, picture: Picture, seconds: float) -> None:
         """Let those who wait for the frame read it."""
         with self._changed:
-            self._done[shown.index] = seconds
-            self._digests[shown.digest] = shown.index
+            self._done[picture.index] = seconds
+            self._digests[picture.digest] = picture.index
             self._changed.notify_all()
         if self._stopped:
             raise _StoppedError

@@ -148,7 +148,7 @@ class PredictionObserver:
     def sequence_started(self, name: str, frames: int) -> None:
         """Take note that a sequence of `frames` selected frames is begun."""
 
-    def frame_done(self, shown: Picture, seconds: float) -> None:
+    def frame_done(self, picture: Picture, seconds: float) -> None:
         """Take note of one more frame, and the model's seconds, NaN for a frame of an earlier start."""
 
 

@@ -305,8 +305,8 @@ def named(vocabularies: Sequence[Path]) -> dict[str, Vocabulary]:
     listed: dict[tuple[Path, Changes], None] = {}
     for file, changes in wanted:
         if EACH in changes.without:
-            each = (Changes(without=(entry.name,)) for entry in files[file].settings.names)
-            listed |= dict.fromkeys((file, variant) for variant in (Changes(), *each))
+            removals = (Changes(without=(entry.name,)) for entry in files[file].settings.names)
+            listed |= dict.fromkeys((file, variant) for variant in (Changes(), *removals))
         else:
             listed[file, changes] = None
     by_name: dict[str, Vocabulary] = {}

@@ -83,16 +83,16 @@ def _load() -> None:
     load_templates()
 
 
-def write_report(result: Result, folder: str | Path, shown: Mapping[str, ShownMap] = MappingProxyType({})) -> Path:
+def write_report(result: Result, folder: str | Path, maps: Mapping[str, ShownMap] = MappingProxyType({})) -> Path:
     """Write FOLDER/report.html, from the result and the files that its run left in the folder; return its path.
 
     Args:
         result: The result of the run or study.
         folder: Its folder.
-        shown: What is shown of a map, by the unit's slug; the voxels of other units are read.
+        maps: What is shown of a map, by the unit's slug; the voxels of other units are read.
     """
     from semstab.report.page import render
 
     path = Path(folder) / "report.html"
-    write_text(path, render(result, Path(folder), digest_of(Path(folder)), shown))
+    write_text(path, render(result, Path(folder), digest_of(Path(folder)), maps))
     return path

@@ -52,11 +52,11 @@ def filled(template: str, **content: Any) -> str:
     return templates().get_template(template).render(style=f"{style}\n{colors_css()}", script=script, **content)
 
 
-def blocks(own: Sequence[Table], shown: Sequence[Figure], folder: Path) -> Iterator[dict[str, Any]]:
+def blocks(tables: Sequence[Table], drawn: Sequence[Figure], folder: Path) -> Iterator[dict[str, Any]]:
     """Yield tables, each with the figure of its name beneath it, then the other figures."""
-    figures = {figure.name: figure for figure in shown}
+    figures = {figure.name: figure for figure in drawn}
     ordered: list[Table | Figure] = []
-    for table in own:
+    for table in tables:
         ordered += [table, *([figures.pop(table.name)] if table.name in figures else [])]
     for item in (*ordered, *figures.values()):
         if isinstance(item, Table):

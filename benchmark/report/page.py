@@ -69,17 +69,17 @@ def load_templates() -> None:
         templates().get_template(name)
 
 
-def render(result: Result, folder: Path, digest: str = "", shown: Mapping[str, ShownMap] = MappingProxyType({})) -> str:
+def render(result: Result, folder: Path, digest: str = "", maps: Mapping[str, ShownMap] = MappingProxyType({})) -> str:
     """Return the page of the result whose files lie in the folder, with the digest of what it is made from.
 
     Args:
         result: The result of the run or study.
         folder: Its folder.
         digest: Digest of the files that the page is made from.
-        shown: What is shown of a map, by the unit's slug; the voxels of other units are read.
+        maps: What is shown of a map, by the unit's slug; the voxels of other units are read.
     """
     everything, result = result, of_interest(result)
-    scenes, views = list(_scenes(result, folder, shown)), [table_block(table) for table in tables(everything)]
+    scenes, views = list(_scenes(result, folder, maps)), [table_block(table) for table in tables(everything)]
     return filled(
         TEMPLATE,
         kind="Study of temporal semantic stability" if result.sweeps() else "Temporal semantic stability",
@@ -228,7 +228,7 @@ def _of_images(records: Sequence[Record]) -> Iterator[tuple[str, str, str]]:
 # --- A scene: the map, the time line, the classes ---------------------------------------------------------------------
 
 
-def _scenes(result: Result, folder: Path, shown: Mapping[str, ShownMap]) -> Iterator[dict[str, Any]]:
+def _scenes(result: Result, folder: Path, maps: Mapping[str, ShownMap]) -> Iterator[dict[str, Any]]:
     views, reading = TopViews(), threading.Lock()
     stored = [record for record in result.select() if record.voxels_file is not None]
     share = min(BYTES, ALL_BYTES // max(1, len(stored)))
@@ -245,9 +245,9 @@ def _scenes(result: Result, folder: Path, shown: Mapping[str, ShownMap]) -> Iter
 
         def map_of(record: Record, up: Any = up, overviews: Mapping[str, Overview] = overviews) -> dict[str, Any]:
             with reading:
-                seen = shown.get(record.unit.slug) or ShownMap(views.above(record, up), places_of(record, LISTED))
+                shown_map = maps.get(record.unit.slug) or ShownMap(views.above(record, up), places_of(record, LISTED))
             scene, model = record.unit.scene, record.unit.model
-            return _map(record, seen, overviews.get(model), result.georeference.get(scene), share)
+            return _map(record, shown_map, overviews.get(model), result.georeference.get(scene), share)
 
         yield {
             "name": scene,
@@ -265,13 +265,13 @@ def _scenes(result: Result, folder: Path, shown: Mapping[str, ShownMap]) -> Iter
 
 
 def _map(
-    record: Record, shown: ShownMap, overview: Overview | None, georeference: Georeference | None, most: int
+    record: Record, shown_map: ShownMap, overview: Overview | None, georeference: Georeference | None, most: int
 ) -> dict[str, Any]:
     """Return the map as the page's script paints it.
 
     It has images of numbers for the script, and an image of the stability for a page without script.
     """
-    above = shown.above
+    above = shown_map.above
     step = max(1, math.ceil(math.sqrt(above.rows.size / CELLS)))
     table, names = above.table, above.table.classes or tuple(map(str, range(above.table.K)))
     moved = states_of(record, table.centers)
@@ -304,7 +304,7 @@ def _map(
         "text": f"{size[0]:.3g} m by {size[1]:.3g} m{of_whole}, seen {above.view}",
         "around": map_frame(located),
         "located": {"matrix": located.matrix.tolist(), "size": located.size, "names": located.names},
-        "places": described_places(shown.places, record, located, overview, names),
+        "places": described_places(shown_map.places, record, located, overview, names),
         "cell": cell,
         "names": names,
         "palette": palette.tolist(),

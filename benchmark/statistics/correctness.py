@@ -195,12 +195,12 @@ def reliability(belief: Float64 | Evidence, label: Int64) -> tuple[Reliability, 
     return reliability_of(prediction_sums(Predictions.of(belief, label), label >= 0))
 
 
-def by_stratum(predictions: Predictions, op: Int32, known: Mask, edges: Sequence[int]) -> tuple[Correctness, ...]:
+def by_stratum(predictions: Predictions, op: Int32, has_truth: Mask, edges: Sequence[int]) -> tuple[Correctness, ...]:
     """Return the correctness of all voxels whose true class is known (n,), by stratum of OP (n,), then of OP >= 2."""
-    sums = _prediction_sums_by_group(predictions, np.where(known, groups_of(op, edges), -1), len(edges) + 1)
+    sums = _prediction_sums_by_group(predictions, np.where(has_truth, groups_of(op, edges), -1), len(edges) + 1)
     names = ["all", *(name for name, _, _ in strata(edges))]
     total = functools.reduce(operator.add, sums)
-    repeated = prediction_sums(predictions, known & (op >= 2))
+    repeated = prediction_sums(predictions, has_truth & (op >= 2))
     sums_and_names = zip([total, *sums, repeated], [*names, "OP>=2"], strict=True)
     return tuple(correctness_of(of_group, name) for of_group, name in sums_and_names)
 

@@ -67,16 +67,16 @@ class Likeness:
     along: Float64
 
 
-def likeness(seen: FeatureObservations) -> Likeness:
+def likeness(observations: FeatureObservations) -> Likeness:
     """Return what vectors tell of each observation, with whole spots in memory one stretch after the other."""
-    log = seen.log
-    T, total = np.diff(log.bounds)[log.voxel], np.zeros(seen.D)
-    for stretch in seen.stretches():
-        total += (T[stretch] >= 2) @ seen.rows(stretch)
+    log = observations.log
+    T, total = np.diff(log.bounds)[log.voxel], np.zeros(observations.D)
+    for stretch in observations.stretches():
+        total += (T[stretch] >= 2) @ observations.rows(stretch)
     along_all = total / (np.linalg.norm(total) or 1.0)
     squared_length, mean_with_others, among, spot, along = np.full((5, len(log)), np.nan)
-    for stretch in seen.stretches():
-        s, voxel, n = seen.rows(stretch), log.voxel[stretch], T[stretch].astype(np.float64)
+    for stretch in observations.stretches():
+        s, voxel, n = observations.rows(stretch), log.voxel[stretch], T[stretch].astype(np.float64)
         start, of = np.flatnonzero(np.diff(voxel, prepend=-1)), voxel - voxel[0]
         sums, square = np.add.reduceat(s, start, axis=0), np.einsum("ij,ij->i", s, s)
         with_others = np.einsum("ij,ij->i", s, sums[of]) - square
@@ -89,13 +89,13 @@ def likeness(seen: FeatureObservations) -> Likeness:
     return Likeness(T, squared_length, mean_with_others, among, spot, along)
 
 
-def feature_sums(seen: FeatureObservations, of: Likeness, edge: float | None = None) -> ClusterSums:
+def feature_sums(observations: FeatureObservations, of: Likeness, edge: float | None = None) -> ClusterSums:
     """Return the sums by cube and group of frames from which `FEATURE_ALPHA` follows.
 
     The mean cosine P of a spot is shared out among its T views, as the agreement of labels is:
     P + 2 (T - 1) / (T - 2) (a_t - P), where a_t is the mean cosine of view t with the others.
     """
-    log = seen.log
+    log = observations.log
     cubes, (groups, group, step, frames) = Cubes.of_log(log, edge), FrameGroups.at_most(most_groups(1), log.frame)
     at = cubes.at[log.voxel].astype(np.int64) * max(len(groups), 1) + group
     counted = np.flatnonzero((cubes.at[log.voxel] >= 0) & (of.views >= 2))
@@ -116,13 +116,13 @@ def feature_sums(seen: FeatureObservations, of: Likeness, edge: float | None = N
     )  # fmt: skip
 
 
-def alpha_of_features(seen: FeatureObservations) -> float:
+def alpha_of_features(observations: FeatureObservations) -> float:
     """Return alpha of features; NaN if no spot was seen by two views."""
-    return value(feature_sums(seen, likeness(seen)), FEATURE_ALPHA) if len(seen) else math.nan
+    return value(feature_sums(observations, likeness(observations)), FEATURE_ALPHA) if len(observations) else math.nan
 
 
 def feature_agreement(
-    seen: FeatureObservations,
+    observations: FeatureObservations,
     of: Likeness,
     sums: ClusterSums,
     scope: Scope = THIS_SCENE,
@@ -133,7 +133,7 @@ def feature_agreement(
     """Return alpha of features with its interval, by range, angle, time and frame, and its worst places.
 
     Args:
-        seen: Features that views give spots.
+        observations: Features that views give spots.
         of: Their `likeness`.
         sums: Their `feature_sums`.
         scope: Scope of the intervals, if there are enough views for it.
@@ -143,18 +143,18 @@ def feature_agreement(
     n, similar, squares = (float(sums[key].sum()) for key in ("observations", "agreeing", "own"))
     total = float((sums["evidence"].sum(axis=0) ** 2).sum())
     return FeatureAgreement(
-        components=seen.D,
+        components=observations.D,
         spots=round(float(sums["voxels"].sum())),
-        views=len(seen.spots.views),
-        one_in=seen.one_in,
+        views=len(observations.spots.views),
+        one_in=observations.one_in,
         alpha=_alpha(sums, scope),
         cosine=similar / n if n else math.nan,
         chance=(total - squares) / (n * (n - 1)) if n > 1 else math.nan,
         alone=alone,
-        correlogram=in_bins(seen.spots, functools.partial(_sums_of_pairs, seen, of), 1, PAIRED),
-        ranges=_ranges(seen, scope),
-        outlying_frames=outlying_frames(lone_features(seen, of), len(seen.spots.views), name=name),
-        places=_places(seen, of),
+        correlogram=in_bins(observations.spots, functools.partial(_sums_of_pairs, observations, of), 1, PAIRED),
+        ranges=_ranges(observations, scope),
+        outlying_frames=outlying_frames(lone_features(observations, of), len(observations.spots.views), name=name),
+        places=_places(observations, of),
     )
 
 
@@ -211,13 +211,13 @@ def _ranges(features: FeatureObservations, scope: Scope) -> tuple[RangeStratum, 
     return tuple(strata)
 
 
-def lone_features(seen: FeatureObservations, of: Likeness) -> LoneDisagreement:
+def lone_features(observations: FeatureObservations, of: Likeness) -> LoneDisagreement:
     """Return how far each frame's features are from those of other views at the same spots, in halves of 1 - cosine.
 
     The null is the same between these other views: so spots that are hard for all views blame no frame.
     """
     several = of.views >= LEAST_VIEWS
-    frame, number = np.unique(seen.log.frame[several], return_inverse=True)
+    frame, number = np.unique(observations.log.frame[several], return_inverse=True)
     places = np.bincount(number, minlength=len(frame))
     share, null = (
         np.bincount(number, (1 - cosine[several]) / 2, len(frame)).clip(min=0) / places

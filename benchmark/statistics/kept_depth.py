@@ -182,11 +182,11 @@ class DepthMemory:
         z = depth[valid]
         rays = np.stack([(column - K.cx) / K.fx, (row - K.cy) / K.fy, np.ones(len(z))], axis=1)
         point = (rays * z[:, None]) @ frame.T_wc[:3, :3].T + frame.T_wc[:3, 3]
-        kept = [view_depth for view_depth in self.kept if not misplaced[view_depth.view]]
-        votes = np.zeros((len(kept), len(point)), np.uint8)
-        for view_votes, view_depth in zip(votes, kept, strict=True):
+        well_placed = [view_depth for view_depth in self.kept if not misplaced[view_depth.view]]
+        votes = np.zeros((len(well_placed), len(point)), np.uint8)
+        for view_votes, view_depth in zip(votes, well_placed, strict=True):
             view_votes[:] = view_depth.votes(point, sigma)
-        counts, at_end, _ = _tallied(votes, np.ones(len(kept), np.bool_))
+        counts, at_end, _ = _tallied(votes, np.ones(len(well_placed), np.bool_))
         num_seen, _, through = counts.astype(np.int64).T
         moves = np.zeros(depth.shape, np.bool_)
         moved = has_moved(through, num_seen + through, at_end)

@@ -121,13 +121,13 @@ def variances(
         distance: (n, n) between the effects, whose correlation is exp(-distance / range); range 0: independent.
         ranges: Correlation lengths that are tried, and their weights before the data.
     """
-    n, seen = len(effect), effect.var()
-    if n < 2 or not seen > 0:
+    n, spread = len(effect), effect.var()
+    if n < 2 or not spread > 0:
         return NOTHING
     contrasts = _contrasts(n)
-    error = contrasts.T @ noise @ contrasts + 1e-9 * seen * np.eye(n - 1)
+    error = contrasts.T @ noise @ contrasts + 1e-9 * spread * np.eye(n - 1)
     whiten = np.linalg.inv(np.linalg.cholesky(error)) @ contrasts.T
-    whitened, sizes = whiten @ effect, seen * n / (n - 1) * _sizes(n)
+    whitened, sizes = whiten @ effect, spread * n / (n - 1) * _sizes(n)
     logs, result = [], []
     for reach, prior in ranges.items():
         alike = np.exp(-distance / reach) if reach > 0 else np.eye(n)

@@ -125,7 +125,9 @@ def assert_same_map(
     """
     columns = {*EXACT, *SUMS} - {*leaving_out}
     wrong = [m for m in mismatches(a, b, tolerance) if re.sub(r"_\d+$", "", m.column) in columns]
-    assert not wrong, "; ".join([*map(str, wrong), *(f"likely: {known}" for known in [cause()] if known)])
+    assert not wrong, "; ".join(
+        [*map(str, wrong), *(f"likely: {explanation}" for explanation in [cause()] if explanation)]
+    )
 
 
 def share_that_differs(a: VoxelTable, b: VoxelTable, tolerance: float) -> float:

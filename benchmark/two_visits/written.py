@@ -48,9 +48,9 @@ TOPICS = (
 )
 
 
-def write(comparison: VisitComparison, seen: Mapping[str, Visited], out: Path) -> None:
+def write(comparison: VisitComparison, visited: Mapping[str, Visited], out: Path) -> None:
     """Write visits.json, tables, the map of each scene, and report.html."""
-    made, figures = tables(comparison), pictures(comparison, seen)
+    made, figures = tables(comparison), pictures(comparison, visited)
     write_json(out / CONTENT, comparison)
     save_tables(made, out)
     keep_only([path for figure in figures for path in figure.save(out / FIGURES)], out / FIGURES)
@@ -88,7 +88,7 @@ def kinds(visited: VisitedSpots) -> Int64:
     return kind
 
 
-def pictures(comparison: VisitComparison, seen: Mapping[str, Visited]) -> list[Figure]:
+def pictures(comparison: VisitComparison, visited: Mapping[str, Visited]) -> list[Figure]:
     """Return the map of each scene."""
     return [
         Figure(
@@ -96,31 +96,31 @@ def pictures(comparison: VisitComparison, seen: Mapping[str, Visited]) -> list[F
             f"What changed: {scene.scene}",
             "In each column of spots the one that changed most is shown; numbers name the largest places.",
             f"The map of {scene.scene}: spots with the same class in both visits, another one, gone, new or moved.",
-            partial(draw, seen[scene.scene], scene.places[:MOST_NUMBERED]),
+            partial(draw, visited[scene.scene], scene.places[:MOST_NUMBERED]),
         )
         for scene in comparison.scenes
-        if len(seen[scene.scene].spots.spots.point)
+        if len(visited[scene.scene].spots.spots.point)
     ]
 
 
-def draw(seen: Visited, places: Sequence[ChangedPlace]) -> Canvas:
+def draw(visit: Visited, places: Sequence[ChangedPlace]) -> Canvas:
     """Return the map of a scene."""
-    visited = seen.spots
+    visited = visit.spots
     asked = np.flatnonzero(visited.counts.sum(axis=0) > 0)
     size = COARSER * visited.spots.spacing * math.sqrt((1 << 32) / visited.spots.share)
     point, kind = visited.spots.point[asked], kinds(visited)[asked]
-    visible, axis, view = best_view_of(point, size, seen.up)
+    visible, axis, view = best_view_of(point, size, visit.up)
     point, kind = point[visible], kind[visible]
     rows, cell, corner = top_down(point, size, axis, RANK[kind])
     figure, (panel,) = map_panels(rows, 1)
     draw_kinds(figure, panel, rows, kind, COLORS, KINDS)
-    located = Located.seen_along(axis, corner, (rows.shape[1] * cell, rows.shape[0] * cell), point, seen.georeference)
+    located = Located.seen_along(axis, corner, (rows.shape[1] * cell, rows.shape[0] * cell), point, visit.georeference)
     mark_panel(panel, "a", f"spots, {view}")
     framed(panel)
     locate(panel, located, rows.shape)
     centres = np.array([place.centre for place in places]).reshape(-1, 3)
-    if seen.georeference is not None:
-        centres = seen.georeference.in_scene(centres)
+    if visit.georeference is not None:
+        centres = visit.georeference.in_scene(centres)
     at: list[Any] = centres.tolist()
     number_places(panel, [place.number for place in places], at, [""] * len(places), located, rows.shape)
     return figure

@@ -64,9 +64,9 @@ class SensorPoses:
         DataError: If an option names what is not there.
     """
 
-    def __init__(self, bag: OpenBag, options: PoseOptions, sensor: str = "camera", seen: str = "images") -> None:
+    def __init__(self, bag: OpenBag, options: PoseOptions, sensor: str = "camera", seen_by: str = "images") -> None:
         self._path = bag.path
-        self._sensor, self._seen = sensor, seen
+        self._sensor, self._seen = sensor, seen_by
         self._options = options
         self._transforms = Transforms()
         self._tf = bag.of_types(*TF_TYPE)

@@ -193,8 +193,8 @@ class CityScene(Scene):
         with self._lock:
             of_frame = self._of_frame.setdefault(index, threading.Lock())
         with of_frame:  # of all that ask for a frame, one renders it
-            if (known := self.rendered.get(index)) is not None:
-                return known
+            if (rendered := self.rendered.get(index)) is not None:
+                return rendered
             moving = CityCaster(town.moving(self._share(index) * self._flight.seconds, T[:3, 3]))
             size = (self._options.height, self._options.width)
             rendered = render((self.still, moving), T, self.camera, size, LIGHTS[self._options.light])

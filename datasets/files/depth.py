@@ -160,7 +160,7 @@ def stored_depth(
     options: FileOptions,
     read: Read,
     camera: Callable[[tuple[int, int]], Intrinsics],
-    own: FrameSize = ANY_SIZE,
+    allowed_sizes: FrameSize = ANY_SIZE,
 ) -> Float32:
     """Return depth (H, W) of a frame's file in metres along the optical axis; values that mean 'no depth' become 0.
 
@@ -169,10 +169,10 @@ def stored_depth(
         options: The settings of the dataset's files.
         read: Reads the content of a file.
         camera: Gives the intrinsics of the depth image of a shape.
-        own: The sizes that the frame's files may have.
+        allowed_sizes: The sizes that the frame's files may have.
     """
     scale = options.depth_scale or frame.depth_scale
-    depth = _reader(frame, own)(frame.depth, scale, read)
+    depth = _reader(frame, allowed_sizes)(frame.depth, scale, read)
     if np.isnan(depth[0, 0]) and np.isnan(depth).all():  # one frame that saw nothing ends no run; it is counted
         depth = np.zeros_like(depth)
     for value in options.invalid_depth:
@@ -191,7 +191,7 @@ def stored_depth(
 
 def _reader(frame: FrameSource, sizes: FrameSize = ANY_SIZE) -> DepthReader:
     """Return what reads a frame's depth: its own reader, or the one of the file's suffix."""
-    return frame.depth_reader or FORMATS.get(frame.depth.suffix.lower(), partial(read_depth, own=sizes))
+    return frame.depth_reader or FORMATS.get(frame.depth.suffix.lower(), partial(read_depth, allowed_sizes=sizes))
 
 
 def shape_of(frame: FrameSource, options: FileOptions) -> tuple[int, int]:

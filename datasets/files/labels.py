@@ -131,9 +131,9 @@ def find_sources(
     entry: SceneEntry,
     frames: Sequence[Named],
     folders: Folders,
-    own: Mapping[str, Path],
+    given: Mapping[str, Path],
 ) -> dict[str, LabelSource]:
-    """Return the label sources of a scene with these frames, those in folders of their `own` first; `gt` is the truth.
+    """Return the label sources of a scene with these frames, `given` folders of labels first; `gt` is the truth.
 
     labels of X are the model X, scores of X found by a template are X-scores, so that neither name depends on
     other folders. A folder without a file of any frame is left out with a warning.
@@ -147,7 +147,7 @@ def find_sources(
     base = options.labels_root or entry.folder
     if options.labels_root is not None and not os.path.isdir(base):  # noqa: PTH112  Path.is_dir raises where the name is too long
         raise ConfigError(f"{base}: there is no such folder; correct labels_root")
-    for name, folder in own.items():
+    for name, folder in given.items():
         sources[name] = LabelSource.of("labels", folder, "{name}", frames, folders)
     for kind in KINDS:
         templates: dict[str, str] = {}
@@ -272,7 +272,7 @@ class LabelMaps:
     Attributes:
         truth: What the format says of its ground truth.
         folders: The listed content of the folders where maps may be.
-        own: Folders of label maps by the label source that they are, besides those that templates find.
+        given: Folders of label maps by the label source that they are, besides those that templates find.
 
     Raises:
         ConfigError: For options that cannot be used.
@@ -284,10 +284,10 @@ class LabelMaps:
         entry: SceneEntry,
         frames: Sequence[Named],
         folders: Folders,
-        own: Mapping[str, Path],
+        given: Mapping[str, Path],
         truth: TruthSource = NO_TRUTH,
     ) -> None:
-        labels, base = find_sources(options, entry, frames, folders, own), options.labels_root or entry.folder
+        labels, base = find_sources(options, entry, frames, folders, given), options.labels_root or entry.folder
         template = Template("regions", REGIONS, ("model", "name"), ("model", "name"))
         regions = {
             name: LabelSource.of("labels", base, filled, frames, folders)
@@ -428,9 +428,9 @@ class LabelMaps:
         return self.truth.ids if model == GROUND_TRUTH else None
 
     def labels(
-        self, model: str, path: Path, read: Read, own: FrameSize = ANY_SIZE, frame: FrameSource | None = None
+        self, model: str, path: Path, read: Read, allowed_sizes: FrameSize = ANY_SIZE, frame: FrameSource | None = None
     ) -> Labels:
-        """Return ids (H, W) of one file of a frame, whose bytes `read` gives; `own` has the sizes that it may have.
+        """Return ids (H, W) of one file of a frame, whose bytes `read` gives, in one of `allowed_sizes`.
 
         Raises:
             DataError: If that fails; the message names it.
@@ -439,7 +439,7 @@ class LabelMaps:
         if model == GROUND_TRUTH and self.truth.read is not None and frame is not None:
             labels = self.truth.read(frame, path, read)
         else:
-            labels = images.read_labels(path, self.space(model), read, own, void)
+            labels = images.read_labels(path, self.space(model), read, allowed_sizes, void)
         if (table := self.class_ids(model)) is not None:
             ids: Labels = table[labels]
             if (unknown := ids == NO_ID).any():
@@ -451,7 +451,7 @@ class LabelMaps:
             labels = np.where(np.isin(labels, void), labels.dtype.type(ignore_id(labels)), labels)
         return labels
 
-    def scores(self, model: str, path: Path, size: Size, read: Read, own: FrameSize = ANY_SIZE) -> Scores:
+    def scores(self, model: str, path: Path, size: Size, read: Read, allowed_sizes: FrameSize = ANY_SIZE) -> Scores:
         """Return scores (H, W, K) of one file; `size` is (H, W) of the depth.
 
         Raises:
@@ -459,7 +459,7 @@ class LabelMaps:
         """
         label_space = self.space(model)
         classes = None if label_space is None else len(label_space)
-        scores = images.read_scores(path, self._options.scores_layout or "KHW", size, read, own, classes)
+        scores = images.read_scores(path, self._options.scores_layout or "KHW", size, read, allowed_sizes, classes)
         if void := self._options.void_ids.get(model):
             space = self.space(model)
             ids = range(scores.shape[2]) if space is None else space.ids
@@ -473,12 +473,12 @@ class LabelMaps:
             return self._sources[GROUND_TRUTH].file(frame)
         return None if self._masks is None else self._masks.file(frame)
 
-    def mask(self, frame: FrameSource, path: Path, read: Read, own: FrameSize = ANY_SIZE) -> Mask:
+    def mask(self, frame: FrameSource, path: Path, read: Read, allowed_sizes: FrameSize = ANY_SIZE) -> Mask:
         """Return (H, W) True where a frame is left out by that file; raises DataError with the file."""
         if self._masks is not None:
-            return images.read_mask(path, read, own)
+            return images.read_mask(path, read, allowed_sizes)
         if self.truth.read is None:
-            stored = images.read_labels(path, self.space(GROUND_TRUTH), read, own)
+            stored = images.read_labels(path, self.space(GROUND_TRUTH), read, allowed_sizes)
         else:
             stored = self.truth.read(frame, path, read)
         return np.isin(stored, list(self.truth.moving))

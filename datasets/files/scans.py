@@ -173,7 +173,7 @@ class ScanScene(Scene):
         entry: SceneEntry,
         scans: Sequence[ScanSource],
         files: Folders | None = None,
-        own: Mapping[str, Path] | None = None,
+        given: Mapping[str, Path] | None = None,
     ) -> None:
         if len({scan.name for scan in scans}) < len(scans):
             raise DataError(f"{entry.folder}: two scans have one name; scans need names of their own")
@@ -202,7 +202,7 @@ class ScanScene(Scene):
             self._sources |= {model: source for model, source in sources.items() if source.first is not None}
             if self._sources:
                 break
-        for name, labels in (own or {}).items():
+        for name, labels in (given or {}).items():
             if name in self._sources:
                 raise ConfigError(f"{entry.folder}: two label sources are called '{name}'; rename one")
             self._sources[name] = LabelSource.of("points", labels, "{name}", scans, self._files)

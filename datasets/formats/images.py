@@ -56,7 +56,9 @@ MOST_SCORES = 4096
 Read = Callable[[Path], bytes]
 
 
-def read_depth(path: Path, scale: float | None = None, read: Read = read_bytes, own: FrameSize = ANY_SIZE) -> Float32:
+def read_depth(
+    path: Path, scale: float | None = None, read: Read = read_bytes, allowed_sizes: FrameSize = ANY_SIZE
+) -> Float32:
     """Return depth (H, W) in metres, float32, as stored: values that mark a pixel invalid stay.
 
     `scale` is units per metre; not given, a 16-bit PNG holds millimetres and float files hold metres.
@@ -67,7 +69,7 @@ def read_depth(path: Path, scale: float | None = None, read: Read = read_bytes, 
     data = read(path)
     suffix = path.suffix.lower()
     if suffix == ".png":
-        with whole_png(path, data, own, {"grey": 4, "RGBA": 16}) as png:
+        with whole_png(path, data, allowed_sizes, {"grey": 4, "RGBA": 16}) as png:
             packed = _unpacked(png.samples()) if (png.kind, png.bits) == ("RGBA", 8) else None
             if packed is None and (png.kind != "grey" or png.bits != 16):
                 raise DataError(
@@ -77,13 +79,13 @@ def read_depth(path: Path, scale: float | None = None, read: Read = read_bytes, 
             depth = png.samples() if packed is None else packed
             scale = scale or (MILLIMETRES if packed is None else 1.0)
     elif suffix in (".tiff", ".tif"):
-        depth = decode_tiff(path, data, own)
+        depth = decode_tiff(path, data, allowed_sizes)
     elif suffix == ".exr":
-        depth = decode_exr(path, data, own)
+        depth = decode_exr(path, data, allowed_sizes)
     elif suffix == ".pfm":
-        depth = decode_pfm(path, data, own)
+        depth = decode_pfm(path, data, allowed_sizes)
     else:
-        depth = decode_array(path, data, "depth", claimed_by(path, own, 4))
+        depth = decode_array(path, data, "depth", claimed_by(path, allowed_sizes, 4))
     if depth.ndim != 2 or depth.dtype.kind not in "fui":
         raise DataError(f"{path}: depth is {depth.dtype} of shape {depth.shape}; store float32 metres (H, W)")
     if scale is None and depth.dtype.kind != "f":
@@ -108,7 +110,7 @@ def read_labels(
     path: Path,
     space: LabelSpace | None = None,
     read: Read = read_bytes,
-    own: FrameSize = ANY_SIZE,
+    allowed_sizes: FrameSize = ANY_SIZE,
     void: Collection[int] = (),
 ) -> Labels:
     """Return the class ids (H, W) uint8 or uint16, in the ids of the file; RGB maps through the colours of `space`.
@@ -121,8 +123,8 @@ def read_labels(
     """
     data = read(path)
     if path.suffix.lower() != ".png":
-        return _narrow(path, decode_array(path, data, "labels", claimed_by(path, own, 4)), space, void)
-    with whole_png(path, data, own, {"grey": 1, "palette": 1, "RGB": 6, "RGBA": 8}) as png:
+        return _narrow(path, decode_array(path, data, "labels", claimed_by(path, allowed_sizes, 4)), space, void)
+    with whole_png(path, data, allowed_sizes, {"grey": 1, "palette": 1, "RGB": 6, "RGBA": 8}) as png:
         if png.kind not in ("grey", "palette") and (png.kind not in ("RGB", "RGBA") or png.bits != 8):
             raise DataError(
                 f"{path}: a {png.bits}-bit {png.kind} PNG cannot hold labels; save ids as 8- or 16-bit grey"
@@ -140,7 +142,7 @@ def read_scores(
     layout: Literal["KHW", "HWK"],
     size: Size,
     read: Read = read_bytes,
-    own: FrameSize = ANY_SIZE,
+    allowed_sizes: FrameSize = ANY_SIZE,
     classes: int | None = None,
 ) -> npt.NDArray[np.floating[Any]]:
     """Return soft scores (H, W, K) float16, float32 or float64, C-contiguous; `layout` is the file's.
@@ -161,7 +163,7 @@ def read_scores(
         (H, W), K = sizes[layout], shape[0 if layout == "KHW" else 2]
         if (classes or MOST_SCORES) < K:
             raise DataError(f"{path}: has scores of {K} classes, but there are {classes or f'at most {MOST_SCORES}'}")
-        check_pixels(path, W, H, sizes=own)
+        check_pixels(path, W, H, sizes=allowed_sizes)
         taken = math.prod(shape) * dtype.itemsize
         if sizes[layout] != size and taken > max(MAX_IMAGE_BYTES // 2, DENSEST * len(data)):
             raise DataError(
@@ -204,25 +206,25 @@ def read_features(path: Path, size: Size, read: Read = read_bytes) -> Features:
         raise DataError(f"{path}: {error}") from error
 
 
-def read_confidence(path: Path, read: Read = read_bytes, own: FrameSize = ANY_SIZE) -> UInt8 | UInt16:
+def read_confidence(path: Path, read: Read = read_bytes, allowed_sizes: FrameSize = ANY_SIZE) -> UInt8 | UInt16:
     """Return (H, W) how sure depth is, as stored.
 
     Raises:
         DataError: If it is no one-channel PNG, or damaged.
     """
-    with whole_png(path, read(path), own, {"grey": 1}) as png:
+    with whole_png(path, read(path), allowed_sizes, {"grey": 1}) as png:
         if png.kind != "grey":
             raise DataError(f"{path}: a {png.bits}-bit {png.kind} PNG is no image of confidence; export it again")
         return png.samples()
 
 
-def read_mask(path: Path, read: Read = read_bytes, own: FrameSize = ANY_SIZE) -> Mask:
+def read_mask(path: Path, read: Read = read_bytes, allowed_sizes: FrameSize = ANY_SIZE) -> Mask:
     """Return mask (H, W) bool, True where the image is 0: black is left out, as COLMAP and nerfstudio have it.
 
     Raises:
         DataError: If it is no one-channel PNG, or damaged.
     """
-    with whole_png(path, read(path), own, {"grey": 1, "palette": 1}) as png:
+    with whole_png(path, read(path), allowed_sizes, {"grey": 1, "palette": 1}) as png:
         if png.kind not in ("grey", "palette"):
             raise DataError(f"{path}: a {png.bits}-bit {png.kind} PNG is no mask; save it as grey, 0 where left out")
         mask: Mask = png.samples() == 0

@@ -46,8 +46,8 @@ def print_comparison(
         console.print(sentence, highlight=False, markup=False)
     for table in tables(comparison):
         if table.name == "comparison" or (verbose and table.name in SHOWN):
-            shown = _over_scenes(table) if briefly else table
-            fitting = _fitting(shown.only(*SHOWN[table.name]), comparison)
+            displayed = _over_scenes(table) if briefly else table
+            fitting = _fitting(displayed.only(*SHOWN[table.name]), comparison)
             text = to_terminal(dataclasses.replace(fitting, caption=""), WIDTH)
             console.print(f"\n{text}", highlight=False, markup=False, soft_wrap=True)
         if table.name == "comparison":

@@ -104,8 +104,8 @@ def _number_of_areas(comparison: RunComparison, against: Against) -> Iterator[st
             listed.append(f"{scene.scene} ({'; '.join(counts)})")
     if listed:
         more = f" and {len(listed) - MOST_SCENES} more scenes" if len(listed) > MOST_SCENES else ""
-        named = ", ".join(listed[:MOST_SCENES])
-        yield f"{against.other} has areas that got worse in {named}{more}; -v shows the largest."
+        scenes = ", ".join(listed[:MOST_SCENES])
+        yield f"{against.other} has areas that got worse in {scenes}{more}; -v shows the largest."
 
 
 KINDS: tuple[Literal["agreement", "truth"], ...] = ("agreement", "truth")

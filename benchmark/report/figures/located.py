@@ -66,12 +66,12 @@ class Located:
         axis: npt.ArrayLike,
         corner: tuple[float, float],
         size: tuple[float, float],
-        seen: Float64,
+        points: Float64,
         georeference: Georeference | None,
     ) -> Located:
         """Locate a picture from the axis towards its viewer, its corner and size, and points (n, 3) that it shows."""
         axes = np.stack(level_axes(axis))
-        away = float((seen @ axes[2]).mean()) if len(seen) else 0.0
+        away = float((points @ axes[2]).mean()) if len(points) else 0.0
         lower_left = axes.T @ np.array([*corner, away])
         linear = np.array(IDENTITY if georeference is None else georeference.linear)
         offset = np.zeros(3) if georeference is None else np.array(georeference.offset)

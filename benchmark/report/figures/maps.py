@@ -62,7 +62,7 @@ def draw_stability(above: FromAbove, georeference: Georeference | None = None) -
     for axes, letter, title in zip((kind, *panels), LETTERS, titles, strict=False):
         mark_panel(axes, letter, title)
         framed(axes)
-        locate(axes, located, rows.shape, named=axes is kind)
+        locate(axes, located, rows.shape, numbers=axes is kind)
     return figure
 
 
@@ -279,14 +279,14 @@ def scale_text(length: float) -> str:
     return f"{length:g} m" if length >= 0.1 else f"{length * 100:g} cm"
 
 
-def locate(axes: Axes, located: Located, cells: tuple[int, ...], *, named: bool = True) -> None:
+def locate(axes: Axes, located: Located, cells: tuple[int, ...], *, numbers: bool = True) -> None:
     """Draw a bar of round length, an arrow to grid north if it is known, and coordinates along two edges.
 
     Args:
         axes: The panel that shows the map.
         located: Where the map lies.
         cells: Its height and width in cells.
-        named: True if the coordinates have numbers; else they have ticks only, and the next panel has the numbers.
+        numbers: Whether the coordinates have numbers; else they have ticks only, and the next panel has the numbers.
     """
     from matplotlib.patheffects import withStroke
 
@@ -309,11 +309,11 @@ def locate(axes: Axes, located: Located, cells: tuple[int, ...], *, named: bool 
     lower, left = located.edges
     axes.set_xticks([share * W - 0.5 for share, _ in lower.ticks], [metres(value) for _, value in lower.ticks])
     axes.set_yticks([(1 - share) * H - 0.5 for share, _ in left.ticks], [metres(value) for _, value in left.ticks])
-    axes.tick_params(labelsize=5, length=2, width=0.4, color=FAINT, pad=1.5, labelbottom=named, labelleft=named)
+    axes.tick_params(labelsize=5, length=2, width=0.4, color=FAINT, pad=1.5, labelbottom=numbers, labelleft=numbers)
     axes.tick_params(axis="y", labelrotation=90)
     for label in axes.get_yticklabels():
         label.set_verticalalignment("center")
-    if named:
+    if numbers:
         axes.set_xlabel(f"{lower.name}, m ({located.system})" if lower.name else "", fontsize=5, labelpad=1)
         axes.set_ylabel(f"{left.name}, m" if left.name else "", fontsize=5, labelpad=1)
     if located.north is not None:
@@ -403,7 +403,7 @@ def draw_changes(
         _draw(figure, panel_axes, panel, rows)
         mark_panel(panel_axes, letter, f"{panel.title}, {view.partition(',')[0]}")
         framed(panel_axes)
-        locate(panel_axes, located, rows.shape, named=panel_axes is axes[0])
+        locate(panel_axes, located, rows.shape, numbers=panel_axes is axes[0])
         number_places(panel_axes, panel.numbers, panel.centres, panel.links, located, rows.shape)
     return figure
 

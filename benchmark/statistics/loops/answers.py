@@ -95,19 +95,19 @@ def project(point, depth, camera, T, noise, allowed, spot, pixel, x, y, error, r
     """
     W, z = depth.shape[1], np.empty(len(point))
     n = in_view(point, camera, T, depth.shape, spot, x, y, z)
-    shown = np.empty((5, n))
+    depths = np.empty((5, n))
     for i in range(n):
         column, row = np.int64(np.floor(x[i] + 0.5)), np.int64(np.floor(y[i] + 0.5))
         pixel[i] = row * W + column
-        shown[0, i], shown[1, i], shown[2, i], shown[3, i], shown[4, i] = depths_around(depth, row, column)
+        depths[0, i], depths[1, i], depths[2, i], depths[3, i], depths[4, i] = depths_around(depth, row, column)
     for i in range(n):
-        around = shown[0, i], shown[1, i], shown[2, i], shown[3, i], shown[4, i]
+        around = depths[0, i], depths[1, i], depths[2, i], depths[3, i], depths[4, i]
         dx, dy = x[i] - np.floor(x[i] + 0.5), y[i] - np.floor(y[i] + 0.5)
         error[i], room[i] = misfit(around, dx, dy, z[i])
     found = 0
     for i in range(n):
         row, column = pixel[i] // W, pixel[i] % W
-        here = inverse_of(shown[0, i])
+        here = inverse_of(depths[0, i])
         if here == 0.0:
             error[i], room[i] = -1.0, 1.0
         elif noise > 0.0:

@@ -63,7 +63,7 @@ def places_of_block(depth, camera, row, column, stride, per_area, chance):
 
 
 @helper
-def look_at(depth, camera, T, spacing, share, low, u, v, shown, here, cell, keys, rows):
+def look_at(depth, camera, T, spacing, share, low, u, v, depths, here, cell, keys, rows):
     """Find the inverse depth of the pixels of places, and the keys of the coarse cells that they show.
 
     Returns how many places show a cell within reach and in the sample, and writes which in `rows`. shown (5, n) and
@@ -74,15 +74,15 @@ def look_at(depth, camera, T, spacing, share, low, u, v, shown, here, cell, keys
     edge = EDGE * spacing
     for i in range(len(u)):
         around = depths_around(depth, np.int64(v[i]), np.int64(u[i]))
-        shown[0, i], shown[1, i], shown[2, i], shown[3, i], shown[4, i] = around
+        depths[0, i], depths[1, i], depths[2, i], depths[3, i], depths[4, i] = around
     for i in range(len(u)):
-        w = inverse_of(shown[0, i])
-        along_x = slope(inverse_of(shown[1, i]), w, inverse_of(shown[2, i]))
-        along_y = slope(inverse_of(shown[3, i]), w, inverse_of(shown[4, i]))
+        w = inverse_of(depths[0, i])
+        along_x = slope(inverse_of(depths[1, i]), w, inverse_of(depths[2, i]))
+        along_y = slope(inverse_of(depths[3, i]), w, inverse_of(depths[4, i]))
         dx, dy = u[i] - np.floor(u[i]) - 0.5, v[i] - np.floor(v[i]) - 0.5
-        here[i], shown[0, i] = w, max(w + along_x * dx + along_y * dy, 0.5 * w)
+        here[i], depths[0, i] = w, max(w + along_x * dx + along_y * dy, 0.5 * w)
     for i in range(len(u)):
-        z = 1.0 / (shown[0, i] if shown[0, i] > 0.0 else 1.0)
+        z = 1.0 / (depths[0, i] if depths[0, i] > 0.0 else 1.0)
         px, py, pz = in_world((u[i] - 0.5 - cx) / fx * z, (v[i] - 0.5 - cy) / fy * z, z, T)
         cell[0, i], cell[1, i] = index_from(px / edge, low[0]), index_from(py / edge, low[1])
         cell[2, i] = index_from(pz / edge, low[2])
@@ -104,11 +104,11 @@ def index_from(coordinate, low):
 
 @helper
 def add_spots(
-    depth, camera, T, allowed, spacing, share, low, table, point, hashed, n, met, u, v, shown, here, cell, keys, rows
+    depth, camera, T, allowed, spacing, share, low, table, point, hashed, n, met, u, v, depths, here, cell, keys, rows
 ):
     """Look at places, and add spots to n others; return how many spots there are, and how many cells were met."""
     fx, fy, cx, cy = camera
-    count = look_at(depth, camera, T, spacing, share, low, u, v, shown, here, cell, keys, rows)
+    count = look_at(depth, camera, T, spacing, share, low, u, v, depths, here, cell, keys, rows)
     found = 0
     for k in range(count):  # most cells were met, and are in the first slot: no branch, so memory is asked ahead
         keys[found], rows[found] = keys[k], rows[k]
@@ -138,7 +138,7 @@ def new_in_image(depth, camera, T, allowed, spacing, share, low, stride, factor,
     place lies anywhere in its pixel, so that the view that finds a spot meets it as any other view does.
     """
     surface = depth, camera, T, allowed, spacing, share, low, table, point, hashed
-    u, v, here, shown = np.empty(AT_ONCE), np.empty(AT_ONCE), np.empty(AT_ONCE), np.empty((5, AT_ONCE))
+    u, v, here, depths = np.empty(AT_ONCE), np.empty(AT_ONCE), np.empty(AT_ONCE), np.empty((5, AT_ONCE))
     cell, keys, rows = np.empty((3, AT_ONCE), np.int32), np.empty(AT_ONCE, np.int64), np.empty(AT_ONCE, np.int64)
     columns = (depth.shape[1] + stride - 1) // stride
     total = (depth.shape[0] + stride - 1) // stride * columns
@@ -156,10 +156,10 @@ def new_in_image(depth, camera, T, allowed, spacing, share, low, stride, factor,
         while places > 0:
             count, places = count + 1, places - 1
             if count == AT_ONCE:
-                n, met = add_spots(*surface, n, met, u, v, shown, here, cell, keys, rows)
+                n, met = add_spots(*surface, n, met, u, v, depths, here, cell, keys, rows)
                 count = 0
                 if met == len(hashed):
                     return n, met
             if places > 0:
                 number, u[count], v[count] = draw_place(top, left, stride, number)
-    return add_spots(*surface, n, met, u[:count], v[:count], shown, here, cell, keys, rows)
+    return add_spots(*surface, n, met, u[:count], v[:count], depths, here, cell, keys, rows)

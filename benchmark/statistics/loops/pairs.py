@@ -42,7 +42,7 @@ def add_pairs(first, second, bins, cluster, log, square, sums):
 
 
 @serial
-def add_feature_pairs(first, second, start, bins, cluster, agreed, own, along, sums):
+def add_feature_pairs(first, second, start, bins, cluster, agreed, self_products, along, sums):
     """Add pairs (m,) of observations to `sums` (bins, clusters, 5), in each of a pair's bins (m, axes).
 
     agreed (m,) is the cosine of a pair, own the squared length of each observation. along (n, bins) is its part along
@@ -55,7 +55,7 @@ def add_feature_pairs(first, second, start, bins, cluster, agreed, own, along, s
                 k = bins[pair, axis]
                 sums[k, of, 0] += agreed[pair]
                 sums[k, of, 1] += 1.0
-                sums[k, of, 2] += own[one]
+                sums[k, of, 2] += self_products[one]
                 sums[k, of, 3] += along[one - start, k]
 
 
