@@ -36,7 +36,7 @@ from semstab.report.figures.located import metres
 from semstab.report.figures.maps import Panel, draw_changes
 from semstab.report.figures.style import Figure
 from semstab.report.html import blocks, filled
-from semstab.report.tables import save_tables
+from semstab.report.tables import write_tables
 from semstab.report.tables.table import Table, relations, to_markdown
 from semstab.statistics.agreement import PSA
 from semstab.statistics.correctness import MIOU
@@ -244,7 +244,7 @@ def write(
     _require_own(folder)
     write_json(folder / CONTENT, result)
     write_text(folder / PAGE, markdown(result, made))
-    save_tables(made, folder)
+    write_tables(made, folder)
     keep_only([path for figure in figures for path in figure.save(folder / "figures")], folder / "figures")
     _write_columns(comparison, folder)
     write_text(folder / REPORT, page(result, made, figures, folder, _described(comparison, result)))

@@ -33,7 +33,7 @@ from semstab.leaderboard.definition import load_benchmark
 from semstab.recording import Recording
 from semstab.recording.timeline import path
 from semstab.report import write_report
-from semstab.report.tables import save_tables, tables
+from semstab.report.tables import tables, write_tables
 from semstab.report.terminal import print_answer
 
 CITY = {"name": "city", "options": {"frames": 14, "width": 96, "height": 54, "seed": 1}}
@@ -109,7 +109,7 @@ def test_the_screen_has_the_numbers_of_the_record(run):
     result, folder = run
     lines = screen(result).splitlines()
     if len(result.scenes) > 1:
-        save_tables(tables(result), folder.with_name("of all"))
+        write_tables(tables(result), folder.with_name("of all"))
         rows = {row["model"]: row for row in rows_of_csv(folder.with_name("of all") / "tables/overview.csv")}
         heads = next(k for k, line in enumerate(lines) if line.split()[:2] == ["all", "scenes"])
         assert lines[heads + 1].split() == ["%", "%", "OP>=3", "OP>=3", "OP>=2"]
@@ -149,7 +149,7 @@ def test_the_screen_has_the_numbers_of_the_record(run):
 
 def test_tables_have_the_numbers_of_the_record_in_csv_and_json(run, tmp_path):
     result, _ = run
-    save_tables(tables(result), tmp_path)
+    write_tables(tables(result), tmp_path)
     columns = {
         "overview": {"vss_op3": "VSS (OP>=3)", "sbd_op3": "SBD (OP>=3)"},
         "verdicts": {"alpha": "alpha"},

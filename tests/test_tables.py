@@ -33,13 +33,13 @@ from semstab.report.tables import (
     Column,
     Group,
     Table,
-    save_as,
     tables,
     to_csv,
     to_json,
     to_latex,
     to_markdown,
-    write_tables,
+    write_run_tables,
+    write_table_file,
 )
 from semstab.report.tables.table import to_terminal
 from semstab.statistics import Estimate
@@ -336,7 +336,7 @@ def test_latex_compiles_without_overfull_lines(tables_of_walls, tmp_path):
 
 def test_a_run_writes_a_dozen_tables_as_csv_and_all_of_them_as_json(walls, tmp_path):
     write_text(tmp_path / "tables/of_a_dropped_sweep.csv", "")
-    paths = write_tables(walls, tmp_path)
+    paths = write_run_tables(walls, tmp_path)
     assert sorted(paths) == sorted((tmp_path / "tables").iterdir())
     *texts, content = paths
     assert len(texts) == 12 < len(tables(walls))
@@ -352,13 +352,13 @@ def test_tables_are_written_on_demand_in_the_format_of_the_suffix(walls, tmp_pat
     made = [table_of(walls, name) for name in ("overview", "drift")]
     for suffix, write in WRITERS.items():
         path = tmp_path / f"one.{suffix}"
-        assert save_as(made[:1], path) == path
+        assert write_table_file(made[:1], path) == path
         assert path.read_text(encoding="utf-8") == write(made[0])
-    assert save_as(made, tmp_path / "both.tex").read_text().count(r"\begin{table") == 2
-    assert [*json.loads(save_as(made, tmp_path / "both.json").read_text())] == ["overview", "drift"]
+    assert write_table_file(made, tmp_path / "both.tex").read_text().count(r"\begin{table") == 2
+    assert [*json.loads(write_table_file(made, tmp_path / "both.json").read_text())] == ["overview", "drift"]
     for name, said in {"both.csv": "choose one of overview, drift", "x.xlsx": ".csv, .md, .tex, .json"}.items():
         with pytest.raises(ConfigError, match=re.escape(said)):
-            save_as(made, tmp_path / name)
+            write_table_file(made, tmp_path / name)
         assert not (tmp_path / name).exists()
 
 

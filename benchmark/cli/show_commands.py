@@ -46,7 +46,7 @@ def show(
     from semstab.data.records import is_run
     from semstab.engine.folder import load_result
     from semstab.report.comparison.own_models import own_models
-    from semstab.report.tables import save_as, tables
+    from semstab.report.tables import tables, write_table_file
     from semstab.report.tables.table import to_terminal
     from semstab.report.terminal import failure_lines, print_answer
 
@@ -79,7 +79,7 @@ def show(
         is_single = out is not None and out.suffix == ".csv" and name in matching
         chosen |= {name: matching[name]} if is_single else matching
     if out is not None and figures is None:
-        print_lines([str(save_as([*(chosen if what else by_name).values()], out))])
+        print_lines([str(write_table_file([*(chosen if what else by_name).values()], out))])
     else:
         print_lines(f"{to_terminal(table)}\n" for table in chosen.values())
 
@@ -89,7 +89,7 @@ def _show_several(
 ) -> None:
     """Print one table of several runs, and write it with its figure where that is wanted."""
     from semstab.report.figures.runs import runs_figure
-    from semstab.report.tables import FORMATS, save_as, save_tables
+    from semstab.report.tables import FORMATS, write_table_file, write_tables
     from semstab.report.tables.runs import found_runs, runs_table
     from semstab.report.tables.table import to_terminal
 
@@ -99,9 +99,9 @@ def _show_several(
     table = runs_table(results)
     print_lines([to_terminal(table)])
     if out is not None and out.suffix in FORMATS:
-        print_lines([str(save_as([table], out))])
+        print_lines([str(write_table_file([table], out))])
     elif out is not None:
-        written = save_tables([table], out)
+        written = write_tables([table], out)
         print_lines(map(str, [*written, *runs_figure(results).save(out, svg=figures is FigureFormat.svg)]))
 
 

@@ -19,7 +19,7 @@ from semstab.report.figures.located import Located
 from semstab.report.figures.maps import draw_kinds, framed, locate, map_panels, number_places
 from semstab.report.figures.style import LETTERS, Figure, mark_panel
 from semstab.report.figures.topdown import best_view_of
-from semstab.report.tables import save_tables
+from semstab.report.tables import write_tables
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure as Canvas
@@ -46,7 +46,7 @@ def write(comparison: MapComparison, out: Path) -> list[Path]:
     """Write OUT/tables, OUT/places.csv and .geojson, OUT/figures and OUT/recording.rrd; return the paths."""
     from semstab.recording.other_maps import Colored, record_maps
 
-    written = [*save_tables(tables(comparison.agreements, comparison.run.name), out), *_write_places(comparison, out)]
+    written = [*write_tables(tables(comparison.agreements, comparison.run.name), out), *_write_places(comparison, out)]
     figure_paths = [path for figure in pictures(comparison) for path in figure.save(out / FIGURES)]
     keep_only(figure_paths, out / FIGURES)
     unions = {voxelwise.agreement.name: voxelwise.laid_together(comparison.run) for voxelwise in comparison.maps}

@@ -15,7 +15,7 @@ from semstab.core.background import Background
 from semstab.core.files import write_text
 from semstab.data.records import Record, RegionFlicker, Result
 from semstab.engine.observer import Observer
-from semstab.report.tables import write_tables
+from semstab.report.tables import write_run_tables
 
 if TYPE_CHECKING:
     from semstab.backends import FusionBackend
@@ -62,7 +62,7 @@ class Reporting(Observer):
                 if digest_of(self._folder) in page.read(HEAD):
                     return
         if result.select():
-            write_tables(result, self._folder)
+            write_run_tables(result, self._folder)
             write_report(result, self._folder, {unit: future.result() for unit, future in self._shown.items()})
 
 

@@ -19,7 +19,7 @@ from semstab.report.figures.maps import draw_kinds, framed, locate, map_panels, 
 from semstab.report.figures.style import Figure, mark_panel
 from semstab.report.figures.topdown import best_view_of
 from semstab.report.html import blocks, filled
-from semstab.report.tables import save_tables
+from semstab.report.tables import write_tables
 from semstab.report.tables.table import Table, relations
 from semstab.statistics.visits import GONE, MOVED, NEW, STAYED, VisitedSpots
 from semstab.two_visits.tables import notes, sentences, tables
@@ -52,7 +52,7 @@ def write(comparison: VisitComparison, visited: Mapping[str, Visited], out: Path
     """Write visits.json, tables, the map of each scene, and report.html."""
     made, figures = tables(comparison), pictures(comparison, visited)
     write_json(out / CONTENT, comparison)
-    save_tables(made, out)
+    write_tables(made, out)
     keep_only([path for figure in figures for path in figure.save(out / FIGURES)], out / FIGURES)
     write_text(out / REPORT, page(comparison, made, figures, out))
 

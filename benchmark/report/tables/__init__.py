@@ -38,13 +38,13 @@ __all__ = [
     "Column",
     "Group",
     "Table",
-    "save_as",
-    "save_tables",
     "tables",
     "to_csv",
     "to_json",
     "to_latex",
     "to_markdown",
+    "write_run_tables",
+    "write_table_file",
     "write_tables",
 ]
 
@@ -83,24 +83,24 @@ def tables(result: Result) -> list[Table]:
     return [dataclasses.replace(table, caption=table.caption + words, benchmark=result.benchmark) for table in made]
 
 
-def write_tables(result: Result, folder: str | Path) -> list[Path]:
-    """Write the tables that users of a run open, at most MOST_WRITTEN, as `save_tables` does; return the paths."""
+def write_run_tables(result: Result, folder: str | Path) -> list[Path]:
+    """Write the tables that users of a run open, at most MOST_WRITTEN, as `write_tables` does; return the paths."""
     made = tables(result)
     selected = dict.fromkeys(table.name for name in WRITTEN for table in made if table.name.startswith(name))
     names = [*selected][:MOST_WRITTEN]
-    return save_tables([table for table in made if table.name in names], folder)
+    return write_tables([table for table in made if table.name in names], folder)
 
 
-def save_tables(made: Sequence[Table], folder: str | Path) -> list[Path]:
+def write_tables(made: Sequence[Table], folder: str | Path) -> list[Path]:
     """Write FOLDER/tables/NAME.csv of each table, and tables.json with all; remove other tables; return the paths."""
     target = Path(folder) / "tables"
-    written = [save_as([table], target / f"{table.name}.csv") for table in made]
-    written.append(save_as(made, target / "tables.json"))
+    written = [write_table_file([table], target / f"{table.name}.csv") for table in made]
+    written.append(write_table_file(made, target / "tables.json"))
     keep_only(written, target)
     return written
 
 
-def save_as(made: Sequence[Table], path: Path) -> Path:
+def write_table_file(made: Sequence[Table], path: Path) -> Path:
     """Write tables into one file, in the format of its suffix: .csv (one table), .json (by name), .md, .tex.
 
     Raises:
