@@ -87,8 +87,8 @@ def views(scene: Scene, frames: int) -> tuple[list[semstab.Frame], float, float]
     caster, made = _caster(scene), []
     for index in range(frames):
         made.append(_view(scene, caster, index))
-    seen = made[0].depth[made[0].depth > 0]
-    middle = float(np.median(seen)) if len(seen) else 1.0
+    depths = made[0].depth[made[0].depth > 0]
+    middle = float(np.median(depths)) if len(depths) else 1.0
     return made, float(f"{scene.pixels_a_voxel * middle / made[0].intrinsics.fx:.2g}"), middle
 
 

@@ -35,7 +35,7 @@ def of(stage: str) -> dict[str, float]:
 @contextlib.contextmanager
 def watched(self: Stopwatch, stage: str) -> Iterator[Any]:
     """A stage of the stopwatch, of which CPU time is noted as well."""
-    own, everything = time.thread_time(), time.process_time()
+    thread_began, everything = time.thread_time(), time.process_time()
     inside.append(stage)
     note(stage)
     try:
@@ -45,7 +45,7 @@ def watched(self: Stopwatch, stage: str) -> Iterator[Any]:
         inside.pop()
         note(stage)
         now = of(stage)
-        now["own_s"] += time.thread_time() - own
+        now["own_s"] += time.thread_time() - thread_began
         now["all_s"] += time.process_time() - everything
 
 
@@ -72,6 +72,8 @@ if __name__ == "__main__":
         main()
     finally:
         most = resource.getrusage(resource.RUSAGE_CHILDREN).ru_maxrss * 1024
-        (own,) = re.findall(r"VmHWM:\s+(\d+) kB", Path("/proc/self/status").read_text())  # ru_maxrss has the parent's
-        of("all")["peak_gb"] = max(most, int(own) * 1024) / 1e9
+        (most_resident,) = re.findall(
+            r"VmHWM:\s+(\d+) kB", Path("/proc/self/status").read_text()
+        )  # ru_maxrss has the parent's
+        of("all")["peak_gb"] = max(most, int(most_resident) * 1024) / 1e9
         file.write_text(json.dumps(found))

@@ -46,9 +46,9 @@ def write_hashes(file: Path, data: Path | None) -> None:
 
 def write_geometry(file: Path, data: Path | None) -> None:
     """Write the spots of the scenes next to a definition."""
-    own = load_benchmark(file)
-    own.require_data(data)
-    save_geometry(geometry_file(file), own.geometry_of(data), own.data_digest)
+    benchmark = load_benchmark(file)
+    benchmark.require_data(data)
+    save_geometry(geometry_file(file), benchmark.geometry_of(data), benchmark.data_digest)
 
 
 if __name__ == "__main__":

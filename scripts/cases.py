@@ -57,7 +57,7 @@ def parser_of(main: Callable[..., Any], program: str, about: str) -> argparse.Ar
     for name, parameter in inspect.signature(main, eval_str=True).parameters.items():
         kind, options = parameter.annotation, {}
         if get_origin(kind) in (Union, types.UnionType):
-            (kind,) = (each for each in get_args(kind) if each is not types.NoneType)
+            (kind,) = (part for part in get_args(kind) if part is not types.NoneType)
         several = get_origin(kind) is tuple
         kind = get_args(kind)[0] if several else kind
         if get_origin(kind) is Literal:

@@ -27,8 +27,8 @@ def main() -> None:
         alone = every - fresh.needed(set(base) - {name})
         rows.append((sum(map(megabytes, alone)), megabytes(name), len(alone), name))
     print(f"{sum(map(megabytes, every)):.0f} MB in {len(every)} packages\n   own  saved  packages")
-    for saved, own, packages, name in sorted(rows, reverse=True):
-        print(f"{own:6.1f} {saved:6.1f} {packages:9}  {name}")
+    for saved, megabytes_alone, packages, name in sorted(rows, reverse=True):
+        print(f"{megabytes_alone:6.1f} {saved:6.1f} {packages:9}  {name}")
 
 
 if __name__ == "__main__":

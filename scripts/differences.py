@@ -96,7 +96,7 @@ class Comparison:
         """Columns by name, arrays or lists of text; tolerance 0: bit by bit."""
         folder, stem = Path(where).parent.name, Path(where).stem
         for key, name in self.names(a, b, folder if folder in FOLDERS else stem, "columns").items():
-            x, y = (np.asarray(each) for each in (a[key], b.get(name, [])))
+            x, y = (np.asarray(column) for column in (a[key], b.get(name, [])))
             if name not in b or x.shape != y.shape or (x.dtype != y.dtype and x.dtype.kind in "fiub"):
                 self.differ(
                     f"{where}: {name}", f"{x.dtype} {x.shape}", f"{y.dtype} {y.shape}" if name in b else "missing"
@@ -149,7 +149,7 @@ class Comparison:
 def listing(folder: Path) -> dict[str, Path]:
     """Files to be compared by their names; the tiles of a voxel table are one table, as one file is."""
     files: dict[str, Path] = {}
-    for path in sorted(each for each in folder.rglob("*") if each.is_file()):
+    for path in sorted(entry for entry in folder.rglob("*") if entry.is_file()):
         tiled = path.name.startswith("tile=")
         where = path.relative_to(folder).as_posix()
         name = f"{Path(where).parent.as_posix()}.parquet" if tiled else where

@@ -46,11 +46,11 @@ def cells(notebook: str) -> Iterator[str]:
         source = "".join(cell["source"])
         yield source if cell["cell_type"] == "markdown" else f"```python\n{source}\n```"
         for output in cell.get("outputs", ()):
-            shown = output.get("data", {})
+            formats = output.get("data", {})
             if "text" in output:
                 yield f"```text\n{''.join(output['text'])}\n```"
-            elif "text/html" in shown or "text/markdown" in shown:
-                yield "".join(shown.get("text/html", shown.get("text/markdown")))
+            elif "text/html" in formats or "text/markdown" in formats:
+                yield "".join(formats.get("text/html", formats.get("text/markdown")))
 
 
 def _cell(text: str | None) -> str:

@@ -67,8 +67,8 @@ def observed(rng: np.random.Generator) -> tuple[float, float]:
 
     labels, K = labels_of(rng, all_seen=True, raters=2)
     a, b = (np.bincount(rater, minlength=K) / len(labels) for rater in labels.T)
-    chance, own = float(a @ b), float(psa(log_of(labels, K).table()).mean())
-    return (own - chance) / (1 - chance), float(cohen_kappa_score(*labels.T))
+    chance, agreement = float(a @ b), float(psa(log_of(labels, K).table()).mean())
+    return (agreement - chance) / (1 - chance), float(cohen_kappa_score(*labels.T))
 
 
 def beliefs(rng: np.random.Generator) -> tuple[Array, Labels]:
@@ -126,9 +126,9 @@ def rows(cases: int, seed: int) -> Iterator[list[str]]:
     for row, (name, package, function, measure) in enumerate(MEASURES):
         rng, largest = np.random.default_rng([seed, row]), 0.0
         for _ in range(cases):
-            own, other = measure(rng)
-            assert math.isnan(own) == math.isnan(other)
-            largest = max(largest, abs(own - other)) if not math.isnan(own) else largest
+            ours, other = measure(rng)
+            assert math.isnan(ours) == math.isnan(other)
+            largest = max(largest, abs(ours - other)) if not math.isnan(ours) else largest
         version = importlib.metadata.version(package)
         yield [name, f"{package} {version}, {function}", f"{cases}", f"{largest:.1e}"]
 

@@ -148,10 +148,10 @@ class Use:
 def predicting(model: str, predictor: str, *more: str, over: str = "") -> Use:
     """Return a run with labels of a tiny model."""
     command = ("-m", "semstab", *SCENE, "--predict", predictor, *more, "--out", "OUT")
-    shown = f"`--predict {predictor.partition(',points')[0]}`, a tiny model"
+    title = f"`--predict {predictor.partition(',points')[0]}`, a tiny model"
     prepare = {"onnx": NETWORK, "smp": SMP, "tflite": TFLITE}.get(model, TINY)
     prepare = prepare.format(tests=str(fresh.SOURCE / "tests"), model=model) if prepare in (TINY, TFLITE) else prepare
-    return Use(shown, (command,), "verdict", prepare=prepare, over=over)
+    return Use(title, (command,), "verdict", prepare=prepare, over=over)
 
 
 SAM = "points_per_side=4,pred_iou=0.5,stability=0.3,stability_offset=0.01,nms_iou=0.95,min_area=20"
@@ -238,7 +238,7 @@ class Fresh:
     def with_extra(self, name: str) -> Path:
         """Return the Python of the base install with one extra, made by hard links, which pip never writes through."""
         extras = fresh.setup()["options.extras_require"]
-        first = next(each for each in extras if extras[each] == extras[name])
+        first = next(extra for extra in extras if extras[extra] == extras[name])
         venv = self.folder / f"venv-{first}"
         if not venv.exists():
             shutil.copytree(self.folder / "venv-base", venv, symlinks=True, copy_function=os.link)
@@ -264,7 +264,7 @@ def try_extra(name: str, there: Fresh) -> str:
     use, folder = USES[name], there.folder
     python, without = there.with_extra(name), there.with_extra(use.over) if use.over else there.base
     before, after = fresh.sizes(there.base), fresh.sizes(python)
-    if changed := {each for each in before if after.get(each) != before[each]}:
+    if changed := {package for package in before if after.get(package) != before[package]}:
         print(f"note: {name} changes {', '.join(sorted(changed))}", file=sys.stderr)
     for file, text in use.files:
         (folder / file).write_text(text)
@@ -284,7 +284,7 @@ def try_extra(name: str, there: Fresh) -> str:
         if len(errors) != 1 or f"pip install 'semstab[{name}]'" not in errors[0]:
             raise SystemExit(f"{name}: without it, {' '.join(command)} says\n{done.stderr}")
     added = set(after) - set(before)
-    cost = f"{len(added)}, {sum(after[each] for each in added) / 1e6:,.0f} MB"
+    cost = f"{len(added)}, {sum(after[package] for package in added) / 1e6:,.0f} MB"
     return f"| `{name}` | {use.shown} | works | {cost} | {seconds:.0f} |"
 
 
@@ -294,7 +294,7 @@ def main() -> None:
     parser.add_argument("extras", nargs="*", metavar="EXTRA", help="all of setup.cfg by default, but dev")
     parser.add_argument("--constraint", action="append", default=[], help="for pip, such as torch==2.13.0; repeatable")
     options = parser.parse_args()
-    names = options.extras or [each for each in fresh.setup()["options.extras_require"] if each != "dev"]
+    names = options.extras or [extra for extra in fresh.setup()["options.extras_require"] if extra != "dev"]
     if unknown := [name for name in names if name not in USES]:
         raise SystemExit(f"not known what it is for: {', '.join(unknown)}; say it in USES")
     with tempfile.TemporaryDirectory() as place:

@@ -103,25 +103,28 @@ def _write_vocabulary(edgenets: Path, network: str, scale: float, model: str, ou
 
 
 def _row(data: str, scene: str, network: str, of: Mapping[tuple[str, str], Record]) -> dict[str, Any]:
-    own, classes, groups = (of[scene, f"{network}{end}"].statistics for end in ("", "@classes", "@groups"))
-    assert own is not None
-    assert own.features is not None
+    statistics, classes, groups = (of[scene, f"{network}{end}"].statistics for end in ("", "@classes", "@groups"))
+    assert statistics is not None
+    assert statistics.features is not None
     assert classes is not None
     assert groups is not None
-    features, kept = own.features, own.groupings and (own.groupings.stable or own.groupings.usable)
+    features, groupings = (
+        statistics.features,
+        statistics.groupings and (statistics.groupings.stable or statistics.groupings.usable),
+    )
     return {
         "data": data, "street": scene, "network": network, "family": network.partition("-")[0],
         "spots": features.spots, "components": features.components,
         **_interval("feature_alpha", features.alpha), "cosine": features.cosine, "chance": features.chance,
-        **_interval("alpha", own.headline.alpha),
+        **_interval("alpha", statistics.headline.alpha),
         "classes": classes.headline.alpha.value,
         "meaning": classes.spots.meaning.alpha.value if classes.spots and classes.spots.meaning else math.nan,
         **_interval("groups", groups.headline.alpha),
         "named": groups.groupings.classes if groups.groupings else 1,
-        "verdict": own.verdict.level,
-        "level": kept.level if kept else "", "kept": kept.groups if kept else math.nan,
-        "classes_seen": own.groupings.classes if own.groupings else 1,
-        "effective": kept.effective if kept else math.nan, "merged": kept.text if kept else "",
+        "verdict": statistics.verdict.level,
+        "level": groupings.level if groupings else "", "kept": groupings.groups if groupings else math.nan,
+        "classes_seen": statistics.groupings.classes if statistics.groupings else 1,
+        "effective": groupings.effective if groupings else math.nan, "merged": groupings.text if groupings else "",
     }  # fmt: skip
 
 
@@ -151,11 +154,11 @@ Rows = Sequence[Mapping[str, Any]]
 
 def tables(rows: Rows, accuracy: Mapping[tuple[str, str], Mapping[str, Any]]) -> dict[str, list[str]]:
     """Return the lines of each table, by its title."""
-    room = [each for each in rows if each["data"] == "livingroom"]
+    room = [numbers for numbers in rows if numbers["data"] == "livingroom"]
     of_streets = [
-        {**each, **{name: accuracy[each["network"], each["street"]][name] for name in ("accuracy", "miou")}}
-        for each in rows
-        if each["data"] == "streets"
+        {**numbers, **{name: accuracy[numbers["network"], numbers["street"]][name] for name in ("accuracy", "miou")}}
+        for numbers in rows
+        if numbers["data"] == "streets"
     ]
     grid = Grid(of_streets)
     return {
@@ -174,14 +177,14 @@ COLUMNS = {"feature_alpha": "features", "alpha": "labels", "meaning": "by meanin
 def room_table(rows: Rows) -> list[str]:
     """Return the networks of the room, with intervals."""
     lines = head(["network", *COLUMNS.values()])
-    for each in rows:
-        cells = [_with_ends(each, name) if name.endswith("alpha") else plain(each[name]) for name in COLUMNS]
-        lines.append(row([each["network"], *cells]))
+    for numbers in rows:
+        cells = [_with_ends(numbers, name) if name.endswith("alpha") else plain(numbers[name]) for name in COLUMNS]
+        lines.append(row([numbers["network"], *cells]))
     return lines
 
 
-def _with_ends(each: Mapping[str, Any], name: str) -> str:
-    return f"{plain(each[name])} ({plain(each[f'{name}_low'])} to {plain(each[f'{name}_high'])})"
+def _with_ends(numbers: Mapping[str, Any], name: str) -> str:
+    return f"{plain(numbers[name])} ({plain(numbers[f'{name}_low'])} to {plain(numbers[f'{name}_high'])})"
 
 
 def streets_table(grid: Grid) -> list[str]:
@@ -231,23 +234,27 @@ def _text(found: tuple[float, float, float]) -> str:
 def kept_table(rows: Rows) -> list[str]:
     """Return the finest groups of classes on which views agree, by network of the room."""
     lines = head(["network", "labels", "verdict", "groups that hold", "merged"])
-    for each in rows:
-        holds = f"{each['level']}: {each['kept']:.0f} of {each['classes_seen']:.0f}" if each["level"] else "-"
-        lines.append(row([each["network"], plain(each["alpha"]), each["verdict"], holds, each["merged"] or "-"]))
+    for numbers in rows:
+        holds = (
+            f"{numbers['level']}: {numbers['kept']:.0f} of {numbers['classes_seen']:.0f}" if numbers["level"] else "-"
+        )
+        lines.append(
+            row([numbers["network"], plain(numbers["alpha"]), numbers["verdict"], holds, numbers["merged"] or "-"])
+        )
     return lines
 
 
 def kept_on_streets(rows: Rows) -> list[str]:
     """Return on how many streets all classes hold, or groups of them, and which classes are merged most often."""
     lines = head(["network", "labels", "all classes", "stable groups", "usable groups", "neither", "merged most often"])
-    for network in dict.fromkeys(each["network"] for each in rows):
-        of_network = [each for each in rows if each["network"] == network]
-        levels = ["all" if each["verdict"] == "stable" else each["level"] for each in of_network]
-        merged = Counter(group for each in of_network for group in filter(None, each["merged"].split(", ")))
+    for network in dict.fromkeys(numbers["network"] for numbers in rows):
+        of_network = [numbers for numbers in rows if numbers["network"] == network]
+        levels = ["all" if numbers["verdict"] == "stable" else numbers["level"] for numbers in of_network]
+        merged = Counter(group for numbers in of_network for group in filter(None, numbers["merged"].split(", ")))
         often = ", ".join(
             f"{group} ({n})" for group, n in sorted(merged.items(), key=lambda item: (-item[1], item))[:1]
         )
-        alpha = float(np.nanmean([each["alpha"] for each in of_network]))
+        alpha = float(np.nanmean([numbers["alpha"] for numbers in of_network]))
         counts = (str(levels.count(level)) for level in ("all", "stable", "usable", ""))
         lines.append(row([network, plain(alpha), *counts, often or "-"]))
     return lines

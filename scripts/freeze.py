@@ -223,10 +223,10 @@ def write_inputs(root: Path, tree: Path, inputs: Path) -> None:
 # --- The command ------------------------------------------------------------------------------------------------------
 
 
-def compare_case(case: Case, kept: Path, out: Path) -> tuple[bool, str]:
+def compare_case(case: Case, reference: Path, out: Path) -> tuple[bool, str]:
     """Return whether the outputs are equal, and the line of the case with the differences."""
     comparison = Comparison()
-    comparison.folders(kept, out)
+    comparison.folders(reference, out)
     if case.same:
         first, second = (listing(out / run) for run in case.same)
         tables = [name for name in first if name.startswith(("voxels/", "truth/"))]
@@ -239,10 +239,10 @@ def compare_case(case: Case, kept: Path, out: Path) -> tuple[bool, str]:
     text = f", {comparison.files} files"
     text += "".join(f", {count} new {what}" for what, count in comparison.new.items() if count)
     text += f"\n        verdicts: {', '.join(comparison.verdicts)}" if comparison.verdicts else ""
-    shown = comparison.differences[:SHOWN]
-    if more := len(comparison.differences) - len(shown):
-        shown.append(f"and {more} more" if more > 0 else "")
-    return not comparison.differences, text + "".join(f"\n    {line}" for line in shown)
+    differences = comparison.differences[:SHOWN]
+    if more := len(comparison.differences) - len(differences):
+        differences.append(f"and {more} more" if more > 0 else "")
+    return not comparison.differences, text + "".join(f"\n    {line}" for line in differences)
 
 
 def main() -> int:
@@ -271,12 +271,12 @@ def main() -> int:
     label = "kept" if keeps else f"now/{source.name}-{hashlib.sha256(str(source).encode()).hexdigest()[:8]}"
 
     def one(case: Case) -> tuple[bool, str]:
-        began, out, kept = time.monotonic(), folder / label / case.name, folder / "kept" / case.name
-        if not keeps and not (kept / "exit_codes").exists():
+        began, out, reference = time.monotonic(), folder / label / case.name, folder / "kept" / case.name
+        if not keeps and not (reference / "exit_codes").exists():
             return False, "was not kept"
         if error := run_case(case, tree, out, places):
             return False, error
-        good, text = (True, "") if keeps else compare_case(case, kept, out)
+        good, text = (True, "") if keeps else compare_case(case, reference, out)
         if good and not keeps:
             shutil.rmtree(out)
         return good, f"{time.monotonic() - began:5.1f} s{text}"

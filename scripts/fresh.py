@@ -88,9 +88,9 @@ def needed(names: Iterable[str]) -> set[str]:
         except metadata.PackageNotFoundError:
             continue
         found.add((name, extra))
-        for each in requirements:
-            if each.marker is None or each.marker.evaluate({"extra": extra}):
-                waiting += [(key(each.name), own) for own in ("", *each.extras)]
+        for requirement in requirements:
+            if requirement.marker is None or requirement.marker.evaluate({"extra": extra}):
+                waiting += [(key(requirement.name), extra_name) for extra_name in ("", *requirement.extras)]
     return {name for name, _ in found}
 
 

@@ -65,16 +65,16 @@ class Text:
 
 def python_texts(source: str) -> Iterator[Text]:
     """Yield docstrings, attribute docstrings, other texts with a space, and comments."""
-    tree, seen = ast.parse(source), set()
+    tree, docstrings = ast.parse(source), set()
     for node in ast.walk(tree):
         if isinstance(node, ast.Expr) and isinstance(node.value, ast.Constant) and isinstance(node.value.value, str):
-            seen.add(id(node.value))
+            docstrings.add(id(node.value))
             content = node.value.value
             if node is tree.body[0]:
                 content = INDENTED.sub(lambda found: "\n" * found.group().count("\n"), content)
             yield Text(node.lineno, content, docstring=True)
     for node in ast.walk(tree):
-        text = node.value if isinstance(node, ast.Constant) and id(node) not in seen else None
+        text = node.value if isinstance(node, ast.Constant) and id(node) not in docstrings else None
         if isinstance(text, str) and " " in text and not is_code(text):
             yield Text(node.lineno, text)
     for token in tokenize.generate_tokens(io.StringIO(source).readline):
@@ -159,11 +159,11 @@ def files() -> list[str]:
 def main(names: list[str]) -> int:
     """Print findings by file, and their number by rule; return the exit code."""
     found = sorted(
-        {each for name in names or files() for each in findings(name, (ROOT / name).read_text(encoding="utf-8"))}
+        {finding for name in names or files() for finding in findings(name, (ROOT / name).read_text(encoding="utf-8"))}
     )
-    for each in found:
-        print(f"{each.file}:{each.line}: {each.rule}: ...{each.text}...")
-    for rule, count in Counter(each.rule for each in found).most_common():
+    for finding in found:
+        print(f"{finding.file}:{finding.line}: {finding.rule}: ...{finding.text}...")
+    for rule, count in Counter(finding.rule for finding in found).most_common():
         print(f"{count:6}  {rule}", file=sys.stderr)
     return 1 if found else 0
 

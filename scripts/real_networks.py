@@ -268,9 +268,11 @@ def run(folders: Folders, results: Path, only: Sequence[str]) -> None:
     Raises:
         StudyError: For names that no condition has, or a command that fails.
     """
-    chosen = [each for each in CONDITIONS if not only or any(each.name.startswith(name) for name in only)]
+    chosen = [
+        condition for condition in CONDITIONS if not only or any(condition.name.startswith(name) for name in only)
+    ]
     if not chosen:
-        raise StudyError(f"--only {' '.join(only)}: there is {', '.join(each.name for each in CONDITIONS)}")
+        raise StudyError(f"--only {' '.join(only)}: there is {', '.join(condition.name for condition in CONDITIONS)}")
     predicted: set[str] = set()
     for condition in chosen:
         scene = condition.scene
@@ -351,7 +353,7 @@ def keep(
 ) -> None:  # fmt: skip
     """Put a condition into both files of results, instead of what they had of it."""
     *predictions, command = commands
-    order = {each.name: k for k, each in enumerate(CONDITIONS)}
+    order = {condition.name: k for k, condition in enumerate(CONDITIONS)}
     there = [row for row in load(results) if row.condition != condition.name] if (results / CSV).exists() else []
     table = sorted([*there, *rows], key=lambda row: order[row.condition])
     with atomic_path(results / CSV) as path, path.open("w", newline="", encoding="utf-8") as file:
@@ -366,7 +368,7 @@ def keep(
         "command": command,
     }
     content["predictions"][condition.scene] = list(predictions)
-    content["weights"] |= {each.weights.name: digest(each.weights) for each in nets}
+    content["weights"] |= {condition.weights.name: digest(condition.weights) for condition in nets}
     content["wrapper"] = {"nets.py": digest(folders.networks / "nets.py")}
     content["sequences"][condition.scene] = {
         path.name: digest(path)
@@ -374,8 +376,8 @@ def keep(
         if path.name in ("color", "depth", "pose", "intrinsics.txt", "scene.yaml")
     }
     content["correlations"] = correlations(load(results))
-    ordered = {each.name: content["conditions"].get(each.name) for each in CONDITIONS}
-    content["conditions"] = {name: each for name, each in ordered.items() if each is not None}
+    ordered = {condition.name: content["conditions"].get(condition.name) for condition in CONDITIONS}
+    content["conditions"] = {name: condition for name, condition in ordered.items() if condition is not None}
     with atomic_path(results / JSON) as path:
         path.write_text(json.dumps(content, indent=1) + "\n", encoding="utf-8")
 
@@ -457,8 +459,8 @@ def _rank_correlation(x: Any, y: Any, axis: int = -1) -> Any:
     """Return Pearson's correlation of ranks, with the mean rank for ties, or NaN if all values are tied."""
     from scipy.stats import rankdata
 
-    x, y = (rankdata(each, axis=axis) for each in (x, y))
-    x, y = (each - each.mean(axis=axis, keepdims=True) for each in (x, y))
+    x, y = (rankdata(values, axis=axis) for values in (x, y))
+    x, y = (values - values.mean(axis=axis, keepdims=True) for values in (x, y))
     scale = np.sqrt((x**2).sum(axis=axis) * (y**2).sum(axis=axis))
     return np.divide((x * y).sum(axis=axis), scale, out=np.full(np.shape(scale), np.nan), where=scale > 0)
 
@@ -483,9 +485,13 @@ def condition_table(rows: Sequence[Row]) -> list[str]:
         title = one.scene + (", scores" if one.kind == "scores" else "")
         cells = []
         for measure in MEASURES:
-            each = found[measure]
-            ends = "" if each["rho"] is None else f" ({signed(each['low'])} to {signed(each['high'])})"
-            cells.append(signed(each["rho"]) + ends)
+            correlation = found[measure]
+            ends = (
+                ""
+                if correlation["rho"] is None
+                else f" ({signed(correlation['low'])} to {signed(correlation['high'])})"
+            )
+            cells.append(signed(correlation["rho"]) + ends)
         of = [found[measure]["networks"] for measure in MEASURES]
         count = f"{of[1]}" if of[0] == of[1] else f"{of[1]}, alpha {of[0]}"
         lines.append(f"| {title} | {one.voxel_size:g} | {one.frames} | {count} | " + " | ".join(cells) + " |")
@@ -518,21 +524,21 @@ def draw(rows: Sequence[Row], file: Path, condition: str = MAIN) -> None:
     from matplotlib.figure import Figure
     from matplotlib.lines import Line2D
 
-    shown = [row for row in rows if row.condition == condition]
+    selected = [row for row in rows if row.condition == condition]
     grey: dict[str, Any] = {"color": "#555555", "linestyle": "none"}
     marks = [
         Line2D([], [], color=color, marker=marker, linestyle="none", label=title)
         for color, marker, _, title in FAMILIES.values()
     ]
     marks.append(Line2D([], [], marker="o", markerfacecolor="white", label="uninformative", **grey))
-    if any(math.isnan(row.alpha) for row in shown):
+    if any(math.isnan(row.alpha) for row in selected):
         marks.append(Line2D([], [], marker="x", label="no alpha: one class", **grey))
     with mpl.rc_context({"font.size": 10, "axes.spines.top": False, "axes.spines.right": False}):
         figure = Figure(figsize=(7, 3.3), layout="constrained")
         left, right = figure.subplots(1, 2)
-        _panel(left, shown, "vss")
+        _panel(left, selected, "vss")
         left.set_ylabel("mean VSS, OP >= 3")
-        _panel(right, shown, "alpha")
+        _panel(right, selected, "alpha")
         right.set_ylabel("alpha")
         right.set_ylim(top=1.02)
         right.axhline(USABLE, color="#555555", linewidth=0.8, linestyle="--")
@@ -555,9 +561,9 @@ def _panel(axes: Axes, rows: Sequence[Row], measure: str) -> None:
         face = "white" if row.verdict == "uninformative" else color
         bars = None if math.isnan(low) else [[max(value - low, 0)], [max(high - value, 0)]]
         axes.errorbar(x, value, bars, fmt=marker, color=color, markerfacecolor=face, elinewidth=1, capsize=2)
-    each = with_miou(rows)[measure]
-    ends = f"95 % {signed(each['low'])} to {signed(each['high'])}, {each['networks']} networks"
-    axes.set_title(f"{TITLES[measure]}: rank correlation {signed(each['rho'])}\n({ends})", fontsize=10)
+    correlation = with_miou(rows)[measure]
+    ends = f"95 % {signed(correlation['low'])} to {signed(correlation['high'])}, {correlation['networks']} networks"
+    axes.set_title(f"{TITLES[measure]}: rank correlation {signed(correlation['rho'])}\n({ends})", fontsize=10)
     axes.set_xlabel("published mIoU on PASCAL VOC, %")
     axes.grid(color="#dddddd", linewidth=0.5)
     axes.set_axisbelow(True)
@@ -575,11 +581,12 @@ def show(results: Path, file: Path) -> None:
     for name in dict.fromkeys(row.condition for row in rows):
         print(*network_table(rows, name), "", sep="\n")
     print(*condition_table(rows), "", sep="\n")
-    for each in correlations(rows):
-        if each["measure"] in PARTS or (each["of"], each["against"]) != ("all", "published_miou"):
-            ends = f"({signed(each['low'])} to {signed(each['high'])})"
-            pair = f"{each['measure']} with {each['against']}"
-            print(f"{each['condition']:27}{pair:34}{signed(each['rho']):6}{ends:18}{each['networks']} {each['of']}")
+    for correlation in correlations(rows):
+        if correlation["measure"] in PARTS or (correlation["of"], correlation["against"]) != ("all", "published_miou"):
+            ends = f"({signed(correlation['low'])} to {signed(correlation['high'])})"
+            pair = f"{correlation['measure']} with {correlation['against']}"
+            count = f"{correlation['networks']} {correlation['of']}"
+            print(f"{correlation['condition']:27}{pair:34}{signed(correlation['rho']):6}{ends:18}{count}")
     if any(row.condition == MAIN for row in rows):
         draw(rows, file)
 

@@ -41,19 +41,19 @@ def commands() -> Iterator[str]:
     from semstab.cli import EXAMPLES, app
 
     yield "# Command line\n\nMade from the commands themselves; `semstab-bench COMMAND --help` prints the same.\n"
-    known: Any = typer.main.get_command(app)
-    shown = {name: command for name, command in known.commands.items() if not command.hidden}
-    yield " · ".join(f"[{name}](#semstab-bench-{name})" for name in shown) + "\n"
-    for name, command in shown.items():
+    group: Any = typer.main.get_command(app)
+    visible = {name: command for name, command in group.commands.items() if not command.hidden}
+    yield " · ".join(f"[{name}](#semstab-bench-{name})" for name in visible) + "\n"
+    for name, command in visible.items():
         yield f"## semstab-bench {name}\n\n{inspect.cleandoc(command.help or '')}\n"
         yield "".join(f"    semstab-bench {line}\n" for line in EXAMPLES[name])
         panels: dict[str, list[Any]] = {}
         for parameter in command.params:
             if not getattr(parameter, "hidden", False):
                 panels.setdefault(getattr(parameter, "rich_help_panel", None) or "Options", []).append(parameter)
-        for panel, own in panels.items():
+        for panel, parameters in panels.items():
             yield f"**{panel}**\n\n| | |\n| --- | --- |"
-            yield from (f"| {_option(parameter)} | {_cell(parameter.help)} |" for parameter in own)
+            yield from (f"| {_option(parameter)} | {_cell(parameter.help)} |" for parameter in parameters)
             yield ""
 
 
@@ -92,7 +92,7 @@ def _section(name: str, value: Any) -> Iterator[str]:
     for section in parsed:
         if section.kind.value in ("returns", "raises"):
             yield f"**{section.kind.value.capitalize()}**\n"
-            yield from (f"- {_of(each)}{_cell(each.description)}" for each in section.value)
+            yield from (f"- {_of(entry)}{_cell(entry.description)}" for entry in section.value)
             yield ""
     for section in parsed:
         if section.kind.value == "examples":
@@ -106,18 +106,20 @@ def sections(value: Any) -> list[Any]:
     return list(griffe.Docstring(inspect.getdoc(value) or "", lineno=1).parse("google", warnings=False))
 
 
-def _of(each: Any) -> str:
-    return f"`{each.annotation}`: " if each.annotation else ""
+def _of(entry: Any) -> str:
+    return f"`{entry.annotation}`: " if entry.annotation else ""
 
 
 def _module(name: str, module: Any) -> Iterator[str]:
     """Yield what a module has: functions and classes, each with its arguments and defaults, and its first line."""
-    here = [each for each, own in vars(module).items() if getattr(own, "__module__", "") == module.__name__]
-    own = getattr(module, "__all__", [each for each in here if not each.startswith("_")])
+    here = [
+        attribute for attribute, value in vars(module).items() if getattr(value, "__module__", "") == module.__name__
+    ]
+    exported = getattr(module, "__all__", [attribute for attribute in here if not attribute.startswith("_")])
     yield "| | |\n| --- | --- |"
-    for each in sorted(each for each in own if callable(getattr(module, each))):
-        text = inspect.getdoc(getattr(module, each)) or ""
-        yield f"| `{name}.{each}{_call(getattr(module, each))}` | {_cell(text.partition(chr(10) * 2)[0])} |"
+    for attribute in sorted(attribute for attribute in exported if callable(getattr(module, attribute))):
+        text = inspect.getdoc(getattr(module, attribute)) or ""
+        yield f"| `{name}.{attribute}{_call(getattr(module, attribute))}` | {_cell(text.partition(chr(10) * 2)[0])} |"
     yield ""
 
 
@@ -125,20 +127,20 @@ def _call(value: Any) -> str:
     """Return '(table, digits=3)'; nothing for what is not called: protocols, base classes, exceptions."""
     if inspect.isabstract(value) or getattr(value, "_is_protocol", False):
         return ""
-    own = [f"{name}={default}" if default else name for name, default, _ in arguments(value)]
-    return f"({', '.join(own)})"
+    texts = [f"{name}={default}" if default else name for name, default, _ in arguments(value)]
+    return f"({', '.join(texts)})"
 
 
 def _rows(value: Any, parsed: list[Any]) -> Iterator[str]:
     described = {}
     for part in reversed([parsed, *(sections(base) for base in getattr(value, "__mro__", ())[1:])]):
         described |= descriptions(part)
-    own = [*arguments(value)]
-    if own:
+    rows = [*arguments(value)]
+    if rows:
         yield "| argument | default | |\n| --- | --- | --- |"
         yield from (
             f"| `{name}` | {f'`{default}`' if default else ''} | {_cell(text or described.get(name.lstrip('*')))} |"
-            for name, default, text in own
+            for name, default, text in rows
         )
         yield ""
 
@@ -147,9 +149,9 @@ def descriptions(parsed: list[Any]) -> dict[str, str]:
     """Return the text of each argument and attribute that a docstring describes: of 'fx, fy: ...' that of both."""
     found = {}
     for section in parsed:
-        for each in section.value if section.kind.value in ("parameters", "attributes") else ():
-            names = f"{each.name}{each.annotation}" if each.name.endswith(",") else each.name
-            found |= {name.strip(): each.description for name in names.split(",")}
+        for entry in section.value if section.kind.value in ("parameters", "attributes") else ():
+            names = f"{entry.name}{entry.annotation}" if entry.name.endswith(",") else entry.name
+            found |= {name.strip(): entry.description for name in names.split(",")}
     return found
 
 
@@ -180,8 +182,8 @@ def arguments(value: Any) -> Iterator[tuple[str, str, str]]:
 def _default(value: Any) -> str:
     if isinstance(value, BaseModel):
         return "{}" if value == type(value)() else _cell(str(value.model_dump(exclude_defaults=True)))
-    if isinstance(value, list | tuple) and any(isinstance(each, BaseModel) for each in value):
-        return _cell(str([each.model_dump(exclude_defaults=True) for each in value]))
+    if isinstance(value, list | tuple) and any(isinstance(model, BaseModel) for model in value):
+        return _cell(str([model.model_dump(exclude_defaults=True) for model in value]))
     return "" if OBJECT.search(repr(value)) else _cell(repr(value))
 
 

@@ -107,11 +107,11 @@ SPOILS: dict[str, Callable[[Image], Image]] = {"jpeg": _jpeg, "noise": _noise, "
 
 def _coarsen(module: torch.nn.Module, bits: int) -> None:
     """Round the weights of convolutions to 2^bits levels, between minus and plus the largest of an output channel."""
-    for each in module.modules():
-        if isinstance(each, torch.nn.Conv2d):
-            weight = each.weight.data
+    for layer in module.modules():
+        if isinstance(layer, torch.nn.Conv2d):
+            weight = layer.weight.data
             step = weight.abs().amax(dim=(1, 2, 3), keepdim=True).clamp_min(1e-12) / (2 ** (bits - 1) - 1)
-            each.weight.data = torch.round(weight / step) * step
+            layer.weight.data = torch.round(weight / step) * step
 
 
 # --- Networks ---------------------------------------------------------------------------------------------------------

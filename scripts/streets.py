@@ -148,7 +148,7 @@ def _predicted(
     rgb = rgb if spoil is None else spoil(rgb)
     out, mirrored = labeller(rgb), labeller(np.ascontiguousarray(rgb[:, ::-1]))[:, ::-1]
     scored = out.ndim == 3
-    label, other = (each.argmax(axis=2) if scored else each for each in (out, mirrored))
+    label, other = (output.argmax(axis=2) if scored else output for output in (out, mirrored))
     labels.mkdir(parents=True, exist_ok=True)
     cv2.imwrite(str(labels / image.name), label.astype(np.uint8))
     softmax = None
@@ -215,10 +215,10 @@ def _under_other_choices(out: Path, about: Mapping[str, dict[str, Any]]) -> Iter
     config = semstab.load_config(out / "config.yaml")
     for condition, (voxel_size, moving, frames) in CONDITIONS.items():
         options = {**config.dataset.options, "moving": moving}
-        own = config.model_copy(update={"dataset": config.dataset.model_copy(update={"options": options})})
+        changed = config.model_copy(update={"dataset": config.dataset.model_copy(update={"options": options})})
         stride = int(frames.rpartition(":")[2])
-        for street, scene in open_scenes(own, out).items():
-            for task in tasks_of(scene, own):
+        for street, scene in open_scenes(changed, out).items():
+            for task in tasks_of(scene, changed):
                 if about[task.model]["of"]:
                     continue
                 K = len(task.mapping.target.classes)
@@ -271,8 +271,8 @@ def _row(record: Record, about: dict[str, Any]) -> dict[str, Any]:
 
 def _means(table: VoxelTable, op: int) -> dict[str, float]:
     """Return means over the voxels that at least `op` frames saw."""
-    seen = table.rows(np.flatnonzero(table.op >= op))
-    return {name: float(np.mean(of(seen))) for name, of in (("vss", vss), ("sbd", sbd), ("entropy", entropy))}
+    often = table.rows(np.flatnonzero(table.op >= op))
+    return {name: float(np.mean(of(often))) for name, of in (("vss", vss), ("sbd", sbd), ("entropy", entropy))}
 
 
 def _halves(records: Sequence[Record], about: Mapping[str, dict[str, Any]]) -> Iterator[dict[str, Any]]:
@@ -304,18 +304,18 @@ def _against_truth(out: Path, records: Sequence[Record], work: Path) -> Measured
         for task in tasks_of(scene, config):
             record = table[street, task.model]
             confusion, signs, wrong = _pixels(task, record.table(), work)
-            seen = confusion.sum(axis=1) > 0
+            present = confusion.sum(axis=1) > 0
             iou = np.diag(confusion) / np.maximum(confusion.sum(axis=0) + confusion.sum(axis=1) - np.diag(confusion), 1)
             numbers[street, task.model] = {
                 "accuracy": float(np.trace(confusion) / confusion.sum()),
-                "miou": float(iou[seen].mean()),
+                "miou": float(iou[present].mean()),
                 "pixels": float(len(wrong)),
                 **{f"auroc_{name}": auroc(sign, wrong) for name, sign in zip(SIGNS, signs, strict=True)},
             }
             pixels[street, task.model] = signs, wrong
-            alphas = {each.name: each.alpha.value for each in record.statistics.spots.classes}
+            alphas = {counted.name: counted.alpha.value for counted in record.statistics.spots.classes}
             for k, name in enumerate(task.mapping.target.classes):
-                if seen[k] or confusion[:, k].any():
+                if present[k] or confusion[:, k].any():
                     of_class = {
                         "true": int(confusion[k].sum()), "said": int(confusion[:, k].sum()),
                         "right": int(confusion[k, k]),

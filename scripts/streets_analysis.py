@@ -66,7 +66,9 @@ class Grid:
     def samples(self) -> Iterator[tuple[Any, Any]]:
         """Yield SAMPLES times drawn rows of networks and columns of streets."""
         rng, families = np.random.default_rng(0), sorted(set(self.family))
-        members = {family: [k for k, own in enumerate(self.family) if own == family] for family in families}
+        members = {
+            family: [k for k, of_network in enumerate(self.family) if of_network == family] for family in families
+        }
         for _ in range(SAMPLES):
             drawn = rng.choice(families, len(families))
             networks = np.concatenate([rng.choice(members[family], len(members[family])) for family in drawn])
@@ -83,11 +85,11 @@ def correlations(x: Array, y: Array) -> Array:
 
     What is NaN in x is the same in all rows, and is left out.
     """
-    known = ~np.isnan(x).any(axis=0)
-    if known.sum() < 3:
+    complete = ~np.isnan(x).any(axis=0)
+    if complete.sum() < 3:
         return np.full(len(x), math.nan)
-    x, y = (rankdata(each[:, known], axis=1) for each in (x, y))
-    x, y = (each - each.mean(axis=1, keepdims=True) for each in (x, y))
+    x, y = (rankdata(values[:, complete], axis=1) for values in (x, y))
+    x, y = (values - values.mean(axis=1, keepdims=True) for values in (x, y))
     scale = np.sqrt((x**2).sum(axis=1) * (y**2).sum(axis=1))
     found: Array = np.divide((x * y).sum(axis=1), scale, out=np.full(len(x), math.nan), where=scale > 0)
     return found
@@ -110,24 +112,24 @@ def within_a_street(measure: Array, accuracy: Array) -> float:
 
 def streets_of_a_network(measure: Array, accuracy: Array) -> float:
     """Return the mean over networks of the correlation of streets."""
-    known = ~np.isnan(measure).any(axis=1)
-    return _nanmean(correlations(measure[known], accuracy[known]))
+    complete = ~np.isnan(measure).any(axis=1)
+    return _nanmean(correlations(measure[complete], accuracy[complete]))
 
 
 def streets(measure: Array, accuracy: Array) -> float:
     """Return the correlation of streets' means over networks."""
-    known = ~np.isnan(measure).any(axis=1)
-    if not known.any():
+    complete = ~np.isnan(measure).any(axis=1)
+    if not complete.any():
         return math.nan
-    return spearman(measure[known].mean(axis=0), accuracy[known].mean(axis=0))
+    return spearman(measure[complete].mean(axis=0), accuracy[complete].mean(axis=0))
 
 
 def pairs_on_a_street(measure: Array, accuracy: Array) -> float:
     """Return the share of pairs of networks on one street, APART or more in accuracy, that a measure orders rightly."""
     one, other = np.tril_indices(len(measure), -1)
-    gap, own = accuracy[one] - accuracy[other], measure[one] - measure[other]
-    asked = (np.abs(gap) >= APART) & ~np.isnan(own)
-    right = (gap * own > 0) + 0.5 * (own == 0)
+    gap, difference = accuracy[one] - accuracy[other], measure[one] - measure[other]
+    asked = (np.abs(gap) >= APART) & ~np.isnan(difference)
+    right = (gap * difference > 0) + 0.5 * (difference == 0)
     return float(right[asked].mean()) if asked.any() else math.nan
 
 
@@ -147,15 +149,15 @@ QUESTIONS: dict[str, Statistic] = {
 
 
 def _nanmean(values: Sequence[float] | Array) -> float:
-    known = [value for value in values if not math.isnan(value)]
-    return float(np.mean(known)) if known else math.nan
+    numbers = [value for value in values if not math.isnan(value)]
+    return float(np.mean(numbers)) if numbers else math.nan
 
 
 def with_interval(grid: Grid, measure: Array, statistic: Statistic, accuracy: Array) -> tuple[float, float, float]:
     """Return a statistic and the ends of its interval."""
     drawn = [statistic(measure[np.ix_(*some)], accuracy[np.ix_(*some)]) for some in grid.samples()]
-    known = [value for value in drawn if not math.isnan(value)]
-    low, high = np.quantile(known, [0.025, 0.975]) if known else (math.nan, math.nan)
+    numbers = [value for value in drawn if not math.isnan(value)]
+    low, high = np.quantile(numbers, [0.025, 0.975]) if numbers else (math.nan, math.nan)
     return statistic(measure, accuracy), float(low), float(high)
 
 
@@ -217,8 +219,8 @@ def variants_table(rows: Sequence[Mapping[str, Any]]) -> list[str]:
         sign, cells = -1.0 if name in LESS else 1.0, []
         for kind in (*kinds, ""):
             gaps = [sign * (b[name] - v[name]) for v, b in pairs if v["network"].endswith(kind)]
-            known = [gap for gap in gaps if not math.isnan(gap)]
-            cells.append(f"{sum(gap > 0 for gap in known)} of {len(known)}" if known else "-")
+            numbers = [gap for gap in gaps if not math.isnan(gap)]
+            cells.append(f"{sum(gap > 0 for gap in numbers)} of {len(numbers)}" if numbers else "-")
         lines.append(row([title, *cells]))
     falls = [
         f"{_nanmean([b['accuracy'] - v['accuracy'] for v, b in pairs if v['network'].endswith(kind)]):.3f}"
@@ -251,9 +253,9 @@ def places_table(grid: Grid) -> list[str]:
         area = grid.of(name)[scored]
         drawn = []
         for networks, columns in grid.samples():
-            kept = [scored.index(k) for k in networks if k in scored]
-            if kept:
-                drawn.append(area[np.ix_(kept, columns)].mean())
+            rows = [scored.index(k) for k in networks if k in scored]
+            if rows:
+                drawn.append(area[np.ix_(rows, columns)].mean())
         low, high = np.quantile(drawn, [0.025, 0.975])
         by_street = area.mean(axis=0)
         cells = [
@@ -269,10 +271,12 @@ def classes_table(rows: Sequence[Mapping[str, Any]], networks: Sequence[str]) ->
     """Return classes with their IoU and alpha over all networks and streets, and the mean correlation in a network."""
     correlations, table = [], []
     for network in networks:
-        own = _by_class([r for r in rows if r["network"] == network])
-        correlations.append(spearman(np.array([a for a, _ in own.values()]), np.array([i for _, i in own.values()])))
+        of_network = _by_class([r for r in rows if r["network"] == network])
+        correlations.append(
+            spearman(np.array([a for a, _ in of_network.values()]), np.array([i for _, i in of_network.values()]))
+        )
     of_all = _by_class([r for r in rows if r["network"] in networks])
-    for name, (alpha, iou) in sorted(of_all.items(), key=lambda each: -each[1][1]):
+    for name, (alpha, iou) in sorted(of_all.items(), key=lambda entry: -entry[1][1]):
         pixels = sum(r["true"] for r in rows if r["class"] == name and r["network"] == networks[0])
         table.append(row([name, f"{pixels:,.0f}", plain(iou), plain(alpha)]))
     return [*head(["class", "true pixels", "IoU", "alpha"]), *table], _nanmean(correlations)
@@ -282,9 +286,9 @@ def _by_class(rows: Sequence[Mapping[str, Any]]) -> dict[str, tuple[float, float
     """Return alpha, weighed by pixels, and IoU of each class with at least a thousand true pixels."""
     found = {}
     for name in dict.fromkeys(r["class"] for r in rows):
-        own = [r for r in rows if r["class"] == name]
-        true, said, right = (sum(r[key] for r in own) for key in ("true", "said", "right"))
-        weights = [(r["said"], r["alpha"]) for r in own if not math.isnan(r["alpha"]) and r["said"]]
+        of_class = [r for r in rows if r["class"] == name]
+        true, said, right = (sum(r[key] for r in of_class) for key in ("true", "said", "right"))
+        weights = [(r["said"], r["alpha"]) for r in of_class if not math.isnan(r["alpha"]) and r["said"]]
         if true >= 1000 and weights:
             alpha = sum(w * a for w, a in weights) / sum(w for w, _ in weights)
             found[name] = (alpha, right / (true + said - right))
@@ -301,7 +305,7 @@ def beyond_softmax(grid: Grid) -> list[str]:
     for name in ("alpha", "meaning", "vss", "agree", "compensated", "flip"):
         measure = grid.of(name)[scored]
         error = _left_out(accuracy, [softmax, measure])
-        ranks = [rankdata(each.ravel()) for each in (measure, accuracy, softmax)]
+        ranks = [rankdata(values.ravel()) for values in (measure, accuracy, softmax)]
         lines.append(row([f"softmax and {MEASURES[name]}", f"{100 * error:.1f}", signed(_partial(*ranks))]))
     return lines
 
@@ -321,21 +325,21 @@ def _left_out(accuracy: Array, measures: Sequence[Array]) -> float:
 def _partial(x: Array, y: Array, given: Array) -> float:
     """Return the correlation of x and y after what a line through `given` explains is taken away."""
     design = np.stack([np.ones(len(given)), given], axis=1)
-    rest = [each - design @ np.linalg.lstsq(design, each, rcond=None)[0] for each in (x, y)]
+    rest = [values - design @ np.linalg.lstsq(design, values, rcond=None)[0] for values in (x, y)]
     return float(np.corrcoef(*rest)[0, 1])
 
 
 def choices_table(rows: Sequence[Mapping[str, Any]]) -> list[str]:
     """Return the correlations of alpha and of VSS in each condition."""
-    shown = ("which network, over all streets", "which network, on one street", "which street, mean of networks")
-    lines = head(["condition", *(f"{m}: {q}" for m in ("alpha", "VSS") for q in shown)])
+    questions = ("which network, over all streets", "which network, on one street", "which street, mean of networks")
+    lines = head(["condition", *(f"{m}: {q}" for m in ("alpha", "VSS") for q in questions)])
     main = Grid([r for r in rows if r["condition"] == "main" and not r["of"]])
     for condition in dict.fromkeys(r["condition"] for r in rows):
         grid = Grid([r for r in rows if r["condition"] == condition and not r["of"]])
         cells = []
         for name in ("alpha", "vss"):
             measure = grid.of(name)
-            cells += [signed(QUESTIONS[q](measure, main.of("accuracy"))) for q in shown]
+            cells += [signed(QUESTIONS[q](measure, main.of("accuracy"))) for q in questions]
         lines.append(row([condition, *cells]))
     of_main = [r for r in rows if r["condition"] == "main" and not r["of"]]
     some = Grid([r for r in of_main if r["family"] in ("espnetv2", "dicenet")])
@@ -344,7 +348,9 @@ def choices_table(rows: Sequence[Mapping[str, Any]]) -> list[str]:
         ("ESPNetv2 and DiCENet", some, ("alpha", "vss")),
     ):
         values = [
-            signed(QUESTIONS[q](grid.of(name), grid.of("accuracy"))) if name else "" for name in names for q in shown
+            signed(QUESTIONS[q](grid.of(name), grid.of("accuracy"))) if name else ""
+            for name in names
+            for q in questions
         ]
         lines.append(row([title, *values]))
     return lines

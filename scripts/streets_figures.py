@@ -60,8 +60,10 @@ def _accuracy(grid: Grid) -> Figure:
         measure = grid.of(name)
         of_networks, of_streets = (figure.add_subplot(2, 2, 1 + 2 * row + column) for row in (0, 1))
         for family, (color, marker, title) in FAMILIES.items():
-            own = [k for k, each in enumerate(grid.family) if each == family]
-            of_networks.plot(accuracy[own].mean(axis=1), measure[own].mean(axis=1), marker, color=color, label=title)
+            networks = [k for k, of_network in enumerate(grid.family) if of_network == family]
+            of_networks.plot(
+                accuracy[networks].mean(axis=1), measure[networks].mean(axis=1), marker, color=color, label=title
+            )
         of_streets.plot(accuracy.mean(axis=0), measure.mean(axis=0), "o", color="#0072B2")
         for k, street in enumerate(grid.streets):
             at = accuracy[:, k].mean(), measure[:, k].mean()

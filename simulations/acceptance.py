@@ -56,8 +56,8 @@ def simulated(flight: Flight, trials: int, seed: int, precision: float) -> list[
     right = label == np.stack([truth.label for _, truth in scenes])
     evidence = {by: np.stack([np.asarray(of(table), float) for table, _ in scenes]) for by, of in EVIDENCE.items()}
     found, broken, left = 0, 0, []
-    for each in scenes:
-        commit = calibrate([each], precision=precision)
+    for flown in scenes:
+        commit = calibrate([flown], precision=precision)
         left.append(commit.left)
         for k, name in enumerate(CLASSES):
             chosen = commit.classes[name]
@@ -93,7 +93,7 @@ def _held(commit: AcceptanceThresholds, held: tuple[VoxelTable, Truth]) -> list[
     table, truth = held
     decided = commit.decide(table)
     counted = (decided >= 0) & truth.known
-    names = [name for name, own in commit.classes.items() if not own.never]
+    names = [name for name, limits in commit.classes.items() if not limits.never]
     right = (decided == truth.label)[counted].mean() if counted.any() else float("nan")
     return [", ".join(names) or "none", f"{commit.left:.2f}", f"{(decided >= 0).mean():.2f}", f"{right:.3f}"]
 

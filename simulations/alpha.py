@@ -83,14 +83,14 @@ def shares(scenes: int, flights: int, seed: int) -> None:
                     added = predicted(views, kind, rate * (1 - share) / share, trial, flights + flight) != views.labels
                     labels = np.where(np.where(views.labels == 1, missed, added), 1 - views.labels, views.labels)
                     flown.append(sums(views, labels))
-                truth = min(float(np.mean([value(own, "alpha") for own in flown])), 1.0)
-                for own in flown:
-                    alpha = estimate(own, "alpha")
+                truth = min(float(np.mean([value(flight, "alpha") for flight in flown])), 1.0)
+                for flight in flown:
+                    alpha = estimate(flight, "alpha")
                     level, probability = stated(alpha)
                     inside = alpha.low - 1e-9 <= truth <= alpha.high + 1e-9
                     decided = level != "undecided"
                     rows.append((inside, alpha.high - alpha.low, probability, level == level_of(truth), decided))
-                    evidence = own.answers[0]["evidence"].sum(axis=0)
+                    evidence = flight.answers[0]["evidence"].sum(axis=0)
                     chance.append(((evidence / evidence.sum()) ** 2).sum())
         inside, wide, probability, right, decided = (np.array(column) for column in zip(*rows, strict=True))
         sure = decided & (probability >= 0.9)

@@ -298,8 +298,10 @@ class Situation(Mistake):
     def is_placed(self, lines: Sequence[str]) -> bool:
         """Return whether the lines name these frames, give or take one."""
         told = [re.search(self.where, line) for line in lines if self.said in line]
-        named = sorted(int(k) for match in told if match is not None for k in match[1].split(", "))
-        return len(named) == len(self.frames) and all(abs(a - b) <= 1 for a, b in zip(named, self.frames, strict=True))
+        frames_told = sorted(int(k) for match in told if match is not None for k in match[1].split(", "))
+        return len(frames_told) == len(self.frames) and all(
+            abs(a - b) <= 1 for a, b in zip(frames_told, self.frames, strict=True)
+        )
 
 
 ALL, SECOND = range(FRAMES), range(FROM, FRAMES)
@@ -360,16 +362,16 @@ def said(frames: Frames, *, run: bool = False) -> Iterator[str]:
     """Yield the findings, as `check` says them, or a run."""
     made, indices = Made(frames), range(len(frames))
     if run:
-        verdict, _, known = quick_sample(made, indices, {}, "net")
+        verdict, _, chained = quick_sample(made, indices, {}, "net")
     else:
         inspection = Inspection(made, indices, "net", clusters(len(frames), CLUSTERS), POINTS)
         verdict = inspection.verdict({}, thorough=True)
-        known = {} if inspection.chained is None else {"net": inspection.chained}
+        chained = {} if inspection.chained is None else {"net": inspection.chained}
     yield from verdict.remarks
     if verdict.state == "unsound":
         yield verdict.text
         return
-    for found in label_findings(made, indices, ["net"], {}, known, thorough=not run):
+    for found in label_findings(made, indices, ["net"], {}, chained, thorough=not run):
         yield from (*found.wrong, *found.remarks)
 
 
@@ -377,16 +379,18 @@ def print_situations(seeds: Sequence[int], only: str) -> None:
     """Print the table of situations."""
     print(f"| situation | `check` finds it in {len(seeds)} | a run | right frames | something else said |")
     print("|---|---:|---:|---:|---:|")
-    for each in SITUATIONS:
-        if only not in each.name:
+    for situation in SITUATIONS:
+        if only not in situation.name:
             continue
-        scenes = [each.plant(scene(seed)) for seed in seeds]
+        scenes = [situation.plant(scene(seed)) for seed in seeds]
         lines = [[*said(frames)] for frames in scenes]
         runs = [[*said(frames, run=True)] for frames in scenes]
-        found, in_run = ([any(each.said in line for line in own) for own in told] for told in (lines, runs))
-        placed = sum(each.is_placed(own) for own in lines) if each.frames else "-"
-        other = sum(any(each.said not in line for line in own) for own in lines)
-        print(f"| {each.name} | {sum(found)} | {sum(in_run)} | {placed} | {other} |", flush=True)
+        found, in_run = (
+            [any(situation.said in line for line in of_scene) for of_scene in told] for told in (lines, runs)
+        )
+        placed = sum(situation.is_placed(of_scene) for of_scene in lines) if situation.frames else "-"
+        other = sum(any(situation.said not in line for line in of_scene) for of_scene in lines)
+        print(f"| {situation.name} | {sum(found)} | {sum(in_run)} | {placed} | {other} |", flush=True)
 
 
 def main(scenes: int = 20, seed: int = 0, only: str = "", situations: bool = False) -> None:
@@ -399,6 +403,6 @@ def main(scenes: int = 20, seed: int = 0, only: str = "", situations: bool = Fal
     for mistake in MISTAKES:
         if only in mistake.name:
             lines = [[*said(mistake.plant(frames))] for frames in rooms]
-            found = sum(any(mistake.said in line for line in each) for each in lines)
-            other = sum(any(mistake.said not in line for line in each) for each in lines)
+            found = sum(any(mistake.said in line for line in of_scene) for of_scene in lines)
+            other = sum(any(mistake.said not in line for line in of_scene) for of_scene in lines)
             cases.row([mistake.name, str(found), str(other)])

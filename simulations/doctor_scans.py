@@ -84,13 +84,13 @@ def cast(street: Street, origins: np.ndarray, directions: np.ndarray) -> tuple[n
     with np.errstate(divide="ignore"):
         inverse = 1 / directions
         distance = np.where(directions[:, 2] < 0, -origins[:, 2] * inverse[:, 2], np.inf)
-    shown = np.zeros(len(directions), np.int64)
+    objects = np.zeros(len(directions), np.int64)
     for number, box in enumerate(street.boxes, 1):
         sides = (np.stack(box.at(0))[:, None] - origins) * inverse
         enter, leave = sides.min(axis=0).max(axis=1), sides.max(axis=0).min(axis=1)
         hit = (enter <= leave) & (enter > 0.1) & (enter < distance)
-        distance, shown = np.where(hit, enter, distance), np.where(hit, number, shown)
-    return distance, shown
+        distance, objects = np.where(hit, enter, distance), np.where(hit, number, objects)
+    return distance, objects
 
 
 def drive(seed: int, *, swept: bool = False) -> Scans:
@@ -101,20 +101,20 @@ def drive(seed: int, *, swept: bool = False) -> Scans:
 @functools.lru_cache(maxsize=64)
 def _drive(seed: int, swept: bool) -> tuple[Frame, ...]:
     rng = np.random.default_rng(seed)
-    street, poses, own = Street.drawn(rng, movers=0), way(rng), rays()
-    shares = share_of_sweep(own, SWEEP) if swept else np.zeros(len(own))
+    street, poses, directions = Street.drawn(rng, movers=0), way(rng), rays()
+    shares = share_of_sweep(directions, SWEEP) if swept else np.zeros(len(directions))
     scans = []
     for k, pose in enumerate(poses):
         around = (poses[j] if 0 <= j < SCANS else None for j in (k - 1, k + 1))
         motion = motion_in_sweep(next(around), pose, next(around))
         turns = Rotation.from_rotvec(shares[:, None] * motion[:3])
         origins = (shares[:, None] * motion[3:]) @ pose[:3, :3].T + pose[:3, 3]
-        distance, shown = cast(street, origins, turns.apply(own) @ pose[:3, :3].T)
+        distance, objects = cast(street, origins, turns.apply(directions) @ pose[:3, :3].T)
         there = distance < RANGE
-        ranged = np.where(there, distance + NOISE * rng.standard_normal(len(own)), 0)
-        wrong = np.repeat(rng.random(len(own) // 8) < WRONG, 8)
-        labels = np.where(wrong, rng.integers(0, CLASSES, len(own)), street.classes[shown])
-        points = (own * ranged[:, None]).astype(np.float32)
+        ranged = np.where(there, distance + NOISE * rng.standard_normal(len(directions)), 0)
+        wrong = np.repeat(rng.random(len(directions) // 8) < WRONG, 8)
+        labels = np.where(wrong, rng.integers(0, CLASSES, len(directions)), street.classes[objects])
+        points = (directions * ranged[:, None]).astype(np.float32)
         scans.append(Frame(k, points=points, labels=np.where(there, labels, 255).astype(np.uint8), T_wc=pose))
     return tuple(scans)
 
@@ -215,7 +215,7 @@ def main(drives: int = 20, seed: int = 0, only: str = "") -> None:
         if only not in mistake.name:
             continue
         seeds = range(seed, seed + (drives if mistake.name != "none" else 2 * drives))
-        lines = [said(mistake.plant(drive(own, swept=mistake.swept))) for own in seeds]
-        named = [any(part in line for part in mistake.said for line in own) for own in lines]
-        other = sum(bool(own) and not is_named for own, is_named in zip(lines, named, strict=True))
+        lines = [said(mistake.plant(drive(seed, swept=mistake.swept))) for seed in seeds]
+        named = [any(part in line for part in mistake.said for line in of_drive) for of_drive in lines]
+        other = sum(bool(of_drive) and not is_named for of_drive, is_named in zip(lines, named, strict=True))
         cases.row([mistake.name, *map(str, (len(seeds), sum(named), other, len(seeds) - sum(named) - other))])

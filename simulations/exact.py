@@ -32,7 +32,7 @@ import numpy as np
 import numpy.typing as npt
 from exact_errors import ERRORS, IGNORED, Labeller, unlabelled
 from exact_scenes import Array, Ints, yard
-from exact_views import PATHS, Flight, Pinhole, Seen, flight
+from exact_views import PATHS, Flight, ImagePoints, Pinhole, flight
 
 from semstab.data.frames import Frame
 from semstab.data.statistics import Interval
@@ -160,12 +160,12 @@ def exact(flown: Flight, labeller: Labeller, points: int, rng: np.random.Generat
         point, face = flown.scene.draw(n, rng)
         times = np.zeros(n, int)
         for frame in range(len(flown.poses)):
-            some, seen = flown.meet(frame, point, face)
-            label = labeller(seen)
-            named = label != IGNORED
-            times[some[named]] += 1
-            units.append(drawn + some[named])
-            labels.append(label[named])
+            some, view = flown.meet(frame, point, face)
+            label = labeller(view)
+            labelled = label != IGNORED
+            times[some[labelled]] += 1
+            units.append(drawn + some[labelled])
+            labels.append(label[labelled])
         drawn, twice = drawn + n, twice + int((times >= 2).sum())
         if twice >= points:
             break
@@ -179,22 +179,22 @@ def exact(flown: Flight, labeller: Labeller, points: int, rng: np.random.Generat
 def frames(flown: Flight, labeller: Labeller, condition: Condition, rng: np.random.Generator) -> Iterator[Frame]:
     """Yield what the tool sees."""
     H, W = flown.sensor.height, flown.sensor.width
-    for seen, T_wc in zip(flown.images, flown.poses, strict=True):
-        labels, there = labeller(seen).astype(np.uint8), seen.face >= 0
+    for view, T_wc in zip(flown.images, flown.poses, strict=True):
+        labels, there = labeller(view).astype(np.uint8), view.face >= 0
         noise = 1 + condition.noise * rng.standard_normal(len(there))
         if not isinstance(flown.sensor, Pinhole):
-            points = flown.sensor.rays(seen.u, seen.v)[there] * (seen.t * noise)[there, None]
-            yield Frame(seen.frame, points=points.astype(np.float32), T_wc=T_wc, labels=labels[there])
+            points = flown.sensor.rays(view.u, view.v)[there] * (view.t * noise)[there, None]
+            yield Frame(view.frame, points=points.astype(np.float32), T_wc=T_wc, labels=labels[there])
             continue
         K = flown.sensor.intrinsics
-        kept = there & _hit(flown.sensor, seen) if condition.path == "sparse" else there
-        depth = np.where(kept, seen.t * noise, 0.0).astype(np.float32)
+        visible = there & _hit(flown.sensor, view) if condition.path == "sparse" else there
+        depth = np.where(visible, view.t * noise, 0.0).astype(np.float32)
         pose = T_wc.copy()
         pose[:3, :3] = T_wc[:3, :3] @ _turned(condition.turn / K.fx, rng)
-        yield Frame(seen.frame, depth.reshape(H, W), K, pose, labels=labels.reshape(H, W))
+        yield Frame(view.frame, depth.reshape(H, W), K, pose, labels=labels.reshape(H, W))
 
 
-def _hit(camera: Pinhole, seen: Seen) -> npt.NDArray[np.bool_]:
+def _hit(camera: Pinhole, view: ImagePoints) -> npt.NDArray[np.bool_]:
     """Return the pixels (n,) that rays of a scanner next to the camera hit."""
     up, aside = np.meshgrid(np.arange(-np.pi / 4, np.pi / 4, RING), np.arange(-np.pi / 4, np.pi / 4, STEP))
     ways = np.stack([np.cos(up) * np.sin(aside), -np.sin(up), np.cos(up) * np.cos(aside)], axis=-1).reshape(-1, 3)
@@ -213,10 +213,10 @@ def _turned(angle: float, rng: np.random.Generator) -> Array:
     return np.eye(3) + np.sin(angle) * cross + (1 - np.cos(angle)) * cross @ cross
 
 
-def said(shown: list[Frame], K: int) -> Interval:
+def said(series: list[Frame], K: int) -> Interval:
     """Return the tool's alpha."""
     sampler = Sampler(K)
-    for frame in shown:
+    for frame in series:
         sampler.add(frame)
     return estimate(sums_of_spots(sampler.sample()), "alpha")
 
@@ -232,15 +232,15 @@ def trial(condition: Condition, seed: int, size: tuple[int, int], points: int) -
     flown = flight(condition.path, condition.frames, condition.K, (finer * size[0], finer * size[1]), scene)
     labeller = ERRORS[condition.error](flown, condition.K, errors)
     labeller = unlabelled(labeller, condition.unlabelled, flown, without)
-    shown = list(frames(flown, labeller, condition, noise))
-    return exact(flown, labeller, points, draws), said(shown, condition.K)
+    made_frames = list(frames(flown, labeller, condition, noise))
+    return exact(flown, labeller, points, draws), said(made_frames, condition.K)
 
 
 def row(condition: Condition, seeds: int, size: tuple[int, int], points: int) -> tuple[list[str], bool]:
     """Return the cells of a row, and whether its difference is within the limit."""
     found = [trial(condition, seed, size, points) for seed in range(seeds)]
-    off = np.array([own.value - true.value for true, own in found])
-    held = sum(own.low - 1e-9 <= true.value <= own.high + 1e-9 for true, own in found)
+    off = np.array([told.value - true.value for true, told in found])
+    held = sum(told.low - 1e-9 <= true.value <= told.high + 1e-9 for true, told in found)
     error = f"{off.std(ddof=1) / np.sqrt(seeds):.3f}" if seeds > 1 else "-"
     cells = [
         condition.name, str(condition.frames), f"{np.mean([true.views for true, _ in found]):.1f}",

@@ -99,10 +99,10 @@ def _about_the_vertical(angle: float) -> Array:
 def flights(condition: Condition, scenes: int, count: int, seed: int) -> Iterator[Flown]:
     """Yield flights over scene after scene, with errors that grow from scene to scene."""
     for number in range(scenes):
-        own, staying, *each = np.random.SeedSequence([seed, number]).spawn(count + 2)
-        scene = PATHS[condition.path][0](condition.K, np.random.default_rng(own))
+        of_scene, staying, *of_flights = np.random.SeedSequence([seed, number]).spawn(count + 2)
+        scene = PATHS[condition.path][0](condition.K, np.random.default_rng(of_scene))
         strength = STRENGTH[0] + (STRENGTH[1] - STRENGTH[0]) * (number + 0.5) / scenes
-        for flight in each:
+        for flight in of_flights:
             course, errors, noise, draws = map(np.random.default_rng, flight.spawn(4))
             flown = again(condition, scene, course)
             if condition.error in STAYS:
@@ -123,31 +123,31 @@ HEAD = (
 
 def by_scene(rows: Sequence[Flown]) -> list[list[Flown]]:
     """Return the flights over each scene."""
-    return [[own for own in rows if own.scene == number] for number in sorted({own.scene for own in rows})]
+    return [[row for row in rows if row.scene == number] for number in sorted({row.scene for row in rows})]
 
 
 def mean(rows: Iterable[Flown], of: Callable[[Flown], float]) -> float:
     """Return the mean of a number of some flights."""
-    return float(np.mean([of(own) for own in rows]))
+    return float(np.mean([of(row) for row in rows]))
 
 
 def held(flown: Sequence[Flown], target: float) -> float:
     """Return the share of the intervals that hold a number."""
-    return mean(flown, lambda own: own.low - 1e-9 <= target <= own.high + 1e-9)
+    return mean(flown, lambda row: row.low - 1e-9 <= target <= row.high + 1e-9)
 
 
 def cells(name: str, rows: Sequence[Flown]) -> list[str]:
     """Return the row of a condition."""
     scenes = by_scene(rows)
-    true = np.array([mean(flown, lambda own: own.exact) for flown in scenes])
-    told = np.array([mean(flown, lambda own: own.said) for flown in scenes])
-    ideal = [EVERY * np.std([own.said for own in flown], ddof=1) for flown in scenes]
-    width = [mean(flown, lambda own: own.high - own.low) for flown in scenes]
+    true = np.array([mean(flown, lambda row: row.exact) for flown in scenes])
+    told = np.array([mean(flown, lambda row: row.said) for flown in scenes])
+    ideal = [EVERY * np.std([row.said for row in flown], ddof=1) for flown in scenes]
+    width = [mean(flown, lambda row: row.high - row.low) for flown in scenes]
     off = told - true
 
     def share(targets: Array) -> str:
-        own = np.array([held(flown, target) for flown, target in zip(scenes, targets, strict=True)])
-        return f"{own.mean():.3f} ± {max(_error(own), np.sqrt(0.0475 / len(rows))):.3f}"
+        holds = np.array([held(flown, target) for flown, target in zip(scenes, targets, strict=True)])
+        return f"{holds.mean():.3f} ± {max(_error(holds), np.sqrt(0.0475 / len(rows))):.3f}"
 
     return [
         name, str(len(rows)), f"{true.min():.2f} to {true.max():.2f}", f"{off.mean():+.3f} ± {_error(off):.3f}",
@@ -164,35 +164,39 @@ GROUPS = ("burst", "lasting")
 """Errors with a column of their own; before them come all others."""
 
 
-def group_of(own: Flown) -> str:
+def group_of(row: Flown) -> str:
     """Return the column that a flight counts in."""
-    error = own.condition.split(", ")[1]
+    error = row.condition.split(", ")[1]
     return error if error in GROUPS else "others"
 
 
 def tenths(rows: Sequence[Flown]) -> Iterator[list[str]]:
     """Yield how often the stated level is that of the scene's exact alpha, by tenths of its probability."""
-    names = dict.fromkeys(own.condition for own in rows)
-    scenes = [flown for name in names for flown in by_scene([own for own in rows if own.condition == name])]
+    names = dict.fromkeys(row.condition for row in rows)
+    scenes = [flown for name in names for flown in by_scene([row for row in rows if row.condition == name])]
     right = [
-        (group_of(own), own.probability, own.level == level_of(mean(flown, lambda each: each.exact)))
+        (group_of(row), row.probability, row.level == level_of(mean(flown, lambda row: row.exact)))
         for flown in scenes
-        for own in flown
-        if own.level != "undecided"
+        for row in flown
+        if row.level != "undecided"
     ]
     for low in np.arange(6, 10) / 10:
         line = [f"{low:.0%} to {low + 0.1:.0%}"]
         for group in ("others", *GROUPS):
-            own = [
+            stated = [
                 (p, is_right) for name, p, is_right in right if name == group and low <= p < low + 0.1 + (low > 0.85)
             ]
-            line += [f"{np.mean([x for _, x in own]):.2f}, stated {np.mean([p for p, _ in own]):.2f}"] if own else ["-"]
-            line += [str(len(own))]
+            line += (
+                [f"{np.mean([x for _, x in stated]):.2f}, stated {np.mean([p for p, _ in stated]):.2f}"]
+                if stated
+                else ["-"]
+            )
+            line += [str(len(stated))]
         yield line
     line = ["undecided"]
     for group in ("others", *GROUPS):
-        own = [flown.level == "undecided" for flown in rows if group_of(flown) == group]
-        line += [f"{np.mean(own):.2f} of {len(own)}" if own else "-", str(sum(own))]
+        undecided = [flown.level == "undecided" for flown in rows if group_of(flown) == group]
+        line += [f"{np.mean(undecided):.2f} of {len(undecided)}" if undecided else "-", str(sum(undecided))]
     yield line
 
 
@@ -236,15 +240,15 @@ def main() -> None:
         if not fnmatch.fnmatch(condition.name, arguments.only):
             continue
         if saved is None:
-            own = list(flights(condition, arguments.scenes, arguments.flights, arguments.seed))
+            of_condition = list(flights(condition, arguments.scenes, arguments.flights, arguments.seed))
         else:
-            own = [flown for flown in saved if flown.condition == condition.name]
-        if own:
-            print("|", " | ".join(cells(condition.name, own)), "|", flush=True)
+            of_condition = [flown for flown in saved if flown.condition == condition.name]
+        if of_condition:
+            print("|", " | ".join(cells(condition.name, of_condition)), "|", flush=True)
         if writer and file:
-            writer.writerows(map(dataclasses.astuple, own))
+            writer.writerows(map(dataclasses.astuple, of_condition))
             file.flush()
-        rows += own
+        rows += of_condition
     print()
     show(("stated", "right", "verdicts", "right, bursts", "verdicts", "right, lasting errors", "verdicts"))
     for line in tenths(rows):

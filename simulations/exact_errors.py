@@ -7,14 +7,14 @@ from typing import Protocol
 
 import numpy as np
 from exact_scenes import Array, Ints
-from exact_views import Flight, Seen
+from exact_views import Flight, ImagePoints
 from scipy import ndimage
 from scipy.stats import norm
 
-Labeller = Callable[[Seen], Ints]
+Labeller = Callable[[ImagePoints], Ints]
 """The label (n,) that a frame gives at image coordinates, the same whenever it is asked."""
 
-Number = Callable[[Seen], Array]
+Number = Callable[[ImagePoints], Array]
 
 
 class Errors(Protocol):
@@ -41,9 +41,9 @@ def smooth(flight: Flight, blur: float, rng: np.random.Generator) -> Number:
         blurred = ndimage.gaussian_filter(rng.standard_normal(shape), blur, mode="wrap")
         fields.append(ndimage.spline_filter(blurred * 2 * blur * np.sqrt(np.pi)))
 
-    def at(seen: Seen) -> Array:
-        where = np.stack([seen.v + PAD, seen.u + PAD])
-        found: Array = ndimage.map_coordinates(fields[seen.frame], where, prefilter=False, mode="nearest")
+    def at(image: ImagePoints) -> Array:
+        where = np.stack([image.v + PAD, image.u + PAD])
+        found: Array = ndimage.map_coordinates(fields[image.frame], where, prefilter=False, mode="nearest")
         return found
 
     return at
@@ -54,9 +54,9 @@ def squares(flight: Flight, edge: int, rng: np.random.Generator) -> Number:
     shape = len(flight.poses), -(-flight.sensor.height // edge), -(-flight.sensor.width // edge)
     drawn = rng.random(shape)
 
-    def at(seen: Seen) -> Array:
-        v, u = (np.floor(x + 0.5).astype(int) // edge for x in (seen.v, seen.u))
-        return drawn[seen.frame, v, u]
+    def at(image: ImagePoints) -> Array:
+        v, u = (np.floor(x + 0.5).astype(int) // edge for x in (image.v, image.u))
+        return drawn[image.frame, v, u]
 
     return at
 
@@ -64,7 +64,7 @@ def squares(flight: Flight, edge: int, rng: np.random.Generator) -> Number:
 def of_place(metres: float, rng: np.random.Generator) -> Number:
     """Return a smooth field over space, of variance 1."""
     waves, phase = rng.normal(0, 1 / metres, (32, 3)), rng.uniform(0, 2 * np.pi, 32)
-    return lambda seen: np.cos(seen.point @ waves.T + phase).sum(axis=1) / 4
+    return lambda image: np.cos(image.point @ waves.T + phase).sum(axis=1) / 4
 
 
 def other(truth: Ints, by: Array, K: int) -> Ints:
@@ -76,9 +76,9 @@ def in_blobs(share: Number, flight: Flight, K: int, rng: np.random.Generator) ->
     """Return errors in blobs, of which `share` says how frequent they are; three classes at most stand in."""
     error, by = smooth(flight, BLOB, rng), smooth(flight, 2 * BLOB, rng)
 
-    def label(seen: Seen) -> Ints:
-        instead = other(seen.truth, norm.cdf(by(seen)) * min(3, K - 1) / (K - 1), K)
-        return np.where(error(seen) > norm.isf(share(seen)), instead, seen.truth)
+    def label(image: ImagePoints) -> Ints:
+        instead = other(image.truth, norm.cdf(by(image)) * min(3, K - 1) / (K - 1), K)
+        return np.where(error(image) > norm.isf(share(image)), instead, image.truth)
 
     return label
 
@@ -86,12 +86,12 @@ def in_blobs(share: Number, flight: Flight, K: int, rng: np.random.Generator) ->
 def in_squares(share: float, edge: int, flight: Flight, K: int, rng: np.random.Generator) -> Labeller:
     """Return errors of whole squares of pixels."""
     error, by = squares(flight, edge, rng), squares(flight, edge, rng)
-    return lambda seen: np.where(error(seen) < share, other(seen.truth, by(seen), K), seen.truth)
+    return lambda image: np.where(error(image) < share, other(image.truth, by(image), K), image.truth)
 
 
 def none(flight: Flight, K: int, rng: np.random.Generator, strength: float = 1.0) -> Labeller:
     """Return the truth."""
-    return lambda seen: seen.truth
+    return lambda image: image.truth
 
 
 def pixels(flight: Flight, K: int, rng: np.random.Generator, strength: float = 1.0) -> Labeller:
@@ -101,7 +101,7 @@ def pixels(flight: Flight, K: int, rng: np.random.Generator, strength: float = 1
 
 def blobs(flight: Flight, K: int, rng: np.random.Generator, strength: float = 1.0) -> Labeller:
     """Return errors of blobs, 20 % of each image."""
-    return in_blobs(lambda seen: np.full(len(seen.u), 0.2 * strength), flight, K, rng)
+    return in_blobs(lambda image: np.full(len(image.u), 0.2 * strength), flight, K, rng)
 
 
 def blocks(flight: Flight, K: int, rng: np.random.Generator, strength: float = 1.0) -> Labeller:
@@ -112,22 +112,22 @@ def blocks(flight: Flight, K: int, rng: np.random.Generator, strength: float = 1
 def place(flight: Flight, K: int, rng: np.random.Generator, strength: float = 1.0) -> Labeller:
     """Return errors that stay at their place."""
     field = of_place(METRES, rng)
-    return lambda seen: np.where(field(seen) > norm.isf(0.3 * strength), (seen.truth + 1) % K, seen.truth)
+    return lambda image: np.where(field(image) > norm.isf(0.3 * strength), (image.truth + 1) % K, image.truth)
 
 
 def view(flight: Flight, K: int, rng: np.random.Generator, strength: float = 1.0) -> Labeller:
     """Return frames of different quality: errors of up to 60 % of the image."""
     share = strength * rng.uniform(0, 0.6, len(flight.poses))
-    return in_blobs(lambda seen: np.full(len(seen.u), share[seen.frame]), flight, K, rng)
+    return in_blobs(lambda image: np.full(len(image.u), share[image.frame]), flight, K, rng)
 
 
 def classes(flight: Flight, K: int, rng: np.random.Generator, strength: float = 1.0) -> Labeller:
     """Return errors of every third class: half of its blocks are taken for the next one."""
     error = squares(flight, BLOCK, rng)
 
-    def label(seen: Seen) -> Ints:
-        taken = (seen.truth % 3 == 0) & (error(seen) < 0.5 * strength)
-        return np.where(taken, (seen.truth + 1) % K, seen.truth)
+    def label(image: ImagePoints) -> Ints:
+        taken = (image.truth % 3 == 0) & (error(image) < 0.5 * strength)
+        return np.where(taken, (image.truth + 1) % K, image.truth)
 
     return label
 
@@ -136,10 +136,10 @@ def border(flight: Flight, K: int, rng: np.random.Generator, strength: float = 1
     """Return borders in the wrong place: the class of where another ray goes, up to 2 pixels away."""
     right, down = smooth(flight, BLOB, rng), smooth(flight, BLOB, rng)
 
-    def label(seen: Seen) -> Ints:
-        du, dv = (strength * SHIFT * np.clip(field(seen) / 2, -1, 1) for field in (right, down))
-        shown = flight.look(seen.frame, seen.u + du, seen.v + dv).truth
-        return np.where(shown >= 0, shown, seen.truth)
+    def label(image: ImagePoints) -> Ints:
+        du, dv = (strength * SHIFT * np.clip(field(image) / 2, -1, 1) for field in (right, down))
+        moved = flight.look(image.frame, image.u + du, image.v + dv).truth
+        return np.where(moved >= 0, moved, image.truth)
 
     return label
 
@@ -150,39 +150,39 @@ def burst(flight: Flight, K: int, rng: np.random.Generator, strength: float = 1.
     bad = max(1, F // 4)
     first = rng.integers(0, F - bad + 1)
     share = strength * np.where((np.arange(F) >= first) & (np.arange(F) < first + bad), 0.6, 0.05)
-    return in_blobs(lambda seen: np.full(len(seen.u), share[seen.frame]), flight, K, rng)
+    return in_blobs(lambda image: np.full(len(image.u), share[image.frame]), flight, K, rng)
 
 
 def lasting(flight: Flight, K: int, rng: np.random.Generator, strength: float = 1.0) -> Labeller:
     """Return errors that stay at their place for 4 frames."""
     fields = [of_place(METRES, rng) for _ in range(len(flight.poses) // LASTS + 1)]
     least = norm.isf(0.25 * strength)
-    return lambda seen: np.where(fields[seen.frame // LASTS](seen) > least, (seen.truth + 1) % K, seen.truth)
+    return lambda image: np.where(fields[image.frame // LASTS](image) > least, (image.truth + 1) % K, image.truth)
 
 
 def with_range(most: float) -> Errors:
     """Return errors that grow with range, from none to `most`, between the 5 and 95 % quantiles over the pixels."""
 
     def errors(flight: Flight, K: int, rng: np.random.Generator, strength: float = 1.0) -> Labeller:
-        distance = np.concatenate([seen.distance[seen.face >= 0] for seen in flight.images])
+        distance = np.concatenate([image.distance[image.face >= 0] for image in flight.images])
         low, high = np.quantile(distance, (0.05, 0.95))
         far = strength * most / (high - low)
-        return in_blobs(lambda seen: np.clip(far * (seen.distance - low), 0, strength * most), flight, K, rng)
+        return in_blobs(lambda image: np.clip(far * (image.distance - low), 0, strength * most), flight, K, rng)
 
     return errors
 
 
 def grazing(flight: Flight, K: int, rng: np.random.Generator, strength: float = 1.0) -> Labeller:
     """Return errors that grow from 30 degrees off the surface's normal to 70 % at 90."""
-    return in_blobs(lambda seen: 0.7 * strength * np.clip((seen.angle - 30) / 60, 0, 1), flight, K, rng)
+    return in_blobs(lambda image: 0.7 * strength * np.clip((image.angle - 30) / 60, 0, 1), flight, K, rng)
 
 
 def corners(flight: Flight, K: int, rng: np.random.Generator, strength: float = 1.0) -> Labeller:
     """Return errors that grow with the square of the image radius, to 60 % in the corners."""
     H, W = flight.sensor.height, flight.sensor.width
 
-    def share(seen: Seen) -> Array:
-        away = (seen.u - (W - 1) / 2) ** 2 + (seen.v - (H - 1) / 2) ** 2
+    def share(image: ImagePoints) -> Array:
+        away = (image.u - (W - 1) / 2) ** 2 + (image.v - (H - 1) / 2) ** 2
         return np.clip(0.6 * strength * away / ((W / 2) ** 2 + (H / 2) ** 2), 0, 1)
 
     return in_blobs(share, flight, K, rng)
@@ -199,10 +199,10 @@ def unlabelled(labeller: Labeller, share: float, flight: Flight, rng: np.random.
     """Return the labeller without labels in blobs, a share of each image, and at pixels without a surface."""
     field = smooth(flight, BLOB, rng)
 
-    def label(seen: Seen) -> Ints:
-        without = seen.face < 0
+    def label(image: ImagePoints) -> Ints:
+        without = image.face < 0
         if share:
-            without |= field(seen) < norm.ppf(share)
-        return np.where(without, IGNORED, labeller(seen))
+            without |= field(image) < norm.ppf(share)
+        return np.where(without, IGNORED, labeller(image))
 
     return label

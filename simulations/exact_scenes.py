@@ -114,7 +114,10 @@ class Scene:
             for face, corners in enumerate(one.polygons[:-1])  # no camera is below a solid
             for i in range(1, len(corners) - 1)
         ]
-        self._faces, self._triangles = np.array([face for face, _ in fans]), np.stack([own for _, own in fans])
+        self._faces, self._triangles = (
+            np.array([face for face, _ in fans]),
+            np.stack([triangles for _, triangles in fans]),
+        )
         a, b, c = self._triangles.transpose(1, 0, 2)
         self._areas = np.linalg.norm(np.cross(b - a, c - a), axis=1) / 2
 
@@ -149,8 +152,8 @@ class Scene:
     def true_class(self, points: Array, face: Ints) -> Ints:
         """Return the classes (n,) of points (n, 3) of faces (n,); -1 without a face."""
         classes = np.where(face >= 0, self.classes[face], -1)
-        for own, texture in self.textures.items():
-            at = np.flatnonzero(face == own)
+        for number, texture in self.textures.items():
+            at = np.flatnonzero(face == number)
             if len(at):
                 classes[at] = texture(points[at])
         return classes

@@ -90,7 +90,7 @@ class Spinning:
 
 
 @dataclass(frozen=True)
-class Seen:
+class ImagePoints:
     """Surface points that one frame sees at image coordinates.
 
     Attributes:
@@ -122,15 +122,15 @@ class Flight:
     sensor: Sensor
     poses: Array
 
-    def look(self, frame: int, u: Array, v: Array) -> Seen:
+    def look(self, frame: int, u: Array, v: Array) -> ImagePoints:
         """Return what a frame sees at image coordinates."""
         R, centre = self.poses[frame, :3, :3], self.poses[frame, :3, 3]
         ways = self.sensor.rays(u, v) @ R.T
         t, face = self.scene.cast(centre, ways)
         far = t * np.linalg.norm(ways, axis=1) > self.sensor.reach
-        return self._seen(frame, u, v, ways, np.where(far, np.inf, t), np.where(far, -1, face))
+        return self._image_points(frame, u, v, ways, np.where(far, np.inf, t), np.where(far, -1, face))
 
-    def meet(self, frame: int, points: Array, face: Ints) -> tuple[Ints, Seen]:
+    def meet(self, frame: int, points: Array, face: Ints) -> tuple[Ints, ImagePoints]:
         """Return which points (n, 3) of faces (n,) a frame sees, and what it sees there: nothing else is nearer."""
         R, centre = self.poses[frame, :3, :3], self.poses[frame, :3, 3]
         with np.errstate(invalid="ignore"):
@@ -143,17 +143,17 @@ class Flight:
         some = some[t >= 1 - 1e-6]
         ways = self.sensor.rays(u[some], v[some]) @ R.T
         t = np.linalg.norm(points[some] - centre, axis=1) / np.linalg.norm(ways, axis=1)
-        return some, self._seen(frame, u[some], v[some], ways, t, face[some])
+        return some, self._image_points(frame, u[some], v[some], ways, t, face[some])
 
-    def _seen(self, frame: int, u: Array, v: Array, ways: Array, t: Array, face: Ints) -> Seen:
+    def _image_points(self, frame: int, u: Array, v: Array, ways: Array, t: Array, face: Ints) -> ImagePoints:
         along = np.where(face >= 0, t, 0.0)[:, None] * ways
         point, length = self.poses[frame, :3, 3] + along, np.linalg.norm(ways, axis=1)
         cosine = np.abs((ways * self.scene.normals[face]).sum(axis=1)) / length
         angle = np.degrees(np.arccos(np.clip(cosine, 0, 1)))
-        return Seen(frame, u, v, t, point, face, self.scene.true_class(point, face), t * length, angle)
+        return ImagePoints(frame, u, v, t, point, face, self.scene.true_class(point, face), t * length, angle)
 
     @cached_property
-    def images(self) -> list[Seen]:
+    def images(self) -> list[ImagePoints]:
         """Surface points that each frame sees in the middles of its pixels, row by row."""
         v, u = np.mgrid[: self.sensor.height, : self.sensor.width].reshape(2, -1).astype(float)
         return [self.look(frame, u, v) for frame in range(len(self.poses))]
@@ -180,11 +180,11 @@ def orbit(frames: int, rng: np.random.Generator) -> Array:
 def strips(frames: int, rng: np.random.Generator) -> Array:
     """Return poses of a camera that looks straight down from 18 m, in parallel lines, there and back."""
     lines = max(1, round(np.sqrt(frames / 1.5)))
-    each = -(-frames // lines)
+    of_line = -(-frames // lines)
     poses = []
     for k in range(frames):
-        line, step = divmod(k, each)
-        x = (step - (each - 1) / 2) * 4.5 * (1 if line % 2 == 0 else -1)
+        line, step = divmod(k, of_line)
+        x = (step - (of_line - 1) / 2) * 4.5 * (1 if line % 2 == 0 else -1)
         centre = np.array([x, (line - (lines - 1) / 2) * 8.0, 18.0]) + rng.normal(0, 0.3, 3)
         poses.append(_looking(centre, np.append(rng.normal(0, 0.02, 2), -1.0)))
     return np.stack(poses)

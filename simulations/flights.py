@@ -136,9 +136,9 @@ def fly(flight: Flight, over: World, rng: np.random.Generator, ease: float | Non
     n, F = len(over.index), flight.frames
     off = over.index[:, :1] - (np.arange(F) + 0.5) / F * flight.side
     width = flight.side * flight.observations / F
-    seen = np.ones((n, F), bool) if flight.observations >= F else np.abs(off) <= width / 2
-    voxel, frame = np.nonzero(seen)
-    off = off[seen] / width
+    visible = np.ones((n, F), bool) if flight.observations >= F else np.abs(off) <= width / 2
+    voxel, frame = np.nonzero(visible)
+    off = off[visible] / width
     harder = over.hard[voxel] - (flight.ease if ease is None else ease) + qualities(flight, rng)[frame]
     if flight.quality == "view":
         harder = harder + 3 * np.abs(off) - 0.7

@@ -128,7 +128,7 @@ def named(made: Made, bad: bool, rng: np.random.Generator) -> tuple[set[int], se
         sampler.add(dataclasses.replace(frame, labels=labels))
     spots = sampler.sample()
     found = outlying_frames(lone_disagreement(spots), len(spots.views))
-    return planted, {each.frame for each in found.frames}
+    return planted, {outlier.frame for outlier in found.frames}
 
 
 def main(trials: int = 100, seed: int = 0) -> None:
@@ -139,8 +139,8 @@ def main(trials: int = 100, seed: int = 0) -> None:
         innocent = exact = found = planted = 0
         for trial in range(trials):
             rng = np.random.default_rng([seed, trial, bad])
-            truth, own = named(Made.drawn(np.random.default_rng([seed, trial]), uneven), bad, rng)
-            innocent, exact = innocent + bool(own - truth), exact + (own == truth)
-            found, planted = found + len(own & truth), planted + len(truth)
+            truth, blamed = named(Made.drawn(np.random.default_rng([seed, trial]), uneven), bad, rng)
+            innocent, exact = innocent + bool(blamed - truth), exact + (blamed == truth)
+            found, planted = found + len(blamed & truth), planted + len(truth)
         share = f"{found / planted:.3f}" if planted else "-"
         cases.row([name, str(trials), str(innocent), str(exact), share])

@@ -57,15 +57,15 @@ def rates(flight: Flight, trials: int, seed: int, scope: Scope = THIS_SCENE) -> 
     totals = 0.0
     for trial in range(trials):
         rng = np.random.default_rng([seed, trial])
-        base, *new = own = models(flight, scope != OTHER_SCENES, rng)
-        totals += np.array([totals_of(each, "alpha") for each in own])
-        found.append([bounded(RULE, each, base, level=LEVEL, scope=scope) for each in new])
+        base, *new = all_models = models(flight, scope != OTHER_SCENES, rng)
+        totals += np.array([totals_of(model, "alpha") for model in all_models])
+        found.append([bounded(RULE, model, base, level=LEVEL, scope=scope) for model in new])
     alphas = number_of(totals, "alpha")
     margin = float(alphas[0] - alphas[2])
     rule = dataclasses.replace(RULE, limit=margin)
-    said = [[verdict(rule, each) for each in column] for column in zip(*found, strict=True)]
+    said = [[verdict(rule, model) for model in column] for column in zip(*found, strict=True)]
     asked = [(0, "fails"), (0, "passes"), (1, "passes"), (1, "fails"), (1, "undecided")]
-    return [margin, *(float(np.mean([each == what for each in said[which]])) for which, what in asked)]
+    return [margin, *(float(np.mean([model == what for model in said[which]])) for which, what in asked)]
 
 
 HEAD = [

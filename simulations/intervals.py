@@ -135,8 +135,8 @@ def _flown(count: int, seed: int, scope: Scope) -> Iterator[Row]:
 def _of_frames(
     flight: Flight, count: int, seed: int, scope: Scope, where: str = "", key: str = "voxel_alpha"
 ) -> Iterator[Row]:
-    seen = "all see all" if flight.observations == flight.frames else "strips"
-    name = ", ".join(filter(None, (f"{flight.frames} frames", flight.quality, seen, where)))
+    overlap = "all see all" if flight.observations == flight.frames else "strips"
+    name = ", ".join(filter(None, (f"{flight.frames} frames", flight.quality, overlap, where)))
     yield from trials(flight, count, seed, scope, (key,), name)
 
 

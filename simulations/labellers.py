@@ -48,8 +48,8 @@ def rows(scene: str, frames: int, width: int) -> Iterator[list[str]]:
             results.append(semstab.load_result(out))
         plain, judged = results
         for name in names:
-            (own,), (true,) = plain.select(model=name), judged.select(model=name)
-            found, right = own.statistics, true.statistics
+            (record,), (true,) = plain.select(model=name), judged.select(model=name)
+            found, right = record.statistics, true.statistics
             said = [text for text in warnings(plain) if name in text or text.startswith("stable says")]
             reasons = [
                 reason for part, reason in REASONS.items() if any(part in text and name in text for text in said)
@@ -57,7 +57,7 @@ def rows(scene: str, frames: int, width: int) -> Iterator[list[str]]:
             numbers = right.headline.wrong_of_consistent_op3.value, right.correctness.accuracy_op2.value
             yield [
                 name, f"{found.headline.alpha.value:.2f}", f"{100 * found.spots.labelled:.0f}",
-                f"{100 * own.image_space.edge_recall:.0f}", f"{own.image_space.compensated_flicker_percent:.1f}",
+                f"{100 * record.image_space.edge_recall:.0f}", f"{record.image_space.compensated_flicker_percent:.1f}",
                 found.verdict.level, ", ".join(reasons), right.verdict.level, f"{100 * numbers[0]:.0f}",
                 f"{100 * numbers[1]:.0f}",
             ]  # fmt: skip

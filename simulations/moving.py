@@ -123,7 +123,7 @@ class Street:
             world, centre = rays @ T_wc[:3, :3].T, T_wc[:3, 3]
             with np.errstate(divide="ignore", invalid="ignore"):
                 depth = np.where(world[..., 2] < -1e-3, -centre[2] / world[..., 2], np.inf)
-                shown = np.zeros((H, W), np.int64)
+                objects = np.zeros((H, W), np.int64)
                 for number, box in enumerate(self.boxes, 1):
                     low, high = box.at(index)
                     if (part := _part(low, high, T_wc)) is None:
@@ -131,9 +131,9 @@ class Street:
                     faces = (np.stack([low, high]) - centre)[:, None, None] / world[part]
                     enter, leave = faces.min(axis=0).max(axis=-1), faces.max(axis=0).min(axis=-1)
                     hit = (enter <= leave) & (enter > 0.1) & (enter < depth[part])
-                    depth[part], shown[part] = np.where(hit, enter, depth[part]), np.where(hit, number, shown[part])
+                    depth[part], objects[part] = np.where(hit, enter, depth[part]), np.where(hit, number, objects[part])
             depth = np.where(depth < 60, depth * (1 + noise * rng.standard_normal((H, W))), 0)
-            yield Frame(index, depth.astype(np.float32), CAMERA, T_wc, labels=self.classes[shown]), shown
+            yield Frame(index, depth.astype(np.float32), CAMERA, T_wc, labels=self.classes[objects]), objects
 
     @property
     def classes(self) -> np.ndarray:
@@ -144,13 +144,13 @@ class Street:
     def asked(self, noise: float, rng: np.random.Generator) -> tuple[SpotObservations, np.ndarray]:
         """Return the answers of the model, and the number of what each spot is on; -1 for a spot without answers."""
         model, ids = Sampler(CLASSES), Sampler(len(self.boxes) + 1, moving=False)
-        for frame, shown in self.frames(noise, rng):
+        for frame, objects in self.frames(noise, rng):
             assert frame.labels is not None
             place = np.kron(rng.random((H // 8, W // 8)), np.ones((8, 8)))
             wrong = np.where(frame.labels == 3, rng.random() < WRONG_MOVER, place < WRONG)
             labels = np.where(wrong, (frame.labels + 2) % CLASSES, frame.labels).astype(np.uint8)
             model.add(dataclasses.replace(frame, labels=labels))
-            ids.add(dataclasses.replace(frame, labels=shown.astype(np.uint8)))
+            ids.add(dataclasses.replace(frame, labels=objects.astype(np.uint8)))
         spots, of_ids = model.sample(), ids.sample()
         first = np.full(len(spots.point), -1)
         first[of_ids.spot[::-1]] = of_ids.label[::-1]
@@ -187,14 +187,14 @@ class Counts:
     def add(self, spots: SpotObservations, mover: np.ndarray, far: np.ndarray, counted: np.ndarray) -> None:
         """Add spots (n,): on a mover, on one that went by its length, with answers."""
         assert spots.votes is not None
-        moved, known = spots.votes.moved & counted, spots.votes.known & counted
+        moved, told = spots.votes.moved & counted, spots.votes.known & counted
         self.called, self.right = self.called + int(moved.sum()), self.right + int((moved & mover).sum())
-        self.movers, self.known = self.movers + int(far.sum()), self.known + int((far & known).sum())
+        self.movers, self.known = self.movers + int(far.sum()), self.known + int((far & told).sum())
         self.found += int((far & moved).sum())
-        self.static, self.wrong = self.static + int((known & ~mover).sum()), self.wrong + int((moved & ~mover).sum())
+        self.static, self.wrong = self.static + int((told & ~mover).sum()), self.wrong + int((moved & ~mover).sum())
 
     def __add__(self, other: Counts) -> Counts:
-        return Counts(*(getattr(self, each.name) + getattr(other, each.name) for each in dataclasses.fields(self)))
+        return Counts(*(getattr(self, field.name) + getattr(other, field.name) for field in dataclasses.fields(self)))
 
     def cells(self) -> list[str]:
         def part(a: int, b: int) -> str:
@@ -234,9 +234,9 @@ def made(scenes: int, seed: int, noises: tuple[float, ...], movers: int) -> None
                 counts.errors.append(abs(error))
             for number, box in enumerate(street.boxes, 1):
                 if box.speed and noise == noises[0]:
-                    own = on == number
+                    of_object = on == number
                     sums = by_speed.setdefault((box.way, round(abs(box.speed) / box.size[0], 3)), [0, 0, 0])
-                    for k, some in enumerate((own, own & spots.votes.known, own & spots.votes.moved)):
+                    for k, some in enumerate((of_object, of_object & spots.votes.known, of_object & spots.votes.moved)):
                         sums[k] += int(some.sum())
         off = np.array(counts.errors)
         share = f"{off.mean():.3f}, {off.max():.2f}, {np.count_nonzero(off > 0.1)}" if movers else "-"
@@ -245,9 +245,9 @@ def made(scenes: int, seed: int, noises: tuple[float, ...], movers: int) -> None
         return
     print()
     cases.head(["way", "lengths a frame", "spots", "told", "moved", "of told"])
-    for (way, speed), (all_, known, moved) in sorted(by_speed.items()):
+    for (way, speed), (all_, told, moved) in sorted(by_speed.items()):
         cases.row(
-            [way, f"{speed:g}", str(all_), str(known), f"{moved / max(all_, 1):.3f}", f"{moved / max(known, 1):.3f}"]
+            [way, f"{speed:g}", str(all_), str(told), f"{moved / max(all_, 1):.3f}", f"{moved / max(told, 1):.3f}"]
         )
 
 
@@ -265,7 +265,7 @@ def city() -> None:
             spots = sampler.sample()
             first = np.full(len(spots.point), -1)
             first[spots.spot[::-1]] = spots.label[::-1]
-            mover = np.isin(first, [space.classes.index(each) for each in ("moving car", "human")])
+            mover = np.isin(first, [space.classes.index(mover_class) for mover_class in ("moving car", "human")])
             counts = Counts()
             counts.add(spots, mover, mover, first >= 0)
             cases.row([name, str(frames), *counts.cells()])
@@ -288,10 +288,10 @@ def real(data: Path) -> None:
         spots = sampler.sample()
         votes, answered = spots.votes, np.unique(spots.spot)
         assert votes is not None
-        known, moved = votes.known[answered], votes.moved[answered]
-        share = f"{100 * moved.sum() / max(known.sum(), 1):.3f} %"
+        is_told, moved = votes.known[answered], votes.moved[answered]
+        share = f"{100 * moved.sum() / max(is_told.sum(), 1):.3f} %"
         chance, gap = f"{100 * votes.false_share:.4f} %", f"{100 * votes.gap:.1f} %"
-        told = f"{100 * known.mean():.0f} %"
+        told = f"{100 * is_told.mean():.0f} %"
         cases.row(
             [name, str(spots.frames), f"{len(answered):,}", told, share, chance, gap, str(int(votes.misplaced.sum()))]
         )

@@ -41,18 +41,18 @@ def scans(street: Street, noise: float, rng: np.random.Generator) -> Iterator[tu
         pose = np.eye(4)
         pose[:3, 3] = camera[0, 3], SIDE + camera[1, 3], HEIGHT
         distance = np.where(rays[:, 2] < 0, -HEIGHT / np.minimum(rays[:, 2], -1e-9), np.inf)
-        shown = np.zeros(len(rays), np.int64)
+        objects = np.zeros(len(rays), np.int64)
         for number, box in enumerate(street.boxes, 1):
             enter, leave = np.full(len(rays), -np.inf), np.full(len(rays), np.inf)
             for axis, (low, high) in enumerate(zip(*box.at(index), strict=True)):
                 a, b = ((side - pose[axis, 3]) * inverse[axis] for side in (low, high))
                 enter, leave = np.maximum(enter, np.minimum(a, b)), np.minimum(leave, np.maximum(a, b))
             hit = (enter <= leave) & (enter > 0.1) & (enter < distance)
-            distance, shown = np.where(hit, enter, distance), np.where(hit, number, shown)
+            distance, objects = np.where(hit, enter, distance), np.where(hit, number, objects)
         there = distance < RANGE
         points = rays[there] * (distance[there] + noise * rng.standard_normal(int(there.sum())))[:, None]
-        labels = street.classes[shown[there]]
-        yield Frame(index, points=points.astype(np.float32), labels=labels, T_wc=pose), shown[there]
+        labels = street.classes[objects[there]]
+        yield Frame(index, points=points.astype(np.float32), labels=labels, T_wc=pose), objects[there]
 
 
 def made(scenes: int, seed: int, noises: tuple[float, ...], movers: int) -> None:
@@ -62,13 +62,13 @@ def made(scenes: int, seed: int, noises: tuple[float, ...], movers: int) -> None
         for scene in range(scenes):
             street = Street.drawn(np.random.default_rng([seed, scene]), movers=movers)
             votes, ids = Sampler(CLASSES), Sampler(len(street.boxes) + 1, moving=False)
-            for frame, shown in scans(street, noise, np.random.default_rng([seed, scene, 2])):
+            for frame, objects in scans(street, noise, np.random.default_rng([seed, scene, 2])):
                 votes.add(frame)
-                ids.add(dataclasses.replace(frame, labels=shown.astype(np.uint8)))
+                ids.add(dataclasses.replace(frame, labels=objects.astype(np.uint8)))
             on = first_answers(ids)
             moves, far = (
-                np.array([False, *own])[on] & (on >= 0)
-                for own in (
+                np.array([False, *flags])[on] & (on >= 0)
+                for flags in (
                     [box.speed != 0 for box in street.boxes],
                     [box.speed != 0 and box.goes_its_length for box in street.boxes],
                 )
@@ -125,14 +125,18 @@ def _instances(folder: Path, scene: Scene) -> list[tuple[Float64, UInt8]]:
         said[-1][np.isin(stored & 0xFFFF, MOVING)] = MOVES
         things.append(stored >> 16)
     far = set()
-    for thing in np.unique(np.concatenate([own[of == MOVES] for own, of in zip(things, said, strict=True)])):
-        parts = [p[(own == thing) & (of == MOVES), :2] for p, own, of in zip(world, things, said, strict=True)]
+    for thing in np.unique(
+        np.concatenate([instances[of == MOVES] for instances, of in zip(things, said, strict=True)])
+    ):
+        parts = [
+            p[(instances == thing) & (of == MOVES), :2] for p, instances, of in zip(world, things, said, strict=True)
+        ]
         middles = np.array([(part.min(axis=0) + part.max(axis=0)) / 2 for part in parts if len(part)])
         length = max(float(np.hypot(*np.ptp(part, axis=0))) for part in parts if len(part))
         if np.hypot(*np.ptp(middles, axis=0)) >= length:
             far.add(int(thing))
-    for own, of in zip(things, said, strict=True):
-        of[(of == MOVES) & np.isin(own, list(far))] = WENT
+    for instances, of in zip(things, said, strict=True):
+        of[(of == MOVES) & np.isin(instances, list(far))] = WENT
     return list(zip(world, said, strict=True))
 
 
@@ -141,8 +145,8 @@ def _of_street(scene: Scene, scans: list[tuple[Float64, UInt8]]) -> tuple[Counts
     sampler = Sampler(4)
     for index, (world, said) in enumerate(scans):
         frame = scene.frame(index, "gt", color=False)
-        own = said if frame.is_scan else _on_image(frame, world, said)
-        sampler.add(dataclasses.replace(frame, labels=own.reshape(frame.shape), mask=None))
+        labels = said if frame.is_scan else _on_image(frame, world, said)
+        sampler.add(dataclasses.replace(frame, labels=labels.reshape(frame.shape), mask=None))
     spots, first, counts = sampler.sample(), first_answers(sampler), Counts()
     counts.add(spots, (first == MOVES) | (first == WENT), first == WENT, (first >= 0) & (first != UNSAID))
     assert spots.votes is not None
@@ -155,6 +159,6 @@ def _on_image(frame: Frame, world: Float64, labels: np.ndarray) -> np.ndarray:
     z = frame.depth[row, column].astype(np.float64)
     x, y = frame.rays
     point = np.stack([x[column] * z, y[row] * z, z], axis=1) @ frame.T_wc[:3, :3].T + frame.T_wc[:3, 3]
-    own = np.full(frame.shape, 255, np.uint8)
-    own[row, column] = labels[cKDTree(world).query(point)[1]]
-    return own
+    image = np.full(frame.shape, 255, np.uint8)
+    image[row, column] = labels[cKDTree(world).query(point)[1]]
+    return image

@@ -51,14 +51,14 @@ def scene(rng: np.random.Generator, frames: int = 30, height: int = 60, width: i
     boxes = low, low + rng.uniform(3, 8, low.shape), rng.uniform(2, 7, len(low))
     u, v = np.meshgrid(np.arange(width), np.arange(height))
     rays = np.stack([(u - width / 2) / (0.9 * width), (v - height / 2) / (0.9 * width), np.ones(u.shape)], axis=-1)
-    poses, seen = [], []
+    poses, casts = [], []
     for k in range(frames):
         centre = np.array(
             [*(RADIUS + rng.normal()) * _circle(2 * np.pi * turns * k / frames), HEIGHT + 0.5 * rng.normal()]
         )
         poses.append(_looking(centre, np.array([*rng.normal(0, 3, 2), 0.0])))
-        seen.append(_cast(poses[-1], rays, sites, of, boxes))
-    labels, there, points = (np.stack(own) for own in zip(*seen, strict=True))
+        casts.append(_cast(poses[-1], rays, sites, of, boxes))
+    labels, there, points = (np.stack(arrays) for arrays in zip(*casts, strict=True))
     return Views(labels, there, points, np.stack(poses))
 
 
@@ -111,8 +111,8 @@ def predicted(views: Views, kind: str, rate: float, model: int, flight: int) -> 
         model: Seed of the errors that a model repeats on every flight.
         flight: Seed of the errors that are new on each flight.
     """
-    own, new = np.random.default_rng([model, 1]), np.random.default_rng([model, flight, 2])
-    wrong = _WRONG[kind](views, rate, own, new)
+    of_model, new = np.random.default_rng([model, 1]), np.random.default_rng([model, flight, 2])
+    wrong = _WRONG[kind](views, rate, of_model, new)
     if isinstance(wrong, tuple):
         bad, instead = wrong
         return np.where(bad, instead, views.labels)
@@ -133,14 +133,14 @@ def _pixel(views: Views, rate: float, _: np.random.Generator, new: np.random.Gen
     return new.random(shape) < rate, (views.labels + new.integers(1, K, shape)) % K
 
 
-def _persistent(views: Views, rate: float, own: np.random.Generator, _: np.random.Generator) -> Wrong:
-    return field(views.points, own, 3.0) > norm.isf(rate)
+def _persistent(views: Views, rate: float, of_model: np.random.Generator, _: np.random.Generator) -> Wrong:
+    return field(views.points, of_model, 3.0) > norm.isf(rate)
 
 
-def _view(views: Views, rate: float, own: np.random.Generator, new: np.random.Generator) -> Wrong:
+def _view(views: Views, rate: float, of_model: np.random.Generator, new: np.random.Generator) -> Wrong:
     """Each location is hard from directions of its own, which neighbours have in common."""
     azimuth = np.arctan2(views.poses[:, 1, 3], views.poses[:, 0, 3])[:, None, None]
-    away = np.cos(np.pi * field(views.points, own, 6.0) - azimuth + 0.2 * new.normal(size=azimuth.shape))
+    away = np.cos(np.pi * field(views.points, of_model, 6.0) - azimuth + 0.2 * new.normal(size=azimuth.shape))
     return away > np.cos(np.pi * rate)
 
 
@@ -151,9 +151,9 @@ def _class(views: Views, rate: float, _: np.random.Generator, new: np.random.Gen
 
 def _boundary(views: Views, rate: float, _: np.random.Generator, new: np.random.Generator) -> Wrong:
     width = 1 + 2 * max(1, round(10 * rate))
-    near = [ndimage.maximum_filter(own, width) != ndimage.minimum_filter(own, width) for own in views.labels]
+    near = [ndimage.maximum_filter(image, width) != ndimage.minimum_filter(image, width) for image in views.labels]
     shift = new.integers(-(width // 2), width // 2 + 1, (len(views.labels), 2))
-    moved = [np.roll(own, tuple(by), (0, 1)) for own, by in zip(views.labels, shift, strict=True)]
+    moved = [np.roll(image, tuple(by), (0, 1)) for image, by in zip(views.labels, shift, strict=True)]
     return np.stack(near), np.stack(moved)
 
 
@@ -191,8 +191,8 @@ _WRONG: dict[str, Callable[[Views, float, np.random.Generator, np.random.Generat
 def frames(views: Views, labels: npt.NDArray[np.int64], stride: int = 1) -> Iterator[Frame]:
     """Yield the frames of a flight, of which every stride-th pixel of each axis is kept."""
     (H, W), f = views.shape, views.focal
-    for k, (pose, own, there) in enumerate(zip(views.poses, labels, views.there, strict=True)):
+    for k, (pose, label, there) in enumerate(zip(views.poses, labels, views.there, strict=True)):
         depth = ((views.points[k] - pose[:3, 3]) @ pose[:3, 2]).astype(np.float32)
-        shown = np.where(there, own, 255).astype(np.uint8)
+        visible = np.where(there, label, 255).astype(np.uint8)
         camera = Intrinsics(f, f, W / 2, H / 2)
-        yield Frame(k, np.where(there, depth, np.float32(0)), camera, pose, labels=shown).every(stride)
+        yield Frame(k, np.where(there, depth, np.float32(0)), camera, pose, labels=visible).every(stride)

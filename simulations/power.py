@@ -72,7 +72,7 @@ def found(flight: Flight, ease: float, trials: int, *, elsewhere: bool) -> list[
         hard = (over.hard + world(flight, rng).hard) / 2**0.5 if elsewhere else over.hard
         scenes = over, dataclasses.replace(over, hard=hard)
         old, new = (
-            sums_of(fly(flight, own, rng, at), over, flight) for own, at in zip(scenes, (EASE, ease), strict=True)
+            sums_of(fly(flight, scene, rng, at), over, flight) for scene, at in zip(scenes, (EASE, ease), strict=True)
         )
         change = sums_difference("psa", new, old)
         hits += change.p_value < 1 - CONFIDENCE and change.value < 0, verdict(RULE, bounded(RULE, new, old)) == "fails"

@@ -122,10 +122,10 @@ def expected(places: Places, others: Sequence[Places], *, by_class: bool) -> np.
     if not others:
         return np.full(len(places.wrong), math.nan)
     cells = (len(STEPS) + 1) * (len(SEEN) + 1)
-    classes = 1 + max(int(own.label.max(initial=0)) for own in [places, *others])
-    cell = np.concatenate([cells_of(own) for own in others])
-    label = np.concatenate([own.label for own in others])
-    wrong = np.concatenate([own.wrong for own in others]).astype(float)
+    classes = 1 + max(int(part.label.max(initial=0)) for part in [places, *others])
+    cell = np.concatenate([cells_of(part) for part in others])
+    label = np.concatenate([part.label for part in others])
+    wrong = np.concatenate([part.wrong for part in others]).astype(float)
     count, bad = np.bincount(cell, minlength=cells), np.bincount(cell, wrong, cells)
     of_cell = (bad + wrong.mean()) / (count + 1)
     if not by_class:
@@ -169,31 +169,34 @@ def city(count: int, width: int) -> Iterator[Places]:
 
 def of_run(run: str) -> Iterator[Places]:
     """Yield the maps of a run."""
-    own = open_run(run)
-    for name, entry in own.scenes.items():
+    run_files = open_run(run)
+    for name, entry in run_files.scenes.items():
         record = entry.with_voxels("this")
-        yield Places.of(own.model, name, record.table(), VoxelTable.load(record.truth_file))
+        yield Places.of(run_files.model, name, record.table(), VoxelTable.load(record.truth_file))
 
 
 def rows(maps: Sequence[Places], family: Callable[[str], str], *, by_class: bool) -> Iterator[list[str]]:
     """Yield the cells of each model; `family` has in common what may not be learnt from."""
-    for model in dict.fromkeys(own.model for own in maps):
-        flights = [own for own in maps if own.model == model]
-        others = [own for own in maps if family(own.model) != family(model)]
-        area = [own.auroc for own in flights]
-        seen = [own for own in area if not math.isnan(own)]
-        same = [expected(own, [each for each in flights if each is not own], by_class=by_class) for own in flights]
-        other = [expected(own, others, by_class=by_class) for own in flights]
-        disagree = [own.disagree for own in flights]
-        observations = sum(own.op.sum() for own in flights)
+    for model in dict.fromkeys(flight.model for flight in maps):
+        flights = [flight for flight in maps if flight.model == model]
+        others = [flight for flight in maps if family(flight.model) != family(model)]
+        area = [flight.auroc for flight in flights]
+        finite = [share for share in area if not math.isnan(share)]
+        same = [
+            expected(flight, [another for another in flights if another is not flight], by_class=by_class)
+            for flight in flights
+        ]
+        other = [expected(flight, others, by_class=by_class) for flight in flights]
+        disagree = [flight.disagree for flight in flights]
+        observations = sum(flight.op.sum() for flight in flights)
         yield [
-            model, percent(own.wrong for own in flights),
-            f"{np.mean(seen):.2f} ({min(seen):.2f} to {max(seen):.2f})" if seen else "-", percent(disagree),
-            percent(own.wrong[own.disagree] for own in flights),
+            model, percent(flight.wrong for flight in flights),
+            f"{np.mean(finite):.2f} ({min(finite):.2f} to {max(finite):.2f})" if finite else "-", percent(disagree),
+            percent(flight.wrong[flight.disagree] for flight in flights),
             percent(chance[where] for chance, where in zip(same, disagree, strict=True)),
             percent(chance[where] for chance, where in zip(other, disagree, strict=True)), percent(other),
-            f"{100 * (1 - sum(own.right.sum() for own in flights) / observations):.1f}",
-            f"{100 * (1 - sum(own.agreeing.sum() for own in flights) / observations):.1f}",
+            f"{100 * (1 - sum(flight.right.sum() for flight in flights) / observations):.1f}",
+            f"{100 * (1 - sum(flight.agreeing.sum() for flight in flights) / observations):.1f}",
         ]  # fmt: skip
 
 
@@ -221,13 +224,13 @@ def main(
     elif study == "city":
         maps = list(city(frames, width))
     else:
-        maps = [own for one in run for own in of_run(one)]
+        maps = [places for folder in run for places in of_run(folder)]
     cases.head(HEAD)
     told = list(rows(maps, lambda model: model.split(",")[0], by_class=study != "runs"))
     for cells in told:
         cases.row(cells)
     for column in ("as on its other flights", "as with other models"):
         pairs = [(cells[HEAD.index("wrong there, %")], cells[HEAD.index(column)]) for cells in told]
-        off = [abs(float(own) - float(other)) for own, other in pairs if other != "-"]
+        off = [abs(float(chance) - float(other)) for chance, other in pairs if other != "-"]
         if off:
             print(f"\n{column}: off by {np.median(off):.1f} points in the median, {max(off):.1f} at most")

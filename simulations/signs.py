@@ -64,9 +64,9 @@ def to_border_in_map(table: VoxelTable) -> np.ndarray:
     label, centers = dominant(table), table.centers
     distance = np.full(len(table), np.inf)
     for k in np.unique(label):
-        own = label == k
-        if not own.all():
-            distance[own] = cKDTree(centers[~own]).query(centers[own])[0]
+        of_class = label == k
+        if not of_class.all():
+            distance[of_class] = cKDTree(centers[~of_class]).query(centers[of_class])[0]
     return distance
 
 
@@ -101,12 +101,12 @@ def in_frames(task: Task, scored: Task | None, table: VoxelTable, stride: int) -
     row = np.concatenate([row for row, _ in found])
     order = np.argsort(row, kind="stable")
     row, signs_of = row[order], np.concatenate([means for _, means in found])[order]
-    seen, first, frames = np.unique(row, return_index=True, return_counts=True)
+    visible, first, frames = np.unique(row, return_index=True, return_counts=True)
     result = {}
     for k, name in enumerate((NEAR, UNSURE)):
         one, every = np.full((2, len(table)), math.nan)
-        one[seen] = signs_of[first + frames // 2, k]
-        every[seen] = np.add.reduceat(signs_of[:, k], first) / frames
+        one[visible] = signs_of[first + frames // 2, k]
+        every[visible] = np.add.reduceat(signs_of[:, k], first) / frames
         result |= {f"{name}: one frame": one, f"{name}: all": every}
     return result
 
@@ -132,22 +132,22 @@ def of_run(run: str, scores: str | None) -> tuple[str, list[Mapping[str, float]]
         run: FOLDER:MODEL.
         scores: The label source of the same folder whose scores tell how sure the model is; by default its own.
     """
-    own, numbers = open_run(run), []
-    assert own.source is not None
-    folder = Path(own.source)
+    opened, numbers = open_run(run), []
+    assert opened.source is not None
+    folder = Path(opened.source)
     config = semstab.load_config(folder / "config.yaml")
     for name, scene in open_scenes(config, folder).items():
         tasks = {task.model: task for task in tasks_of(scene, config)}
-        record = own.scenes[name].with_voxels("this")
+        record = opened.scenes[name].with_voxels("this")
         table = record.table()
         true = join_truth(table, VoxelTable.load(record.truth_file)).label
         some = (true >= 0) & (table.op >= SEEN)
         wrong = dominant(table)[some] != true[some]
         signs = {DISAGREE: 1 - np.nan_to_num(psa(table)), IN_MAP: -to_border_in_map(table)}
-        signs |= in_frames(tasks[own.model], tasks[scores] if scores else None, table, config.pixel_stride)
+        signs |= in_frames(tasks[opened.model], tasks[scores] if scores else None, table, config.pixel_stride)
         areas = {sign: auroc(signs[sign][some], wrong) for sign in SIGNS}
         numbers.append({"places": len(wrong), "wrong": wrong.mean(), **areas})
-    return own.model, numbers
+    return opened.model, numbers
 
 
 def table(runs: Sequence[str], scores: str | None) -> None:
@@ -155,20 +155,20 @@ def table(runs: Sequence[str], scores: str | None) -> None:
     cases.head(["model", "places", "wrong, %", *SIGNS])
     for run in runs:
         model, numbers = of_run(run, scores)
-        places = sum(own["places"] for own in numbers)
-        wrong = sum(own["places"] * own["wrong"] for own in numbers) / places
+        places = sum(counts["places"] for counts in numbers)
+        wrong = sum(counts["places"] * counts["wrong"] for counts in numbers) / places
         cells = [
             model,
             f"{places:.0f}",
             f"{100 * wrong:.1f}",
-            *(_over([own[sign] for own in numbers]) for sign in SIGNS),
+            *(_over([counts[sign] for counts in numbers]) for sign in SIGNS),
         ]
         cases.row(cells)
 
 
 def _over(values: Sequence[float]) -> str:
     """Return 'mean (least to most)' of the scenes that have a value."""
-    known = [value for value in values if not math.isnan(value)]
-    if not known:
+    numbers = [value for value in values if not math.isnan(value)]
+    if not numbers:
         return "-"
-    return f"{np.mean(known):.2f}" + (f" ({min(known):.2f} to {max(known):.2f})" if len(values) > 1 else "")
+    return f"{np.mean(numbers):.2f}" + (f" ({min(numbers):.2f} to {max(numbers):.2f})" if len(values) > 1 else "")

@@ -70,7 +70,7 @@ def _residual(grid: Influences) -> np.ndarray:
 def _blocked(cell: np.ndarray) -> np.ndarray:
     """Return the sums (G, B) over blocks of successive frames."""
     F = cell.shape[1]
-    return np.stack([own.sum(axis=1) for own in np.array_split(cell, max(2, math.isqrt(F)), axis=1)], axis=1)
+    return np.stack([part.sum(axis=1) for part in np.array_split(cell, max(2, math.isqrt(F)), axis=1)], axis=1)
 
 
 def _clustered(grid: Influences, cell: np.ndarray, scope: Scope) -> Spread:
@@ -89,15 +89,15 @@ METHODS: Mapping[str, Callable[[Influences, Scope], Spread]] = {
 
 def conditions(scope: Scope) -> Iterator[tuple[str, Flight, str]]:
     """Yield the name, the flight and the number of each condition of `intervals.py`."""
-    kept: list[tuple[str, Flight, str]] = []
+    later: list[tuple[str, Flight, str]] = []
 
     def note(flight: Flight, _count: int, _seed: int, _scope: Scope, keys: tuple[str, ...], name: str) -> list[object]:
-        kept.extend((name, flight, key) for key in keys)
+        later.extend((name, flight, key) for key in keys)
         return []
 
     with mock.patch.object(study, "trials", note):
         list((study.this_scene if scope == THIS_SCENE else study.other_scenes)(0, 0))
-    yield from kept
+    yield from later
 
 
 def rows(flight: Flight, key: str, count: int, seed: int, scope: Scope) -> Mapping[str, tuple[float, float]]:
@@ -112,8 +112,8 @@ def rows(flight: Flight, key: str, count: int, seed: int, scope: Scope) -> Mappi
         totals.append(sum(totals_of(sums, key) for sums in flown))
         for name, method in METHODS.items():
             with mock.patch.object(intervals, "spread_of", method):
-                own = intervals.estimate(flown[0], key, scope=scope)
-            found[name].append((own.low, own.high))
+                interval = intervals.estimate(flown[0], key, scope=scope)
+            found[name].append((interval.low, interval.high))
     target = number_of(np.array(totals) if scope == THIS_SCENE else np.sum(totals, axis=0)[None], key)
     result = {}
     for name, ends in found.items():

@@ -22,7 +22,7 @@ import numpy as np
 from exact import Condition, frames
 from exact_errors import ERRORS, IGNORED, Labeller
 from exact_scenes import Array, Ints, Scene, Solid, rectangle, yard
-from exact_views import PATHS, Flight, Pinhole, Seen
+from exact_views import PATHS, Flight, ImagePoints, Pinhole
 
 from semstab.data.statistics import TwoVisits
 from semstab.statistics.visit_agreement import two_visits
@@ -82,12 +82,12 @@ class Made:
     def of(cls, visits: Visits, seed: int, size: tuple[int, int]) -> Made:
         """Make them."""
         streams = [np.random.default_rng(s) for s in np.random.SeedSequence([seed, 82]).spawn(7)]
-        scene, boxes, *paths = streams[:4]
-        both = yard(K, scene).solids
+        of_scene, boxes, *paths = streams[:4]
+        both = yard(K, of_scene).solids
         alone = tuple([_box(boxes) for _ in range(visits.boxes)] for _ in range(2))
-        scenes = [Scene([*both, *own]) for own in alone]
+        scenes = [Scene([*both, *solids]) for solids in alone]
         course, sensor = PATHS[visits.path][1], Pinhole(size[1], size[0])
-        flights = [Flight(own, sensor, course(visits.frames, rng)) for own, rng in zip(scenes, paths, strict=True)]
+        flights = [Flight(scene, sensor, course(visits.frames, rng)) for scene, rng in zip(scenes, paths, strict=True)]
         errors = ERRORS[visits.error]
         at_place = [np.random.default_rng([seed, 7]) for _ in range(2)]  # errors of a place are the same
         drawn = at_place if visits.error == "place" else streams[4:6]
@@ -107,10 +107,10 @@ def _changing(labeller: Labeller, share: float, rng: np.random.Generator) -> Lab
     """Return labels of the next class in a share of the cubes of space."""
     chosen = rng.random((64, 64, 64)) < share
 
-    def label(seen: Seen) -> Ints:
-        own, cube = labeller(seen), np.floor(seen.point / EDGE + 1e-6).astype(int) % 64
-        other = chosen[tuple(cube.T)] & (own != IGNORED)
-        return np.where(other, (own + 1) % K, own)
+    def label(view: ImagePoints) -> Ints:
+        labels, cube = labeller(view), np.floor(view.point / EDGE + 1e-6).astype(int) % 64
+        other = chosen[tuple(cube.T)] & (labels != IGNORED)
+        return np.where(other, (labels + 1) % K, labels)
 
     return label
 
@@ -118,7 +118,7 @@ def _changing(labeller: Labeller, share: float, rng: np.random.Generator) -> Lab
 def said(made: Made, visits: Visits) -> tuple[VisitedSpots, TwoVisits]:
     """Return what the tool says."""
     sampler, like = VisitSampler(K), Condition(visits.path, visits.error, visits.frames, K)
-    series = [frames(*own, like, np.random.default_rng(0)) for own in zip(made.flights, made.labellers, strict=True)]
+    series = [frames(*pair, like, np.random.default_rng(0)) for pair in zip(made.flights, made.labellers, strict=True)]
     for visit, frame in by_turns(*series, (visits.frames, visits.frames)):
         sampler.add_of(visit, frame)
     visited = sampler.visits()
@@ -128,21 +128,21 @@ def said(made: Made, visits: Visits) -> tuple[VisitedSpots, TwoVisits]:
 def exact_across(made: Made, points: int, rng: np.random.Generator) -> Array:
     """Return alpha within the first flight, within the second one, and across, of points that did not change."""
     point, face = made.flights[0].scene.draw(points, rng)
-    kept = face < made.common_faces
-    point, face = point[kept], face[kept]
+    common = face < made.common_faces
+    point, face = point[common], face[common]
     counts = np.zeros((2, len(point), K))
     for visit, (flown, labeller) in enumerate(zip(made.flights, made.labellers, strict=True)):
         for frame in range(len(flown.poses)):
-            some, seen = flown.meet(frame, point, face)
-            label = labeller(seen)
-            named = label != IGNORED
-            np.add.at(counts[visit], (some[named], label[named]), 1)
+            some, view = flown.meet(frame, point, face)
+            label = labeller(view)
+            labelled = label != IGNORED
+            np.add.at(counts[visit], (some[labelled], label[labelled]), 1)
     counts = counts[:, (counts.sum(axis=2) >= 2).all(axis=0)]
     times = counts.sum(axis=2)
     weight, (p, q) = times.sum(axis=0), counts / times[..., None]
     within = ((counts * (counts - 1)).sum(axis=2) / (times * (times - 1))) @ weight / weight.sum()
     across = (p * q).sum(axis=1) @ weight / weight.sum()
-    P, Q = (own.T @ weight / weight.sum() for own in (p, q))
+    P, Q = (shares.T @ weight / weight.sum() for shares in (p, q))
     chance = np.array([P @ P, Q @ Q, P @ Q])
     return 1 - (1 - np.append(within, across)) / (1 - chance)
 

@@ -42,17 +42,23 @@ class Images:
             self.edge[i] = np.argwhere((edges > 0) & frame.valid)
             voxels.append(np.floor(back_project(frame).T / size).astype(np.int64))
         _, key = np.unique(np.concatenate(voxels), axis=0, return_inverse=True)
-        for i, own in zip(self.frames, np.split(key.ravel(), np.cumsum([*map(len, voxels)])[:-1]), strict=True):
-            self.key[i][self.key[i] != NONE] = own
-        known = {i: self.key[i][self.wrong[i] & (self.key[i] != NONE)] for i in self.frames}
-        self.errors = np.bincount(np.concatenate([*known.values()]), minlength=int(key.max()) + 1)
+        for i, keys in zip(self.frames, np.split(key.ravel(), np.cumsum([*map(len, voxels)])[:-1]), strict=True):
+            self.key[i][self.key[i] != NONE] = keys
+        of_wrong = {i: self.key[i][self.wrong[i] & (self.key[i] != NONE)] for i in self.frames}
+        self.errors = np.bincount(np.concatenate([*of_wrong.values()]), minlength=int(key.max()) + 1)
 
     def held(self, masks):
         """Pixels of [(frame, mask), ...], wrong ones; voxels shown, wrong pixels of all frames there, wrong voxels."""
         pixels = sum(int(mask.sum()) for _, mask in masks)
         wrong = sum(int((mask & self.wrong[i]).sum()) for i, mask in masks)
-        shown = np.unique(np.concatenate([self.key[i][mask & (self.key[i] != NONE)] for i, mask in masks]))
-        return pixels, wrong, len(shown), int(self.errors[shown].sum()), int((self.errors[shown] > 0).sum())
+        held_voxels = np.unique(np.concatenate([self.key[i][mask & (self.key[i] != NONE)] for i, mask in masks]))
+        return (
+            pixels,
+            wrong,
+            len(held_voxels),
+            int(self.errors[held_voxels].sum()),
+            int((self.errors[held_voxels] > 0).sum()),
+        )
 
 
 def window(shape, center, area):
@@ -99,7 +105,7 @@ def main(run: Path, model: str = "fcn", scores: str = "fcn-scores", most: int = 
     record, soft = (result.record(model=name) for name in (model, scores))
     with contextlib.ExitStack() as open_tasks:
         task, soft_task = (
-            open_tasks.enter_context(task_of(run, own, result.manifest["inputs"]))[0] for own in (record, soft)
+            open_tasks.enter_context(task_of(run, opened, result.manifest["inputs"]))[0] for opened in (record, soft)
         )
         tasks = annotation_tasks(ExportedUnit(result, record, columns=("op",)), task, most)
         images = Images(task, soft_task, ExportedUnit(result, record, columns=("op",)).first.table.voxel_size)

@@ -66,11 +66,11 @@ def main(size: str = "4000x2250", triangles: int = 400_000, rounds: int = 3) -> 
             of_the_bare_cast=seconds / max(table.rows[0]["CPU_s"] if table.rows else seconds, 1e-9),
         )
 
-    def each(work: Callable[[], object]) -> list[float]:
+    def timed(work: Callable[[], object]) -> list[float]:
         return [measuring.cpu_ms(work) for _ in range(rounds)]
 
-    say("embree, bare", *each(lambda: embree.run(origins, rays, query="DISTANCE")))
-    say("Open3D, bare", *each(lambda: theirs.cast_rays(both)))
+    say("embree, bare", *timed(lambda: embree.run(origins, rays, query="DISTANCE")))
+    say("Open3D, bare", *timed(lambda: theirs.cast_rays(both)))
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "hills.ply"
         trimesh.Trimesh(vertices, faces, process=False).export(path)
@@ -84,6 +84,6 @@ def main(size: str = "4000x2250", triangles: int = 400_000, rounds: int = 3) -> 
         surface = built()
         for step in ("frame", "again"):
             say(step, *(measuring.cpu_ms(surface.depth, view) for view in views))
-        kept = max(file.stat().st_size for file in Path(folder).rglob("*.cast"))
-    print(f"\n{size}, {len(faces):,} triangles; {kept / 1e6:.1f} MB a kept cast")
+        bytes_of_cast = max(file.stat().st_size for file in Path(folder).rglob("*.cast"))
+    print(f"\n{size}, {len(faces):,} triangles; {bytes_of_cast / 1e6:.1f} MB a kept cast")
     return table.rows

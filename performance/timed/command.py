@@ -81,7 +81,10 @@ def main(frames: int = 200, size: str = "640x480", voxel_size: float = 0.01, run
     print(f"{frames} frames, {voxels:,} voxels, {cores} cores")
     print("stages of the last default run:", {k: round(v, 1) for k, v in stages.items() if v >= 0.05}, end="\n\n")
     rows = {"default, cold": (cold.wall_s, cold.cpu_s)}
-    rows |= {one: (median(p.wall_s for p in own), median(p.cpu_s for p in own)) for one, own in taken.items()}
+    rows |= {
+        one: (median(p.wall_s for p in processes), median(p.cpu_s for p in processes))
+        for one, processes in taken.items()
+    }
     table, base = (
         measuring.Table(command="", wall_s=".1f", ratio=".2f", CPU_s=".1f", CPU_ratio=".2f"),
         rows["all three off"],

@@ -116,17 +116,17 @@ def main(
         size="", depth="", noise_mm="g", backend="", voxel_m=".2g", MB=".1f", decode_ms=".1f", loop_ms=".1f",
         ratio=".2f", CPU_ratio=".2f", whole_s=".2f", start_s=".2f", read_ms=".1f", fuse_ms=".1f", observe_ms=".1f",
     )  # fmt: skip
-    for each in size:
-        views = rendered(measuring.sides(each), frames)
+    for image_size in size:
+        views = rendered(measuring.sides(image_size), frames)
         for kind, level in itertools.product(depth, noise):
             with tempfile.TemporaryDirectory() as folder:
                 root = Path(folder) / "scene"
-                write_scene(root, views, measuring.sides(each), level, kind)
+                write_scene(root, views, measuring.sides(image_size), level, kind)
                 files = [*root.glob("depth/*"), *root.glob("labels/net/*"), *(root.glob("color/*") if recorded else ())]
                 files.sort(key=lambda path: path.stem)
                 for name in backend:
                     row = measured(root, files, name, runs, threads, voxel_size, recorded, frames)
-                    table.add(size=each, depth=kind, noise_mm=level, backend=name, **row)
+                    table.add(size=image_size, depth=kind, noise_mm=level, backend=name, **row)
                 shutil.rmtree(root)
     return table.rows
 
@@ -144,10 +144,10 @@ def measured(
 
     works = {"decode": decode, "run": lambda: run(root, backend, threads, voxel_size, recorded=recorded)}
     taken = {name: measuring.medians(rows) for name, rows in measuring.in_turns(works, runs).items()}
-    bare, own, each = taken["decode"], taken["run"], 1e3 / frames
+    bare, of_run, ms = taken["decode"], taken["run"], 1e3 / frames
     return {
-        "voxel_m": own["voxel_m"], "MB": sum(path.stat().st_size for path in files) / frames / 1e6,
-        "decode_ms": each * bare["wall"], "loop_ms": each * own["loop"], "ratio": own["loop"] / bare["wall"],
-        "CPU_ratio": own["loop_cpu"] / bare["cpu"], "whole_s": own["whole"], "start_s": own["start"],
-        **{f"{part}_ms": each * own[part] for part in ("read", "fuse", "observe")},
+        "voxel_m": of_run["voxel_m"], "MB": sum(path.stat().st_size for path in files) / frames / 1e6,
+        "decode_ms": ms * bare["wall"], "loop_ms": ms * of_run["loop"], "ratio": of_run["loop"] / bare["wall"],
+        "CPU_ratio": of_run["loop_cpu"] / bare["cpu"], "whole_s": of_run["whole"], "start_s": of_run["start"],
+        **{f"{part}_ms": ms * of_run[part] for part in ("read", "fuse", "observe")},
     }  # fmt: skip

@@ -95,7 +95,7 @@ def measure(
                 times[name][-1].append(measuring.cpu_ms(maps[name], frame))
         del maps
     return {
-        name: {"first_ms": median(own[0] for own in rounds_), "later_ms": median(t for own in rounds_ for t in own[1:])}
+        name: {"first_ms": median(ms[0] for ms in rounds_), "later_ms": median(t for ms in rounds_ for t in ms[1:])}
         for name, rounds_ in times.items()
     }
 

@@ -84,10 +84,10 @@ def measure(
 ) -> list[dict[str, Any]]:
     """Rows of the table for one map: ids, logits, and ids of several models."""
     backend = TorchMap(VOXEL_SIZE, K, device=device, reserve=voxels + voxels // 5)
-    places = seen = 0
-    while seen < voxels:
+    places = map_voxels = 0
+    while map_voxels < voxels:
         report = backend.integrate_tensors(*case.view(places), index=places, labels=case.ids)
-        seen, touched = report.map_voxels, report.voxels
+        map_voxels, touched = report.map_voxels, report.voxels
         places += 1
     visits = np.random.default_rng(0).integers(0, places, rounds).tolist()
     row_bytes = Columns(K, torch.float64, torch.device("cpu")).row_bytes
@@ -112,7 +112,7 @@ def measure(
     if several:
         works[f"ids x{MODELS}"] = (fuse_several, pixels * (4 + MODELS) + MODELS * of_rows)
     return [
-        {"voxels": seen, "input": name, "seconds": seconds(work, visits, backend.device), "bytes": size}
+        {"voxels": map_voxels, "input": name, "seconds": seconds(work, visits, backend.device), "bytes": size}
         for name, (work, size) in works.items()
     ]
 

@@ -80,8 +80,10 @@ def draw(rows: list[dict[str, Any]], file: Path) -> None:
     styles = {"frames": ("#0072B2", "o-"), "voxels": ("#D55E00", "s--"), "classes": ("#009E73", "^:")}  # Okabe and Ito
     for axis, cost, unit in ((axes[0], "ms", "CPU ms a frame"), (axes[1], "bytes", "bytes a voxel")):
         for growing, (color, style) in styles.items():
-            own = [row for row in rows if row["growing"] == growing]
-            axis.plot([row["times"] for row in own], [row[cost] for row in own], style, color=color, label=growing)
+            of_kind = [row for row in rows if row["growing"] == growing]
+            axis.plot(
+                [row["times"] for row in of_kind], [row[cost] for row in of_kind], style, color=color, label=growing
+            )
         axis.set_xscale("log", base=2)
         axis.set_ylim(0, 1.15 * max(row[cost] for row in rows))
         axis.set_ylabel(unit, fontsize=9)
@@ -116,10 +118,10 @@ def main(
     print()
     fits = measuring.Table(exponent="", ms=".2f", bytes=".2f")
     for what in growing:
-        own = [row for row in table.rows if row["growing"] == what]
-        factors = np.log([row["seen" if what == "voxels" else "times"] for row in own])
+        of_kind = [row for row in table.rows if row["growing"] == what]
+        factors = np.log([row["seen" if what == "voxels" else "times"] for row in of_kind])
         slopes = {
-            cost: float(np.polyfit(factors, np.log([row[cost] for row in own]), 1)[0]) for cost in ("ms", "bytes")
+            cost: float(np.polyfit(factors, np.log([row[cost] for row in of_kind]), 1)[0]) for cost in ("ms", "bytes")
         }
         fits.add(exponent=what, **slopes)
     if figure:

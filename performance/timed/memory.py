@@ -70,7 +70,7 @@ def measured(scene: Path, out: Path, memory: MapMemory, backend: str, K: int, ki
     words = ("--data", scene, "--voxel-size", str(VOXEL_SIZE), "--backend", backend, "--no-geometry-check")
 
     def row(run: str, out: Path, *more: str) -> tuple[dict[str, Any], Any]:
-        stages = {name: own["peak_gb"] for name, own in measuring.staged(out, *words, *more)[1].items()}
+        stages = {name: numbers["peak_gb"] for name, numbers in measuring.staged(out, *words, *more)[1].items()}
         stage = max((name for name in stages if name not in ("beside", "all")), key=stages.__getitem__)
         (unit,) = semstab.load_result(out).runs
         taken = (stages["all"] - stages["digest"]) * GB

@@ -55,16 +55,16 @@ def measured(
         fusion.prepare(frame)
     counter = create("numba", voxel_size=size, num_classes=scene.K)
     reports = [counter.integrate(frame) for frame in frames]
-    voxels, known = reports[-1].voxels, reports[-1].map_voxels
+    voxels, map_voxels = reports[-1].voxels, reports[-1].map_voxels
     del counter
-    fit = [name for name in names if expected_bytes(name, known, known, scene.K) < most_gb * 1e9]
+    fit = [name for name in names if expected_bytes(name, map_voxels, map_voxels, scene.K) < most_gb * 1e9]
     times = fusion.measure(frames, scene.K, size, (fusion.BASELINE, *fit), rounds)
-    own = times[fusion.BASELINE]["later_ms"]
+    baseline_ms = times[fusion.BASELINE]["later_ms"]
     return (
         dataclasses.asdict(scene) | {"voxel_size": size, "noise": noise, "voxels": voxels}
-        | {"floor_bytes": floor_bytes(frames[-1], voxels), "integrate_ms": own}
+        | {"floor_bytes": floor_bytes(frames[-1], voxels), "integrate_ms": baseline_ms}
         | {f"{name}_ms": times[name]["later_ms"] if name in fit else None for name in names}
-        | {f"{name}_faster": own / times[name]["later_ms"] if name in fit else None for name in names}
+        | {f"{name}_faster": baseline_ms / times[name]["later_ms"] if name in fit else None for name in names}
     )  # fmt: skip
 
 
@@ -80,9 +80,18 @@ def main(
     many: int = 1_000_000,
     csv_: Path | None = None,
 ) -> Any:
-    own = {f"{name}_{what}": spec for name in backends for what, spec in (("ms", ".1f"), ("faster", ".2f"))}
+    backend_columns = {f"{name}_{what}": spec for name in backends for what, spec in (("ms", ".1f"), ("faster", ".2f"))}
     table = measuring.Table(
-        seed="", kind="", width="", height="", K="", voxel_size="g", noise="", voxels=",", integrate_ms=".1f", **own
+        seed="",
+        kind="",
+        width="",
+        height="",
+        K="",
+        voxel_size="g",
+        noise="",
+        voxels=",",
+        integrate_ms=".1f",
+        **backend_columns,
     )
     for number in range(seed, seed + scenes_):
         scene = scenes.drawn(number, tuple(map(measuring.sides, sizes)))

@@ -54,10 +54,10 @@ def main(
                 spent, file = measuring.seconds_of(Path(out)), Path(out) / "recording.rrd"
                 loop = sum(spent.get(f"fuse {backend}" if stage == "fuse" else stage, 0.0) for stage in LOOP)
                 megabytes = file.stat().st_size / 1e6 if recording else 0.0
-            each = 1e3 / frames
+            ms = 1e3 / frames
             return {
-                "run_s": process.wall_s, "CPU_s": process.cpu_s, "loop_ms": each * loop,
-                "observers_ms": each * spent.get("observe", 0.0), "recording_MB": megabytes,
+                "run_s": process.wall_s, "CPU_s": process.cpu_s, "loop_ms": ms * loop,
+                "observers_ms": ms * spent.get("observe", 0.0), "recording_MB": megabytes,
             }  # fmt: skip
 
         works = {"with": lambda: run(True), "without": lambda: run(False)}

@@ -64,7 +64,7 @@ OWN = {BASELINE: "open3d", OURS: "points", IMAGES: "images"}
 BENCH = Path(__file__).parents[1] / "bench.py"
 
 
-def seen(size: str, frames: int, K: int) -> list[semstab.Frame]:
+def views(size: str, frames: int, K: int) -> list[semstab.Frame]:
     """The frames of the walk."""
     return [room.frame(index, *measuring.sides(size), K) for index in range(frames)]
 
@@ -102,7 +102,7 @@ def highest() -> int:
 
 def fuse(kind: str, out: Path, images: str, count: int, K: int, size: float) -> None:
     """Be one of our own programs: 'open3d', 'points' or 'images'."""
-    small, *frames = seen("64x48", 1, K) + seen(images, count, K)
+    small, *frames = views("64x48", 1, K) + views(images, count, K)
     if kind == "points":
         small, *frames = (scan(frame) for frame in (small, *frames))
     grid: list[Any] = []
@@ -221,7 +221,7 @@ def build_pyslam(checkout: Path, folder: Path) -> dict[str, str]:
     return {f"pySLAM, {kind}": f"{shlex.quote(str(program))} {kind}" for kind in ("votes", "probabilities")}
 
 
-def named(given: Sequence[str]) -> dict[str, str]:
+def by_name(given: Sequence[str]) -> dict[str, str]:
     """NAME=VALUE as a dictionary."""
     return {name: value for name, _, value in (one.partition("=") for one in given)}
 
@@ -242,15 +242,15 @@ def main(
     if one and out:  # in a process of its own
         fuse(one, out, size, frames, classes, voxel_size)
         return None
-    commits = {name: commit_of(given) for name, given in named(commit).items()}
+    commits = {name: commit_of(given) for name, given in by_name(commit).items()}
     options = ["--size", size, "--frames", str(frames), "--classes", str(classes), "--voxel-size", str(voxel_size)]
     with tempfile.TemporaryDirectory() as name:
-        folder, rivals = Path(name), named(rival)
+        folder, rivals = Path(name), by_name(rival)
         if pyslam:
             rivals = build_pyslam(pyslam, folder) | rivals
             commits = {"pySLAM": commit_of(str(pyslam))} | commits
         given = folder / "frames.bin"
-        write_frames(given, seen(size, frames, classes), voxel_size, classes)
+        write_frames(given, views(size, frames, classes), voxel_size, classes)
         maps = {name: folder / f"{k}.bin" for k, name in enumerate((*OWN, *rivals))}
         works: dict[str, Callable[[], Any]] = {
             name: partial(run, [sys.executable, str(BENCH), "rivals", *options, "--one", kind, "--out"], [maps[name]])
@@ -260,19 +260,21 @@ def main(
         reports = measuring.in_turns(works, rounds, warm=0)
         found = {name: read_map(path, voxel_size) for name, path in maps.items() if path.exists()}
         if keep:
-            keep_maps(keep, {name: maps[name] for name in rivals}, seen(size, frames, classes), voxel_size, classes)
+            keep_maps(keep, {name: maps[name] for name in rivals}, views(size, frames, classes), voxel_size, classes)
     print(f"{frames} frames of {size}, K = {classes}, {voxel_size:g} m, one core")
     print(*(f"{name}: {which}" for name, which in commits.items()), sep="\n", end="\n\n")
     table = measuring.Table(
         implementation="", CPU_ms=".1f", faster=".2f", voxels=",", bytes=",.0f", peak=",.0f", missing=",", extra=",",
         label_differs=".2%", without_ties=".2%",
     )  # fmt: skip
-    ms = {name: median([t for r in own for t in r["ms"][1:]]) for name, own in reports.items()}
-    for name, own in reports.items():
+    ms = {
+        name: median([t for r in reports_of_rival for t in r["ms"][1:]]) for name, reports_of_rival in reports.items()
+    }
+    for name, reports_of_rival in reports.items():
         row = compared(found[OURS], found[name]) if name in found else {}
         if row:
             row["bytes"], row["peak"] = (
-                median(r[k] for r in own) / max(1, row["voxels"]) for k in ("bytes", "peak_bytes")
+                median(r[k] for r in reports_of_rival) / max(1, row["voxels"]) for k in ("bytes", "peak_bytes")
             )
         table.add(implementation=name, CPU_ms=ms[name], faster=ms[BASELINE] / ms[name], **row)
     return {"commits": commits, "rows": table.rows}

@@ -97,7 +97,7 @@ def main(
     counts = [np.count_nonzero(frame.valid) for frame in frames]
     print(f"{len(frames)} scans of {np.median(counts):,.0f} points, K = {K}, {voxel_size:g} m, {voxels:,} voxels\n")
     table = measuring.Table(implementation="", CPU_ms=".1f", faster=".2f")
-    ms = {name: float(np.median(np.median(np.array(own), axis=0))) for name, own in taken.items()}
+    ms = {name: float(np.median(np.median(np.array(seconds_taken), axis=0))) for name, seconds_taken in taken.items()}
     for name in works:
         table.add(implementation=name, CPU_ms=ms[name], faster=ms["numpy"] / max(ms[name], 1e-6))
     return table.rows

@@ -111,7 +111,7 @@ def main(
         work = steps(frame, K)
         timed = {name: partial(measuring.cpu_ms, step) for name, step in work.items()}
         ms = {name: median(times) for name, times in measuring.in_turns(timed, rounds).items()}
-        floor, seen = ms["read"] + ms["keys"], work["frame"]()
+        floor, report = ms["read"] + ms["keys"], work["frame"]()
         ratios = {"of_floor": ms["frame"] / floor, "with_rows": ms["frame"] / (floor + ms["rows"])}
-        table.add(size=size, K=K, type=kind, noise=level, voxels=seen.voxels, **ms, **ratios)
+        table.add(size=size, K=K, type=kind, noise=level, voxels=report.voxels, **ms, **ratios)
     return table.rows

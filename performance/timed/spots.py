@@ -91,9 +91,9 @@ def cost(
             found: dict[str, float] = defaultdict(float)
             with parts(found):
                 found["all"] = milliseconds(sampler.add, frame)
-            found["the rest"] = found["all"] - sum(own for name, own in found.items() if name in PARTS)
-            for name, own in found.items():
-                by_part[name].append(own)
+            found["the rest"] = found["all"] - sum(ms for name, ms in found.items() if name in PARTS)
+            for name, ms in found.items():
+                by_part[name].append(ms)
         else:
             answers, spots = sampler._answers, sampler._spots
             added, fused = milliseconds(sampler.add, frame), milliseconds(backend.integrate, frame)
@@ -101,7 +101,7 @@ def cost(
                 {"known": spots, "answers": sampler._answers - answers, "sampler_ms": added, "fusion_ms": fused}
             )
     whole = measuring.medians(rows)
-    return whole | {"ratio": whole["sampler_ms"] / whole["fusion_ms"]}, {k: median(own) for k, own in by_part.items()}
+    return whole | {"ratio": whole["sampler_ms"] / whole["fusion_ms"]}, {k: median(ms) for k, ms in by_part.items()}
 
 
 def held(sampler: Sampler) -> int:
@@ -115,16 +115,16 @@ def memory(size: tuple[int, int], K: int, frames: int) -> dict[str, Any]:
     sampler, most = Sampler(K), 0
     tracemalloc.start()
     for index in range(frames):
-        frame, own = made(index, size, K, 0.0), held(sampler)
+        frame, held_bytes = made(index, size, K, 0.0), held(sampler)
         tracemalloc.reset_peak()
         before = tracemalloc.get_traced_memory()[0]
         sampler.add(frame)
-        most = max(most, own + tracemalloc.get_traced_memory()[1] - before)
+        most = max(most, held_bytes + tracemalloc.get_traced_memory()[1] - before)
     tracemalloc.stop()
-    own, spots, answers = held(sampler), sampler._spots, sampler._answers
+    held_bytes, spots, answers = held(sampler), sampler._spots, sampler._answers
     last = [milliseconds(sampler.add, made(index, size, K, 0.0)) for index in range(frames, frames + LAST)]
     return {
-        "frames": frames, "spots": spots, "answers": answers, "held_MB": own / 1e6, "peak_MB": most / 1e6,
+        "frames": frames, "spots": spots, "answers": answers, "held_MB": held_bytes / 1e6, "peak_MB": most / 1e6,
         "ms_at_its_end": median(last),
     }  # fmt: skip
 
@@ -149,8 +149,8 @@ def main(
             details += [(size, percent, name, by_part[name]) for name in (*PARTS, "the rest", "all") if name in by_part]
     print()
     part = measuring.Table(size="", noise="g", part="", ms=".2f")
-    for size, percent, name, own in details:
-        part.add(size=size, noise=percent, part=name, ms=own)
+    for size, percent, name, ms in details:
+        part.add(size=size, noise=percent, part=name, ms=ms)
     print()
     long = measuring.Table(
         size="", frames="", spots=",.0f", answers=",.0f", held_MB=".1f", peak_MB=".1f", ms_at_its_end=".2f"

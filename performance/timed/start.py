@@ -49,16 +49,16 @@ def main(backend: Literal["numba", "open3d", "numpy"] = "numba", rounds: int = 3
             return seconds("-c", UNTIL_FUSED, *words, "--rerun", "off", "--report", "off", **variables)
 
     table = measuring.Table(until="", CPU_s=".2f", cache_MB=".1f")
-    each = range(rounds)
-    table.add(until="help", CPU_s=median(seconds("-m", "semstab", "--help") for _ in each))
-    table.add(until=f"import {backend}", CPU_s=median(seconds("-c", f"import {backend}") for _ in each))
+    runs = range(rounds)
+    table.add(until="help", CPU_s=median(seconds("-m", "semstab", "--help") for _ in runs))
+    table.add(until=f"import {backend}", CPU_s=median(seconds("-c", f"import {backend}") for _ in runs))
     with tempfile.TemporaryDirectory() as folder:
         labels = np.indices(SIZE[::-1])[1].astype(np.uint8) % 7
         camera = Intrinsics(SIZE[0], SIZE[0], SIZE[0] / 2, SIZE[1] / 2)
         wall = [Frame(k, np.full(SIZE[::-1], 5, np.float32), camera, np.eye(4), labels=labels) for k in range(2)]
         root, cache = measuring.posed(Path(folder) / "scene", 2, wall, 7, scale=1000), Path(folder) / "cache"
         first_frame()
-        table.add(until="first frame, warm", CPU_s=median(first_frame() for _ in each))
+        table.add(until="first frame, warm", CPU_s=median(first_frame() for _ in runs))
         if cold:
             took = first_frame(NUMBA_CACHE_DIR=str(cache))
             size = sum(file.stat().st_size for file in cache.rglob("*") if file.is_file())

@@ -38,15 +38,15 @@ def flip(frames: Iterable[Frame], share: float, K: int) -> Iterator[Frame]:
         yield replace(frame, labels=labels)
 
 
-def soft(frames: Iterable[Frame], kept: int, K: int) -> Iterator[Frame]:
+def soft(frames: Iterable[Frame], classes: int, K: int) -> Iterator[Frame]:
     """The frames with probabilities in place of labels: 0.4 to 1 for the label, the rest for classes at random.
 
-    Of each pixel those of `kept` classes, the label among them.
+    Of each pixel those of `classes`, the label among them.
     """
     for frame in frames:
         rng, n, labels = np.random.default_rng(frame.index), frame.labels.size, frame.labels.reshape(-1, 1)
-        others = (rng.integers(1, K, n)[:, None] + np.arange(kept - 1)) % (K - 1) + 1
-        share = rng.random((n, kept - 1), dtype=np.float32)
+        others = (rng.integers(1, K, n)[:, None] + np.arange(classes - 1)) % (K - 1) + 1
+        share = rng.random((n, classes - 1), dtype=np.float32)
         share *= rng.uniform(0.0, 0.6, (n, 1)).astype(np.float32) / share.sum(axis=1, keepdims=True)
         scores = np.zeros((n, K), dtype=np.float16)
         np.put_along_axis(scores, (labels + others) % K, share.astype(np.float16), axis=1)

@@ -55,13 +55,13 @@ def main(
                 process, stages = measuring.staged(out, *words_of_run, recording=record, NUMBA_NUM_THREADS="1")
                 voxels = sum(one["voxels"] for one in json.loads((out / "summary.json").read_text())["runs"])
                 seconds = {
-                    stage: stages.get(own, {}).get("own_s" if stage == "fuse" else "all_s", 0.0)
-                    for stage, own in STAGES.items()
+                    stage: stages.get(part, {}).get("own_s" if stage == "fuse" else "all_s", 0.0)
+                    for stage, part in STAGES.items()
                 }
                 table.add(
                     voxels=voxels, run=run, size=size, tiles=len(list((out / "voxels").glob("*/tile=*"))),
                     peak_GB=stages["all"]["peak_gb"], CPU_s=process.cpu_s, us_a_voxel=1e6 * process.cpu_s / voxels,
-                    **{stage: 1e6 * own / voxels for stage, own in seconds.items()},
+                    **{stage: 1e6 * taken / voxels for stage, taken in seconds.items()},
                 )  # fmt: skip
             measuring.same(folder / "whole", folder / "tiles")
     return table.rows

@@ -41,8 +41,8 @@ def cluster(count: int, folder: Path) -> Iterator[tuple[str, list[int]]]:
     started = [start("distributed.cli.dask_scheduler", "--host", "127.0.0.1", "--port", str(PORT), folder=folder)]
     try:
         time.sleep(3)
-        own = ("--nthreads", "1", "--no-nanny", "--local-directory", str(folder / "dask"), "--preload", LOADED)
-        started += [start("distributed.cli.dask_worker", address, *own, folder=folder) for _ in range(count)]
+        options = ("--nthreads", "1", "--no-nanny", "--local-directory", str(folder / "dask"), "--preload", LOADED)
+        started += [start("distributed.cli.dask_worker", address, *options, folder=folder) for _ in range(count)]
         with Client(address, set_as_default=False) as client:
             client.wait_for_workers(count, timeout=60)
         yield address, [process.pid for process in started[1:]]
@@ -84,9 +84,9 @@ def main(
                         before = out.with_name(f"{out.name}, before")
                         measuring.command(before, *words, "--frames", ":24", "--tile-size", "128", **ONE_THREAD)
                     begun = [cpu_seconds(pid) for pid in ids]
-                    own = measuring.command(out, *words, "--set", f"memory_gb={memory_gb * count}", **ONE_THREAD)
+                    process = measuring.command(out, *words, "--set", f"memory_gb={memory_gb * count}", **ONE_THREAD)
                     busy = [cpu_seconds(pid) - was for pid, was in zip(ids, begun, strict=True)]
-                table.add(workers=count, wall_s=own.wall_s, command_CPU_s=own.cpu_s, workers_CPU_s=sum(busy),
+                table.add(workers=count, wall_s=process.wall_s, command_CPU_s=process.cpu_s, workers_CPU_s=sum(busy),
                           busiest_CPU_s=max(busy), **measuring.seconds_of(out))  # fmt: skip
         for count in workers[1:]:
             measuring.same(folder / f"{workers[0]} workers, 0", folder / f"{count} workers, 0")
