@@ -81,14 +81,14 @@ class Ros:
     def info(self, ns: int, frame: Frame, D=(0.0,) * 5, model="plumb_bob", size=None, P=None, roi=None) -> Any:
         K = frame.intrinsics.matrix
         W, H = size or (frame.shape[1], frame.shape[0])
-        named = {"D": np.array(D, float), "K": K.ravel(), "R": np.eye(3).ravel()}
-        named["P"] = (np.hstack([K, np.zeros((3, 1))]) if P is None else P).ravel()
+        fields = {"D": np.array(D, float), "K": K.ravel(), "R": np.eye(3).ravel()}
+        fields["P"] = (np.hstack([K, np.zeros((3, 1))]) if P is None else P).ravel()
         region = self.types["sensor_msgs/msg/RegionOfInterest"]
         x, y, w, h = roi or (0, 0, 0, 0)
         return self.types["sensor_msgs/msg/CameraInfo"](
             header=self.header(ns, OPTICAL), height=H, width=W, distortion_model=model, binning_x=0, binning_y=0,
             roi=region(x_offset=x, y_offset=y, height=h, width=w, do_rectify=False),
-            **{name if self.first else name.lower(): value for name, value in named.items()},
+            **{name if self.first else name.lower(): value for name, value in fields.items()},
         )  # fmt: skip
 
     def cloud(
@@ -103,7 +103,7 @@ class Ros:
         """Fields by name, in this order, each after a byte that is in no field; rows are `pad` bytes longer."""
         order, (count, *_) = ">" if big else "<", next(iter(columns.values())).shape
         kinds = [(name, values.dtype.newbyteorder(order)) for name, values in columns.items()]
-        layout = np.dtype([each for k, kind in enumerate(kinds) for each in ((f"gap{k}", "u1"), kind)])
+        layout = np.dtype([part for k, kind in enumerate(kinds) for part in ((f"gap{k}", "u1"), kind)])
         points = np.zeros(count, layout)
         for name, values in columns.items():
             points[name] = values
@@ -204,12 +204,12 @@ def write_bag(path: Path, container: str, entries: Callable[[Ros], Iterable[Entr
     ros = Ros(container)
     path.parent.mkdir(parents=True, exist_ok=True)
     if ros.first:
-        path, own = path.with_name(f"{path.name}.bag"), None
+        path, folder = path.with_name(f"{path.name}.bag"), None
         writer: Any = Writer1(path)
     else:
-        own = path.parent / f"{path.name}-new"
+        folder = path.parent / f"{path.name}-new"
         plugin = StoragePlugin.MCAP if container == "MCAP" else StoragePlugin.SQLITE3
-        writer = Writer2(own, version=9, storage_plugin=plugin)
+        writer = Writer2(folder, version=9, storage_plugin=plugin)
     with writer:
         connections: dict[str, Any] = {}
         for topic, time, message in entries(ros):
@@ -218,11 +218,11 @@ def write_bag(path: Path, container: str, entries: Callable[[Ros], Iterable[Entr
                 connections[topic] = writer.add_connection(topic, kind, typestore=ros.store)
             serialize = ros.store.serialize_ros1 if ros.first else ros.store.serialize_cdr
             writer.write(connections[topic], time, serialize(message, kind))
-    if own is not None:
+    if folder is not None:
         path.mkdir(exist_ok=True)
-        for file in own.iterdir():
+        for file in folder.iterdir():
             shutil.move(file, path / file.name)
-        own.rmdir()
+        folder.rmdir()
     return path
 
 

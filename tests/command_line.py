@@ -36,7 +36,7 @@ def command(words: Sequence[object], report: bool = False, recording: bool = Fal
 
 @functools.cache
 def _commands() -> frozenset[str]:
-    return frozenset(each.name or each.callback.__name__ for each in app.registered_commands)  # type: ignore[union-attr]
+    return frozenset(entry.name or entry.callback.__name__ for entry in app.registered_commands)  # type: ignore[union-attr]
 
 
 def bench(
@@ -48,24 +48,24 @@ def bench(
     - `process`: start the installed command: what it imports, its signals, plug-ins; the imports take seconds
     - `more`: of its environment
     """
-    line, known = command(words, report, recording), environment(columns, **more)
+    line, variables = command(words, report, recording), environment(columns, **more)
     if process:
-        done = subprocess.run(line, cwd=cwd, env=known, capture_output=True, text=True, check=False)
+        done = subprocess.run(line, cwd=cwd, env=variables, capture_output=True, text=True, check=False)
     else:
-        done = _in_this_process(line, cwd, known)
+        done = _in_this_process(line, cwd, variables)
     assert code is None or done.returncode == code, done.stderr
     assert "Traceback" not in done.stderr
     return done
 
 
-def _in_this_process(line: list[str], cwd: Path, known: dict[str, str]) -> subprocess.CompletedProcess[str]:
+def _in_this_process(line: list[str], cwd: Path, variables: dict[str, str]) -> subprocess.CompletedProcess[str]:
     """Call the command as `main` does: warnings go to standard error, each of them once."""
     logger, handler = logging.getLogger("semstab"), logging._StderrHandler(logging.WARNING)  # as logging.lastResort
     handler.addFilter(_Once())
     logger.addHandler(handler)
     try:
         with contextlib.chdir(cwd):
-            done = CliRunner().invoke(app, line[1:], env=known, catch_exceptions=False)
+            done = CliRunner().invoke(app, line[1:], env=variables, catch_exceptions=False)
     finally:
         logger.removeHandler(handler)
     return subprocess.CompletedProcess(line, done.exit_code, done.stdout, done.stderr)

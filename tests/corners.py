@@ -10,16 +10,16 @@ import pytest
 combination = pytest.mark.combination
 
 
-def corners(values: Iterable[Any], kept: Collection[Any]) -> list[Any]:
-    """Return the values of a parameter, or tuples of several: those that are not `kept` are combinations.
+def corners(values: Iterable[Any], always: Collection[Any]) -> list[Any]:
+    """Return the values of a parameter, or tuples of several: those that are not in `always` are combinations.
 
     Raises:
-        ValueError: If a kept value is no value: a name that has changed would leave nothing in `make test`.
+        ValueError: If one of `always` is no value: a name that has changed would leave nothing in `make test`.
     """
     values = list(values)
-    if unknown := [value for value in kept if value not in values]:
+    if unknown := [value for value in always if value not in values]:
         raise ValueError(f"no such values: {unknown}")
-    return [value if value in kept else pytest.param(*_several(value), marks=combination) for value in values]
+    return [value if value in always else pytest.param(*_several(value), marks=combination) for value in values]
 
 
 def _several(value: Any) -> tuple[Any, ...]:

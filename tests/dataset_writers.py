@@ -532,10 +532,10 @@ def write_metashape_xml(
     values = {"f": fy, "cx": cx - (size[0] - 1) / 2, "cy": cy - (size[1] - 1) / 2, "b1": fx - fy} | more
     cameras = []
     for k, (name, T) in enumerate(poses.items()):
-        own = np.eye(4)
-        own[:3, :3], own[:3, 3] = turn.T @ T[:3, :3], turn.T @ (T[:3, 3] - move) / scale
+        local = np.eye(4)
+        local[:3, :3], local[:3, 3] = turn.T @ T[:3, :3], turn.T @ (T[:3, 3] - move) / scale
         head = f'<camera id="{k}" sensor_id="0" component_id="0" label="{name}">'
-        cameras.append(f"{head}<transform>{numbers(own)}</transform></camera>")
+        cameras.append(f"{head}<transform>{numbers(local)}</transform></camera>")
     wrong = "<calibration class='initial'><f>1</f></calibration>"
     adjusted = "".join(f"<{key}>{value!r}</{key}>" for key, value in values.items())
     path.parent.mkdir(parents=True, exist_ok=True)
@@ -622,10 +622,10 @@ def write_uavscenes(folder: Path, frames: Sequence[Frame]) -> list[str]:
 
 def uavscenes_camera(name: str, frame: Frame, lens=(0.0, 0.0, 0.0, 0.0, 0.0)) -> dict[str, object]:
     """A camera of sampleinfos_interpolated.json; the lens is k1, k2, p1, p2, k3."""
-    named = dict(zip(("K1", "K2", "P1", "P2", "K3"), lens, strict=True))
+    distortion = dict(zip(("K1", "K2", "P1", "P2", "K3"), lens, strict=True))
     return {
         "OriginalImageName": name, "T4x4": frame.T_wc.tolist(), "P3x3": frame.intrinsics.matrix.tolist(),
-        "Width": frame.shape[1], "Height": frame.shape[0], **named,
+        "Width": frame.shape[1], "Height": frame.shape[0], **distortion,
     }  # fmt: skip
 
 

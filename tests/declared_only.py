@@ -27,7 +27,7 @@ def hide_undeclared() -> list[str]:
     """Hide the packages of all other distributions, as if they were not installed; returns their import names."""
     declared = fresh.needed(["semstab"]) | BESIDE
     brought = metadata.packages_distributions()
-    hidden = {name for name, by in brought.items() if not {fresh.key(each) for each in by} & declared}
+    hidden = {name for name, by in brought.items() if not {fresh.key(requirement) for requirement in by} & declared}
     find = PathFinder.find_spec
 
     def find_spec(name: str, path: Any = None, target: Any = None) -> ModuleSpec | None:

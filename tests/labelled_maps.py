@@ -29,7 +29,7 @@ def kimera_mesh(path: Path, table: VoxelTable, colors: dict[str, tuple[int, int,
     first = 4 * np.arange(len(table))[:, None]
     faces = np.concatenate([first + np.array([0, 1, 2]), first + np.array([0, 2, 3])])
     rgb = np.array([colors[table.classes[k]] for k in dominant(table)], np.uint8)
-    shown = np.column_stack([np.repeat(rgb, 4, axis=0), np.full(len(vertices), 255, np.uint8)])
-    mesh = trimesh.Trimesh(vertices, faces, vertex_colors=shown, process=False)
+    vertex_colors = np.column_stack([np.repeat(rgb, 4, axis=0), np.full(len(vertices), 255, np.uint8)])
+    mesh = trimesh.Trimesh(vertices, faces, vertex_colors=vertex_colors, process=False)
     path.write_bytes(trimesh.exchange.ply.export_ply(mesh))
     return path

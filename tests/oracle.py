@@ -37,21 +37,21 @@ class Oracle:
 
     def integrate(self, frame):
         self.check(frame)
-        seen = {}  # A_t(q): voxel -> evidence vectors of the frame's pixels in it
+        vectors_of = {}  # A_t(q): voxel -> evidence vectors of the frame's pixels in it
         for v, row in enumerate(frame.depth.tolist()):
             for u, d in enumerate(row):
                 s = self.evidence(frame, u, v)
                 if self.has_depth(d) and s is not None:
-                    seen.setdefault(self.voxel(frame, self.world_point(frame, u, v, d)), []).append(s)
-        new = {q for q in seen if q not in self.history}
-        for q, vectors in seen.items():
+                    vectors_of.setdefault(self.voxel(frame, self.world_point(frame, u, v, d)), []).append(s)
+        new = {q for q in vectors_of if q not in self.history}
+        for q, vectors in vectors_of.items():
             self.observe(q, frame, vectors)
         return FrameReport(
             frame=frame.index,
-            points=sum(len(vectors) for vectors in seen.values()),
-            voxels=len(seen),
+            points=sum(len(vectors) for vectors in vectors_of.values()),
+            voxels=len(vectors_of),
             new_voxels=len(new),
-            drift_sum=math.fsum(self.divergence(*self.beliefs(q)[-2:]) for q in seen if q not in new),
+            drift_sum=math.fsum(self.divergence(*self.beliefs(q)[-2:]) for q in vectors_of if q not in new),
             seconds=0.0,
             map_voxels=len(self.history),
         )
@@ -117,8 +117,8 @@ class Oracle:
     def accumulated(self, q):
         """The sum of s_bar after each observation; the last one is e(q)."""
         total, sums = [0.0] * self.num_classes, []
-        for seen in self.history[q]:
-            total = [a + b for a, b in zip(total, seen.s_bar, strict=True)]
+        for visit in self.history[q]:
+            total = [a + b for a, b in zip(total, visit.s_bar, strict=True)]
             sums.append(total)
         return sums
 
@@ -156,19 +156,19 @@ class Oracle:
     # --- The contract ---
 
     def first_frame(self, q):
-        return min(seen.frame for seen in self.history[q])
+        return min(visit.frame for visit in self.history[q])
 
     def last_frame(self, q):
-        return max(seen.frame for seen in self.history[q])
+        return max(visit.frame for visit in self.history[q])
 
     def self_sum(self, q):
-        return sum(s * s for seen in self.history[q] for s in seen.s_bar)
+        return sum(s * s for visit in self.history[q] for s in visit.s_bar)
 
     def frame_entropy_sum(self, q):
-        return -sum(s * math.log2(s) for seen in self.history[q] for s in seen.s_bar if s > 0)
+        return -sum(s * math.log2(s) for visit in self.history[q] for s in visit.s_bar if s > 0)
 
     def pixels(self, q):
-        return sum(seen.pixels for seen in self.history[q])
+        return sum(visit.pixels for visit in self.history[q])
 
     def rows(self):
         return sorted(self.history)

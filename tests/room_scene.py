@@ -114,10 +114,10 @@ class Room(Scene):
     def frame(self, index, model, *, color=True) -> Frame:
         self.read.append((index, model))
         rng = np.random.default_rng(index)
-        z, seen = render(self.poses[index])
+        z, truth = render(self.poses[index])
         z = z * (1 + self.noise * rng.standard_normal(z.shape))
-        wrong = (rng.random(seen.shape) < 0.1) & (model != "gt")
-        labels = np.where(wrong, (seen + 1) % len(CLASSES), seen).astype(np.uint8)
+        wrong = (rng.random(truth.shape) < 0.1) & (model != "gt")
+        labels = np.where(wrong, (truth + 1) % len(CLASSES), truth).astype(np.uint8)
         scores = np.eye(len(CLASSES), dtype=np.float32)[labels] * 0.5 + 0.1 if self.soft else None
         return Frame(
             index=index, depth=self.told_depth(z).astype(np.float32), intrinsics=self.camera,

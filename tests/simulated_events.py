@@ -16,16 +16,16 @@ def log_of(labels, K=3, index=None, frames=None, voxel_size=0.2):
     return log_of_evidence(np.eye(K)[np.maximum(labels, 0)], labels >= 0, index, frames, voxel_size)
 
 
-def log_of_evidence(evidence, seen=None, index=None, frames=None, voxel_size=0.2):
-    """Observations s_bar (n, F, K), where (n, F) `seen` says which there are; voxels (0, 0, 0), (0, 0, 1), ..."""
+def log_of_evidence(evidence, visible=None, index=None, frames=None, voxel_size=0.2):
+    """Observations s_bar (n, F, K), where (n, F) `visible` says which there are; voxels (0, 0, 0), (0, 0, 1), ..."""
     evidence = np.asarray(evidence, dtype=np.float64)
     n, F, _ = evidence.shape
-    seen = np.ones((n, F), dtype=bool) if seen is None else seen
-    voxel, frame = np.nonzero(seen)
+    visible = np.ones((n, F), dtype=bool) if visible is None else visible
+    voxel, frame = np.nonzero(visible)
     index = np.stack([np.zeros(n), np.zeros(n), np.arange(n)], axis=1) if index is None else index
     return Events(
         *np.asarray(index).T, voxel=voxel, frame=frame if frames is None else np.asarray(frames)[frame],
-        evidence=evidence[seen], pixels=np.ones(len(voxel)), voxel_size=voxel_size,
+        evidence=evidence[visible], pixels=np.ones(len(voxel)), voxel_size=voxel_size,
     )  # fmt: skip
 
 

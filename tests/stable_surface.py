@@ -39,11 +39,11 @@ def stable_surface() -> Surface:
     return dict(sorted(found.items()))
 
 
-def complaints(known: Mapping[str, Iterable[str]], found: Mapping[str, Iterable[str]]) -> list[str]:
+def complaints(stored: Mapping[str, Iterable[str]], found: Mapping[str, Iterable[str]]) -> list[str]:
     """Return a sentence for each surface that lost or gained names."""
     lines = []
-    for surface in sorted({*known, *found}):
-        before, now = set(known.get(surface, ())), set(found.get(surface, ()))
+    for surface in sorted({*stored, *found}):
+        before, now = set(stored.get(surface, ())), set(found.get(surface, ()))
         if gone := sorted(before - now):
             lines.append(
                 f"{surface}: {', '.join(gone)} is gone; keep the old name for a minor version with a warning that names"
@@ -63,8 +63,8 @@ def _python() -> Iterator[tuple[str, Iterable[str]]]:
             yield f"semstab.{name}", (row.split("`")[1].split("(")[0] for row in reference._module(name, value)
                                       if row.startswith("| `"))  # fmt: skip
             continue
-        if own := [each.lstrip("*") for each, _, _ in reference.arguments(value)]:
-            yield f"semstab.{name}: arguments", own
+        if names := [argument.lstrip("*") for argument, _, _ in reference.arguments(value)]:
+            yield f"semstab.{name}: arguments", names
         if isinstance(value, type):
             yield f"semstab.{name}: members", _members(value)
     for protocol in PROTOCOLS:
@@ -73,10 +73,10 @@ def _python() -> Iterator[tuple[str, Iterable[str]]]:
 
 def _members(value: type) -> Iterator[str]:
     """Yield the public members that classes of semstab define."""
-    for each in value.__mro__:
-        if each.__module__.startswith("semstab"):
-            own = {*vars(each), *inspect.get_annotations(each)} - {"model_config", "model_post_init"}
-            yield from (name for name in own if not name.startswith("_"))
+    for cls in value.__mro__:
+        if cls.__module__.startswith("semstab"):
+            names = {*vars(cls), *inspect.get_annotations(cls)} - {"model_config", "model_post_init"}
+            yield from (name for name in names if not name.startswith("_"))
 
 
 def _commands() -> Iterator[tuple[str, Iterable[str]]]:
@@ -84,12 +84,14 @@ def _commands() -> Iterator[tuple[str, Iterable[str]]]:
 
     from semstab.cli import app
 
-    known: Any = typer.main.get_command(app)
-    shown = {name: command for name, command in known.commands.items() if not command.hidden}
-    yield "commands", shown
-    for name, command in shown.items():
-        own = (reference._option(each) for each in command.params if not getattr(each, "hidden", False))
-        yield f"command {name}", (word.strip("`") for words in own for word in words.split(", "))
+    group: Any = typer.main.get_command(app)
+    visible = {name: command for name, command in group.commands.items() if not command.hidden}
+    yield "commands", visible
+    for name, command in visible.items():
+        options = (
+            reference._option(parameter) for parameter in command.params if not getattr(parameter, "hidden", False)
+        )
+        yield f"command {name}", (word.strip("`") for words in options for word in words.split(", "))
 
 
 def _settings() -> Iterator[tuple[str, Iterable[str]]]:

@@ -47,7 +47,7 @@ class Street:
 
     def with_ids(self, change):
         """The same with other ids: `change` takes those of a scan and its number."""
-        return replace(self, ids=[change(own, k) for k, own in enumerate(self.ids)])
+        return replace(self, ids=[change(of_scan, k) for k, of_scan in enumerate(self.ids)])
 
 
 @functools.lru_cache(maxsize=8)
@@ -86,11 +86,11 @@ def _cast(origin, rays, boxes):
     with np.errstate(divide="ignore", invalid="ignore"):
         ground = (-2.0 - origin[2]) / rays[:, 2]
         distance, label = np.where(ground > 0, ground, np.inf), np.full(len(rays), 40)
-        for low, high, own in boxes:
+        for low, high, number in boxes:
             a, b = (np.array(low) - origin) / rays, (np.array(high) - origin) / rays
             near, far = np.minimum(a, b).max(axis=1), np.maximum(a, b).min(axis=1)
             hit = (near < far) & (near > 0) & (near < distance)
-            distance, label = np.where(hit, near, distance), np.where(hit, own, label)
+            distance, label = np.where(hit, near, distance), np.where(hit, number, label)
     return distance, label
 
 

@@ -35,8 +35,8 @@ def town(side=40, seed=0, classes=CLASSES):
     wrong = np.where(truth == 0, 0.0, np.where(truth == 1, np.where(sure, 0.0, 0.6), 0.4))[:, None]
     labels = np.where(rng.random((side * side, 9)) < wrong, (truth[:, None] % 2) + 1, truth[:, None])
     table = log_of(labels, index=grid(side)).table()
-    named = VoxelTable(**{**vars(table), "classes": classes})
-    return named, Truth(truth >= 0, truth)
+    renamed = VoxelTable(**{**vars(table), "classes": classes})
+    return renamed, Truth(truth >= 0, truth)
 
 
 @pytest.fixture(scope="module")

@@ -144,10 +144,10 @@ def test_the_command_says_what_it_wrote(floor, tmp_path):
 
 
 def test_an_outline_fills_gaps_and_leaves_specks_out():
-    seen = np.zeros((60, 80), bool)
-    seen[10:40:2, 10:50] = True  # depth in every second row
-    seen[50:52, 70:72] = True
-    (outline,), mask = outlined(seen, voxel=8, smallest=20)  # pixels
+    pixels = np.zeros((60, 80), bool)
+    pixels[10:40:2, 10:50] = True  # depth in every second row
+    pixels[50:52, 70:72] = True
+    (outline,), mask = outlined(pixels, voxel=8, smallest=20)  # pixels
     assert mask[12:38, 12:48].all()
     assert not mask[45:].any()
     assert outline.min() >= 9

@@ -158,16 +158,16 @@ class MajorityVoteWithinAFrame(Oracle):
 @fails("test_each_frame_weighs_the_same")
 class MeanOverAllPixels(Oracle):
     def accumulated(self, q):
-        weights = [seen.pixels for seen in self.history[q]]
+        weights = [visit.pixels for visit in self.history[q]]
         mean = sum(weights) / len(weights)
-        weighted = [[s * n / mean for s in seen.s_bar] for seen, n in zip(self.history[q], weights, strict=True)]
+        weighted = [[s * n / mean for s in visit.s_bar] for visit, n in zip(self.history[q], weights, strict=True)]
         return np.cumsum(weighted, axis=0).tolist()
 
 
 @fails("test_small_disagreement_survives_many_frames")
 class SumsInSinglePrecision(Oracle):
     def accumulated(self, q):
-        return np.cumsum([seen.s_bar for seen in self.history[q]], axis=0, dtype=np.float32).tolist()
+        return np.cumsum([visit.s_bar for visit in self.history[q]], axis=0, dtype=np.float32).tolist()
 
 
 # --- Drift ---
@@ -188,7 +188,7 @@ class DriftIsADistance(Oracle):
 @fails("test_drift_follows_the_accumulated_belief")
 class DriftBetweenObservations(Oracle):
     def beliefs(self, q):
-        return [seen.s_bar for seen in self.history[q]]
+        return [visit.s_bar for visit in self.history[q]]
 
 
 @fails("test_drift_follows_the_accumulated_belief")
@@ -210,7 +210,7 @@ class DriftFromTheUniformBelief(Oracle):
 @fails("test_first_and_last_frame")
 class CountsFramesFromZero(Oracle):
     def first_frame(self, q):
-        return super().first_frame(q) - min(seen.frame for log in self.history.values() for seen in log)
+        return super().first_frame(q) - min(visit.frame for log in self.history.values() for visit in log)
 
 
 @fails("test_frames_out_of_order")

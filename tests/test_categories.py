@@ -72,8 +72,8 @@ def test_thresholds_count_as_reached():
     ("settings", "named"),
     [({"min_op": 0}, "min_op = 0"), ({"drifting_bits": 0}, "drifting_bits = 0"), ({"uncertain_bits": math.nan}, "nan")],
 )
-def test_thresholds_out_of_range_are_refused(settings, named):
-    with pytest.raises(ConfigError, match=named):
+def test_thresholds_out_of_range_are_refused(settings, name):
+    with pytest.raises(ConfigError, match=name):
         CategoryThresholds(**settings)
 
 
@@ -112,8 +112,8 @@ SIGHT = {
 def test_colors_differ_to_all_eyes(sight):
     colors = np.array(CATEGORY_COLORS) / 255
     linear = np.where(colors <= 0.04045, colors / 12.92, ((colors + 0.055) / 1.055) ** 2.4)
-    seen = np.clip(linear @ np.array(SIGHT[sight]).T, 0, 1)
-    xyz = seen @ np.array([[0.4124, 0.2126, 0.0193], [0.3576, 0.7152, 0.1192], [0.1805, 0.0722, 0.9505]])
+    perceived = np.clip(linear @ np.array(SIGHT[sight]).T, 0, 1)
+    xyz = perceived @ np.array([[0.4124, 0.2126, 0.0193], [0.3576, 0.7152, 0.1192], [0.1805, 0.0722, 0.9505]])
     x, y, z = np.cbrt(xyz / [0.9505, 1, 1.089]).T  # all above the linear part of CIE Lab
     lab = np.stack([116 * y - 16, 500 * (x - y), 200 * (y - z)], axis=1)
     distances = [np.linalg.norm(a - b) for i, a in enumerate(lab) for b in lab[:i]]

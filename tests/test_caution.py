@@ -63,7 +63,7 @@ def old():
 @pytest.mark.parametrize(
     ("name", "truth"),
     corners(itertools.product(STABLE_AND_WORSE, (True, False)),
-            kept=[*((name, True) for name in STABLE_AND_WORSE), ("merged", False)]),
+            always=[*((name, True) for name in STABLE_AND_WORSE), ("merged", False)]),
 )  # fmt: skip
 def test_what_is_more_stable_and_less_right_is_said_to_be_so(old, name, truth):
     change = STABLE_AND_WORSE[name]

@@ -379,10 +379,10 @@ def test_a_look_up_agrees_with_the_warp():
     matched = sample.matched((0, 1), Convention(), np.array([1.0]))
     assert len(views[0].u) == HEIGHT * WIDTH
     found = correspond(frames[0], frames[1], depth_tolerance=0.02)
-    seen = np.full(HEIGHT * WIDTH, -1)
+    pixel = np.full(HEIGHT * WIDTH, -1)
     same = matched.error[0] * matched.z[0] <= 0.02 * matched.z[0]
-    seen[(views[0].v * WIDTH + views[0].u)[same]] = (matched.v * WIDTH + matched.u)[0][same]
-    np.testing.assert_array_equal(seen.reshape(HEIGHT, WIDTH), found.pixel)
+    pixel[(views[0].v * WIDTH + views[0].u)[same]] = (matched.v * WIDTH + matched.u)[0][same]
+    np.testing.assert_array_equal(pixel.reshape(HEIGHT, WIDTH), found.pixel)
 
 
 def test_a_large_image_is_thinned_with_its_camera():
@@ -400,7 +400,7 @@ def test_a_large_image_is_thinned_with_its_camera():
 
 @given(st.lists(st.one_of(st.floats(0, 10), st.just(np.inf)), max_size=9))
 def test_the_median_is_of_those_that_are_seen(errors):
-    seen = sorted(error for error in errors if np.isfinite(error))
-    expected = seen[(len(seen) - 1) // 2] if seen else np.nan
+    finite = sorted(error for error in errors if np.isfinite(error))
+    expected = finite[(len(finite) - 1) // 2] if finite else np.nan
     if errors:
         np.testing.assert_equal(float(median_of_seen(np.array(errors))), expected)

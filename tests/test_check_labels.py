@@ -20,8 +20,10 @@ from semstab.check.labels import check_labels
 from semstab.check.reprojection import View
 
 NAMES = [f"{k:03d}" for k in range(doctor.FRAMES)]
-OF_ALL = [each for each in doctor.MISTAKES if "of one frame" not in each.name]  # found in 7 of 10 scenes: docs/check.md
-LABELS = [each for each in OF_ALL if each.name.startswith(("labels", "ids", "one class"))]
+OF_ALL = [
+    hypothesis for hypothesis in doctor.MISTAKES if "of one frame" not in hypothesis.name
+]  # found in 7 of 10 scenes: docs/check.md
+LABELS = [hypothesis for hypothesis in OF_ALL if hypothesis.name.startswith(("labels", "ids", "one class"))]
 
 
 def write(folder, frames):
@@ -46,24 +48,24 @@ def test_what_is_wrong_with_labels_is_named(mistake, frames):
 
 
 def test_check_says_it_and_ends_with_exit_2(frames, tmp_path):
-    mistake = next(each for each in LABELS if "one map" in each.name)
+    mistake = next(hypothesis for hypothesis in LABELS if "one map" in hypothesis.name)
     folder = write(tmp_path / "room", mistake.plant(frames))
     assert mistake.said in words(bench("check", "--data", folder, cwd=tmp_path, code=2))
 
 
 def test_a_run_says_the_same_and_goes_on(frames, tmp_path):
-    mirrored = next(each for each in LABELS if "mirrored" in each.name)
+    mirrored = next(hypothesis for hypothesis in LABELS if "mirrored" in hypothesis.name)
     folder = write(tmp_path / "room", mirrored.plant(frames))
     result = bench("run", "--data", folder, "--voxel-size", "0.2", "--check", "none", cwd=tmp_path)
     note, verdict = (words(result).index(text) for text in ("note: labels of net are mirrored left to right", "alpha"))
     assert note < verdict
-    (kept,) = json.loads(next(tmp_path.glob("runs/*/summary.json")).read_text())["notes"].values()
-    assert any("mirrored" in text for text in kept)
+    (notes,) = json.loads(next(tmp_path.glob("runs/*/summary.json")).read_text())["notes"].values()
+    assert any("mirrored" in text for text in notes)
 
 
 def test_labels_of_another_frame_fail_a_check_and_are_noted_by_a_run(frames, tmp_path):
     """docs/check.md says why: a run measures the labels as they are."""
-    early = next(each for each in LABELS if each.name == "labels of the next frame")
+    early = next(hypothesis for hypothesis in LABELS if hypothesis.name == "labels of the next frame")
     folder = write(tmp_path / "room", early.plant(frames))
     refused = bench("check", "--quiet", "--data", folder, cwd=tmp_path, code=2)
     assert "error: room: labels of net are one frame early" in words(refused)
@@ -126,7 +128,7 @@ BANDS, SHARP = [0, 0, 1, 2, 2, 255, 5, 5, 6, 7, 7], [0, 0, 2, 2, 2, 255, 5, 5, 7
         ([BANDS] * 40 + [SHARP] * 21, False),
     ],
 )
-def test_bands_between_ids_are_half_of_fifty_pixels_or_more_at_the_borders_of_two_pairs_of_classes(rows, said):
+def test_bands_at_borders_of_two_pairs_of_classes_are_half_of_fifty_pixels_or_more(rows, said):
     """A border without a band has two pixels with the id of one side between ids of both."""
     maps = [np.array([row]) for row in rows]
     assert any("thin bands of ids" in line for line in id_remarks(maps, 255, None, maps)) is said
@@ -135,8 +137,8 @@ def test_bands_between_ids_are_half_of_fifty_pixels_or_more_at_the_borders_of_tw
 def test_every_hypothesis_has_maps_of_the_shape_of_the_given_ones(frames):
     views = [View.of(frame, 500) for frame in frames[:5]]
     run = LabelRun([LabelledFrame(view, (), view.labels) for view in views])
-    assert all(each.applies(run) for each in MAPS)
-    others = [(each, each.change(run).maps) for each in MAPS]
-    assert {len(maps) for each, maps in others if "frame" not in each.name} == {5}
-    assert {len(maps) for each, maps in others if "frame" in each.name} == {3, 4}
+    assert all(hypothesis.applies(run) for hypothesis in MAPS)
+    others = [(hypothesis, hypothesis.change(run).maps) for hypothesis in MAPS]
+    assert {len(maps) for hypothesis, maps in others if "frame" not in hypothesis.name} == {5}
+    assert {len(maps) for hypothesis, maps in others if "frame" in hypothesis.name} == {3, 4}
     assert all(labels.shape == views[0].labels.shape for _, maps in others for labels, _ in maps.values())

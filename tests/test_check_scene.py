@@ -420,11 +420,11 @@ def test_a_study_refuses_unsound_data_unless_told_otherwise(tmp_path):
 
 
 def test_the_manifest_says_what_was_found_and_what_it_cost(folder, tmp_path):
-    seen = []
+    checked = []
 
     class Watching(semstab.engine.Observer):
         def geometry_checked(self, task, verdict):
-            seen.append((task.scene.name, verdict.state))
+            checked.append((task.scene.name, verdict.state))
 
     config = configure(folder, models=["net", "gt"], check=None, check_geometry=True, voxel_size=0.2)
     semstab.run(config, out=tmp_path / "run", observers=[Watching()], report=False)
@@ -432,9 +432,9 @@ def test_the_manifest_says_what_was_found_and_what_it_cost(folder, tmp_path):
     assert manifest["geometry"]["room"]["state"] == "sound"
     assert manifest["geometry"]["room"]["frames"] == 4
     assert manifest["seconds"]["check"] > 0
-    assert seen == [("room", "sound")]  # once a scene, not once a model
+    assert checked == [("room", "sound")]  # once a scene, not once a model
     semstab.run(config, out=tmp_path / "run", observers=[Watching()], report=False)
-    assert len(seen) == 1  # what is kept is not checked again
+    assert len(checked) == 1  # what is kept is not checked again
 
 
 def test_what_cannot_be_told_does_not_stop_a_run(tmp_path):

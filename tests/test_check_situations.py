@@ -22,12 +22,12 @@ HARD = ("fy 5 %", "extrinsic of", "two classes exchanged", "labels one frame lat
 LIKE_OTHERS = ("poses turned by 2", "labels upside down from")
 """Situations that are found as other ones are: poses that jump, labels that are mirrored from a frame on."""
 
-FOUND = [each for each in doctor.SITUATIONS if not each.name.startswith(HARD + LIKE_OTHERS)]
+FOUND = [situation for situation in doctor.SITUATIONS if not situation.name.startswith(HARD + LIKE_OTHERS)]
 
 AS_ANOTHER = ("identity as pose in 5 frames", "poses in another frame of reference", "labels three frames late")
 """Situations that are said in the words of another one here."""
 
-CORNERS = [each for each in FOUND if not each.name.startswith(AS_ANOTHER)]
+CORNERS = [situation for situation in FOUND if not situation.name.startswith(AS_ANOTHER)]
 
 
 @pytest.fixture(scope="module")
@@ -35,10 +35,10 @@ def frames():
     return doctor.scene(SEED)
 
 
-@pytest.mark.parametrize("situation", corners(FOUND, kept=CORNERS), ids=lambda each: each.name)
+@pytest.mark.parametrize("situation", corners(FOUND, always=CORNERS), ids=lambda situation: situation.name)
 def test_check_and_a_run_name_it_in_the_same_words(situation, frames, monkeypatch) -> None:
     planted = situation.plant(frames)
-    if all(np.array_equal(own.T_wc, f.T_wc) for own, f in zip(planted, frames, strict=True)):  # mistakes of labels
+    if all(np.array_equal(after.T_wc, f.T_wc) for after, f in zip(planted, frames, strict=True)):  # mistakes of labels
         for trial in ("with_mistakes", "with_lateness", "with_mounting", "with_intrinsics"):
             monkeypatch.setattr(f"semstab.check.inspection.{trial}", lambda verdict, *_: verdict)  # as without mistakes
     checked, in_run = [*doctor.said(planted)], [*doctor.said(planted, run=True)]
@@ -74,7 +74,7 @@ def test_check_names_frames_of_a_tum_file_whose_poses_are_zeros(frames, tmp_path
     zeros = [f"{line.split()[0]} 0 0 0 0 0 0 0" if k // 2 in lost else line for k, line in enumerate(lines)]
     (tmp_path / "groundtruth.txt").write_text("\n".join([head, *zeros]) + "\n")
     options = ("intrinsics=[80,80,47.5,35.5]", "classes=[a,b,c,d,e,f,g]")
-    words = ["check", "--data", str(tmp_path), *(word for each in options for word in ("--option", each))]
+    words = ["check", "--data", str(tmp_path), *(word for situation in options for word in ("--option", situation))]
     result = CliRunner().invoke(app, words)
     assert result.exit_code == 0
     said = "3 of 30 selected frames have no pose (tracking was lost) and are left out: 4, 5, 20"

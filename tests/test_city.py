@@ -70,8 +70,8 @@ def view_of(scene: CityScene, index: int, *, as_frame: int | None = None) -> Cit
     return CityView(index if as_frame is None else as_frame, rendered, frame.intrinsics, frame.T_wc)
 
 
-def simulated(scene: CityScene, seen: CityView, **model: Any) -> np.ndarray:
-    return Simulation(SimulatedModel(**model), 0, "test", scene.name).labels(seen)
+def simulated(scene: CityScene, view: CityView, **model: Any) -> np.ndarray:
+    return Simulation(SimulatedModel(**model), 0, "test", scene.name).labels(view)
 
 
 def test_frames_depend_on_the_seed_and_not_on_the_order_of_calls(small) -> None:
@@ -145,8 +145,8 @@ def test_overlap_and_classes_are_as_in_the_paper(name: str, low: float, high: fl
     """Mean OP at 0.2 m: about 2 in two scenes, 1.15 to 1.25 in three; every class occurs in every scene."""
     scene = full(name)
     frames = [scene.frame(i, GROUND_TRUTH) for i in range(len(scene))]
-    seen = np.concatenate([np.unique(packed(voxels(f, 0.2))) for f in frames])
-    assert low < len(seen) / len(np.unique(seen)) < high
+    visits = np.concatenate([np.unique(packed(voxels(f, 0.2))) for f in frames])
+    assert low < len(visits) / len(np.unique(visits)) < high
     share = np.bincount(np.concatenate([f.labels.ravel() for f in frames]), minlength=256)
     share = share / (len(frames) * frames[0].depth.size)
     assert (share[:8] > 2e-4).all()
@@ -297,7 +297,7 @@ def test_flicker_is_one_draw_a_cell_and_frame(small: City) -> None:
 
 def test_place_errors_are_the_same_in_every_view() -> None:
     scene = full("scene1")
-    seen: dict[tuple[int, int], int] = {}
+    label_of: dict[tuple[int, int], int] = {}
     met = errors = 0
     for index in (6, 7, 8):
         view = view_of(scene, index)
@@ -306,11 +306,11 @@ def test_place_errors_are_the_same_in_every_view() -> None:
         pairs, first, parent = np.unique(pairs, axis=0, return_index=True, return_inverse=True)
         assert np.array_equal(labels[first][parent.ravel()], labels), "one label for a cell and true class"
         for pair, label in zip(map(tuple, pairs.tolist()), labels[first].tolist(), strict=True):
-            met += pair in seen
-            assert seen.setdefault(pair, label) == label
+            met += pair in label_of
+            assert label_of.setdefault(pair, label) == label
             errors += label != pair[1]
     assert met > 5_000
-    assert 0.18 < errors / (len(seen) + met) < 0.22
+    assert 0.18 < errors / (len(label_of) + met) < 0.22
 
 
 def test_view_errors_repeat_with_the_view_and_change_with_it() -> None:
@@ -326,9 +326,9 @@ def test_view_errors_repeat_with_the_view_and_change_with_it() -> None:
     a = dict(zip(packed(voxels(scene.frame(3, GROUND_TRUTH), 0.8)).tolist(), wrong.ravel().tolist(), strict=True))
     b = dict(zip(packed(voxels(scene.frame(5, GROUND_TRUTH), 0.8)).tolist(), second.ravel().tolist(), strict=True))
     both = a.keys() & b.keys()
-    kept = np.mean([b[cell] for cell in both if a[cell]])
+    share = np.mean([b[cell] for cell in both if a[cell]])
     assert len(both) > 500
-    assert kept < 0.8
+    assert share < 0.8
 
 
 def test_border_errors_stay_at_borders_and_difficulty_scales_rates() -> None:
@@ -390,23 +390,23 @@ GOLDEN = runpy.run_path(str(Path(__file__).parent / "golden/regenerate.py"))
 
 def test_the_city_is_what_its_version_stands_for() -> None:
     """Raise GENERATOR_VERSION with a change of the city; `python tests/golden/regenerate.py` then writes the file."""
-    found, known = GOLDEN["golden_city"](), read_json(Path(__file__).parent / "golden/city.json")
-    assert found.keys() == known.keys()
-    assert found["version"] == known["version"]
+    found, golden = GOLDEN["golden_city"](), read_json(Path(__file__).parent / "golden/city.json")
+    assert found.keys() == golden.keys()
+    assert found["version"] == golden["version"]
     for scene in found.keys() - {"version"}:
-        labels = [own[scene].pop("labels") for own in (found, known)]
+        labels = [content[scene].pop("labels") for content in (found, golden)]
         for model, counts in labels[0].items():  # a ray at an edge may hit either side
             assert np.abs(np.array(counts) - labels[1][model]).max() <= 3
-        approximately(found[scene], known[scene], scene)
+        approximately(found[scene], golden[scene], scene)
 
 
-def approximately(found: Any, known: Any, where: str) -> None:
+def approximately(found: Any, expected: Any, where: str) -> None:
     """Every number is the same to six digits; depth and colour of images to three."""
-    if isinstance(known, dict):
-        assert found.keys() == known.keys(), where
-    if isinstance(known, dict | list):
-        for key in known if isinstance(known, dict) else range(len(known)):
-            approximately(found[key], known[key], f"{where}, {key}")
+    if isinstance(expected, dict):
+        assert found.keys() == expected.keys(), where
+    if isinstance(expected, dict | list):
+        for key in expected if isinstance(expected, dict) else range(len(expected)):
+            approximately(found[key], expected[key], f"{where}, {key}")
         return
     image = where.endswith("depth") or where.split(", ")[1] == "color"
-    assert found == pytest.approx(known, rel=1e-3 if image else 1e-6, abs=1e-9), where
+    assert found == pytest.approx(expected, rel=1e-3 if image else 1e-6, abs=1e-9), where

@@ -39,18 +39,18 @@ CLASSES = ["wall", "door", "window", "floor"]
 def write_scene(folder: Path, sources: dict[str, set[int]], name: str = "wall") -> Path:
     """A wall that nine frames see from one place to the next; in those of a source its doors are called windows."""
     size, focal, depth = (48, 64), 64.0, np.full((48, 64), 2.03, np.float32)
-    seen: dict[str, list[Frame]] = {key: [] for key in ("gt", *sources)}
+    views: dict[str, list[Frame]] = {key: [] for key in ("gt", *sources)}
     for i in range(9):
         columns = (np.arange(64) + i * 0.25 * focal / 2.03).astype(int)
         truth = np.tile((columns // 12 % 3).astype(np.uint8), (48, 1))
         pose = np.eye(4)
         pose[:3, 3] = [0.25 * i + 0.003, 0.003, 0.0]
         wrong = np.kron(np.random.default_rng(i).random((12, 16)) < 0.1, np.ones((4, 4), bool))
-        for key, frames in seen.items():
+        for key, frames in views.items():
             labels = truth if key == "gt" else np.where(wrong, (truth + 1) % 3, truth)
             labels = np.where((labels == 1) & (i in sources.get(key, ())), 2, labels).astype(np.uint8)
             frames.append(Frame(i, depth, Intrinsics(focal, focal, size[1] / 2, size[0] / 2), pose, labels=labels))
-    write_posed(folder / name, [f"{i:04d}" for i in range(9)], seen, classes=CLASSES, up_axis="-y")
+    write_posed(folder / name, [f"{i:04d}" for i in range(9)], views, classes=CLASSES, up_axis="-y")
     return folder / name
 
 
@@ -73,15 +73,15 @@ def fault(runs) -> RunComparison:
     return semstab.compare(runs / "old", f"{runs}/new:net", out=runs / "compared")
 
 
-def rows(own: Against, of: str = "") -> dict[str, Contrast]:
-    return {row.measure: row for row in (*own.contrasts, *own.by_class) if row.of == of}
+def rows(against: Against, of: str = "") -> dict[str, Contrast]:
+    return {row.measure: row for row in (*against.contrasts, *against.by_class) if row.of == of}
 
 
 def test_a_run_and_itself_do_not_differ_and_numbers_are_those_of_the_runs(runs, fault):
-    (own,) = semstab.compare(runs / "old", f"{runs}/new:same").overall
-    assert {row.difference.value for row in (*own.contrasts, *own.by_class)} == {0.0}
-    assert {row.change for row in (*own.contrasts, *own.by_class)} == {""}
-    assert all(row.difference.low == row.difference.high == 0 for row in own.contrasts)
+    (against,) = semstab.compare(runs / "old", f"{runs}/new:same").overall
+    assert {row.difference.value for row in (*against.contrasts, *against.by_class)} == {0.0}
+    assert {row.change for row in (*against.contrasts, *against.by_class)} == {""}
+    assert all(row.difference.low == row.difference.high == 0 for row in against.contrasts)
     record = semstab.load_result(runs / "old").record(model="net")
     found = rows(fault.overall[0])
     judged, right = record.statistics.headline, record.statistics.correctness
@@ -97,18 +97,18 @@ def test_a_run_and_itself_do_not_differ_and_numbers_are_those_of_the_runs(runs, 
 
 
 def test_a_planted_fault_is_found_with_its_class_its_place_and_its_frames(fault):
-    (own,) = fault.scenes[0].against
+    (against,) = fault.scenes[0].against
     assert fault.scenes[0].basis == "observations"
-    found = rows(own)
+    found = rows(against)
     assert found["alpha"].difference.value < -0.05
     assert found["accuracy_op2"].other < found["accuracy_op2"].base
     assert found["coverage_op2"].difference.value == 0
-    assert rows(own, "door")["alpha"].difference.value < rows(own, "wall")["alpha"].difference.value
-    assert own.areas
-    assert {(area.of, area.confused_with) for area in own.areas} == {("door", "window")}
-    assert {each.frame for area in own.areas for each in area.frames} <= set(FAULTY)
-    assert {FAULTY[0], FAULTY[1]} <= {each.frame for each in own.top_frames} <= set(FAULTY)
-    assert own.worse > 10 * own.better
+    assert rows(against, "door")["alpha"].difference.value < rows(against, "wall")["alpha"].difference.value
+    assert against.areas
+    assert {(area.of, area.confused_with) for area in against.areas} == {("door", "window")}
+    assert {frame.frame for area in against.areas for frame in area.frames} <= set(FAULTY)
+    assert {FAULTY[0], FAULTY[1]} <= {frame.frame for frame in against.top_frames} <= set(FAULTY)
+    assert against.worse > 10 * against.better
 
 
 def test_what_is_written_comes_back_and_every_file_is_there(runs, fault):
@@ -147,18 +147,18 @@ def test_a_location_is_worse_from_one_of_ten_observations_on_that_turned():
 def test_the_columns_go_along_in_an_export(runs, fault, tmp_path):
     import pyarrow.parquet as pq
 
-    own = fault.scenes[0].against[0]
-    assert own.columns is not None
-    columns = pq.read_table(runs / "compared" / own.columns)
-    assert columns.num_rows == own.compared
-    assert (columns["change"].to_numpy() <= -0.2).sum() == own.worse
-    listed = [area.number for area in own.areas if area.what == "agreement"]
+    against = fault.scenes[0].against[0]
+    assert against.columns is not None
+    columns = pq.read_table(runs / "compared" / against.columns)
+    assert columns.num_rows == against.compared
+    assert (columns["change"].to_numpy() <= -0.2).sum() == against.worse
+    listed = [area.number for area in against.areas if area.what == "agreement"]
     assert set(listed) <= set(columns["area"].to_numpy().tolist())
-    file = runs / "compared" / own.columns
+    file = runs / "compared" / against.columns
     semstab.export(runs / "old", tmp_path / "map.parquet", measures=["change", "area"], join=file)
     exported = pq.read_table(tmp_path / "map.parquet")
     assert (exported["area"].to_numpy() > 0).sum() == (columns["area"].to_numpy() > 0).sum()
-    assert exported["change"].null_count == exported.num_rows - own.compared
+    assert exported["change"].null_count == exported.num_rows - against.compared
     with pytest.raises(DataError, match=r"voxels of 0\.125 m"):
         semstab.export(runs / "coarse", tmp_path / "map.csv", measures=["change"], join=file)
 
@@ -170,11 +170,13 @@ def test_runs_of_other_voxel_sizes_and_frames_of_reference_are_hardly_compared(r
     assert not scene.against[0].areas
     assert (scene.against[0].compared, scene.against[0].worse, scene.against[0].better) == (0, 0, 0)
     assert "voxels of 0.125 m and 0.25 m" in scene.notes[0]
-    entries = [each.scenes["wall"] for each in open_runs([runs / "old", f"{runs}/new:net"])]
+    entries = [run.scenes["wall"] for run in open_runs([runs / "old", f"{runs}/new:net"])]
     here = Georeference("PROJCRS", (0.0, 0.0, 0.0))
     moved = dataclasses.replace(here, offset=(100.0, 0.0, 0.0))
     for pairs in ((here, moved), (None, here)):
-        placed = [dataclasses.replace(entry, georeference=own) for entry, own in zip(entries, pairs, strict=True)]
+        placed = [
+            dataclasses.replace(entry, georeference=reference) for entry, reference in zip(entries, pairs, strict=True)
+        ]
         found = pair(placed, ["old", "new"])
         assert found.basis == "flights"
         assert "nothing can be paired" in found.notes[0]
@@ -223,7 +225,7 @@ def test_a_terminal_of_80_columns_and_markdown_hold_it(fault):
     assert "| Measure | old | new |" in page
 
 
-def test_of_several_scenes_the_screen_shows_the_differences_over_all_and_verbose_each(fault):
+def test_of_several_scenes_the_screen_has_differences_over_all_verbose_those_of_each(fault):
     (scene,) = fault.scenes
     both = (dataclasses.replace(scene, scene="one"), dataclasses.replace(scene, scene="two"))
     several = dataclasses.replace(fault, scenes=both)
@@ -244,21 +246,21 @@ def test_of_several_scenes_the_screen_shows_the_differences_over_all_and_verbose
 
 def renamed(scene: SceneComparison, overall: tuple[Against, ...]) -> SceneComparison:
     """Return a scene with the contrasts and names of what stands over all scenes."""
-    own = (
+    changed = (
         dataclasses.replace(a, other=o.other, contrasts=o.contrasts)
         for a, o in zip(scene.against, overall, strict=True)
     )
-    return dataclasses.replace(scene, against=tuple(own))
+    return dataclasses.replace(scene, against=tuple(changed))
 
 
 def test_long_names_of_runs_stand_in_the_title_and_what_is_written_is_not_offered(fault):
     first, other = "espnetv2_voc scale=2.0", "espnetv2_voc scale=1.0"
     runs = tuple(dataclasses.replace(run, name=name) for run, name in zip(fault.runs, (first, other), strict=True))
-    overall = tuple(dataclasses.replace(own, other=other) for own in fault.overall)
+    overall = tuple(dataclasses.replace(against, other=other) for against in fault.overall)
     (scene,) = fault.scenes
-    named = dataclasses.replace(fault, base=first, runs=runs, overall=overall, scenes=(renamed(scene, overall),))
+    renamed_runs = dataclasses.replace(fault, base=first, runs=runs, overall=overall, scenes=(renamed(scene, overall),))
     text = StringIO()
-    print_comparison(named, Console(file=text, width=80), out=Path("versus"))
+    print_comparison(renamed_runs, Console(file=text, width=80), out=Path("versus"))
     lines = text.getvalue().splitlines()
     assert max(map(len, lines)) <= 80
     assert f"Differences (base: {first}, other: {other})" in lines
@@ -318,9 +320,9 @@ def test_coverage_is_a_count_and_neither_better_nor_worse(runs, change, said):
     text = " ".join(sentences(other))
     assert said in text
     assert "in coverage" not in text
-    shown = StringIO()
-    print_comparison(other, Console(file=shown, width=80))
-    lines = shown.getvalue().splitlines()
+    screen = StringIO()
+    print_comparison(other, Console(file=screen, width=80))
+    lines = screen.getvalue().splitlines()
     line = lines[next(k for k, line in enumerate(lines) if line.startswith(" Coverage")) + 1]  # the name takes two
     assert line.split()[-1] == ("fewer" if change < 0 else "more")
     assert bool(said) == ("covers" in text)

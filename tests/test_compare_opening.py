@@ -45,12 +45,12 @@ def test_a_label_source_is_selected_behind_a_colon_and_names_are_the_shortest(ru
     assert list(entry.flicker) == [1, 2, 3, 4, 5]
     assert np.mean(list(entry.flicker.values())) == pytest.approx(entry.record.image_space.compensated_flicker_percent)
     shutil.copytree(run, tmp_path / "new")
-    names = [each.name for each in open_runs([f"{run}:a", f"{run}:b"])]
+    names = [opened.name for opened in open_runs([f"{run}:a", f"{run}:b"])]
     assert names == ["a", "b"]
-    assert [each.name for each in open_runs([f"{run}:a", f"{tmp_path}/new:a"])] == ["run", "new"]
+    assert [opened.name for opened in open_runs([f"{run}:a", f"{tmp_path}/new:a"])] == ["run", "new"]
     three = open_runs([f"{run}:a", f"{tmp_path}/new:a", f"{run}:b"])
-    assert [each.name for each in three] == ["run:a", "new:a", "run:b"]
-    assert [each.name for each in open_runs([f"{run}:a", f"{run}:a"])] == ["a", "a (2)"]
+    assert [opened.name for opened in three] == ["run:a", "new:a", "run:b"]
+    assert [opened.name for opened in open_runs([f"{run}:a", f"{run}:a"])] == ["a", "a (2)"]
     shutil.copytree(run, tmp_path / "a:b")
     assert open_run(f"{tmp_path}/a:b:a").source == tmp_path / "a:b"
 
@@ -60,8 +60,8 @@ def test_a_label_source_is_selected_behind_a_colon_and_names_are_the_shortest(ru
     ("{run}/nothing", "there is no such folder"), ("{run}/units", "summary.json: cannot be read"),
     ("{run}/config.yaml", "neither a run's folder nor a small summary"),
 ])  # fmt: skip
-def test_what_cannot_be_opened_is_one_line(run, named, line):
-    fails((ConfigError, DataError), re.escape(line.format(run=run)), open_run, named.format(run=run))
+def test_what_cannot_be_opened_is_one_line(run, path, line):
+    fails((ConfigError, DataError), re.escape(line.format(run=run)), open_run, path.format(run=run))
 
 
 def test_an_earlier_layout_and_runs_of_other_scenes_and_classes_are_refused(run, tmp_path):
@@ -86,13 +86,13 @@ def test_an_earlier_layout_and_runs_of_other_scenes_and_classes_are_refused(run,
 def test_a_small_summary_holds_all_but_voxels(run, tmp_path):
     one, file = open_run(f"{run}:a"), tmp_path / "kept.semstab"
     save_summary(one, file)
-    kept = open_run(file)
-    assert (kept.model, list(kept.scenes)) == ("a", ["wall"])
-    own, back = one.scenes["wall"], kept.scenes["wall"]
-    assert to_json(back.record.statistics.agreement) == to_json(own.record.statistics.agreement)
-    assert to_json(back.record.image_space) == to_json(own.record.image_space)
-    assert (back.up, back.flicker) == (own.up, own.flicker)
-    assert all(value(back.sums, key) == value(own.sums, key) for key in ("psa", "alpha", "voxel_alpha", "vss"))
+    small = open_run(file)
+    assert (small.model, list(small.scenes)) == ("a", ["wall"])
+    whole, back = one.scenes["wall"], small.scenes["wall"]
+    assert to_json(back.record.statistics.agreement) == to_json(whole.record.statistics.agreement)
+    assert to_json(back.record.image_space) == to_json(whole.record.image_space)
+    assert (back.up, back.flicker) == (whole.up, whole.flicker)
+    assert all(value(back.sums, key) == value(whole.sums, key) for key in ("psa", "alpha", "voxel_alpha", "vss"))
     fails(
         DataError, re.escape(f"{file}: it is a small summary, without the voxels that mIoU needs"), back.with_voxels,
         "mIoU",

@@ -55,10 +55,10 @@ def run(
 ) -> subprocess.CompletedProcess[str]:
     home = tmp_path / "home"
     home.write_text("a file, so that nothing can be written below it")
-    kept = {k: v for k, v in os.environ.items() if not k.startswith(("NUMBA", "XDG", "PYTHON", "TMP"))}
+    inherited = {k: v for k, v in os.environ.items() if not k.startswith(("NUMBA", "XDG", "PYTHON", "TMP"))}
     settings = {"HOME": str(home), "PYTHONPATH": str(program.parent), "MPLCONFIGDIR": str(tmp_path), **environment}
     return subprocess.run(
-        [sys.executable, program, *arguments], env=kept | settings, capture_output=True, text=True, check=False
+        [sys.executable, program, *arguments], env=inherited | settings, capture_output=True, text=True, check=False
     )
 
 
@@ -149,10 +149,10 @@ def test_code_is_compiled_again_where_what_it_takes_in_has_changed_or_is_damaged
 
     def called() -> str:
         path = f"{tmp_path}{os.pathsep}{Path(semstab.__file__).parents[1]}"
-        kept = {k: v for k, v in os.environ.items() if not k.startswith(("NUMBA", "PYTHON"))}
+        environment = {k: v for k, v in os.environ.items() if not k.startswith(("NUMBA", "PYTHON"))}
         done = subprocess.run(
-            [sys.executable, tmp_path / "caller.py"], env=kept | {"PYTHONPATH": path}, capture_output=True, text=True,
-            check=False,
+            [sys.executable, tmp_path / "caller.py"], env=environment | {"PYTHONPATH": path}, capture_output=True,
+            text=True, check=False,
         )  # fmt: skip
         return done.stdout.strip() or done.stderr
 
@@ -186,7 +186,7 @@ def test_python_cannot_call_a_helper_of_compiled_functions():
         assert six_times(4) == 24
 
 
-def test_the_garbage_collector_runs_again_after_a_function_was_compiled_or_failed_to_compile():
+def test_the_garbage_collector_runs_again_after_a_function_was_compiled_or_failed():
     @serial
     def cannot_be_compiled(x):
         return x.nothing_of_this_name

@@ -136,17 +136,17 @@ def test_what_is_there_is_kept(tmp_path):
 
 def test_an_interrupted_conversion_goes_on(tmp_path):
     config = of_city(scenes=["scene0"])
-    seen = []
+    steps = []
 
     def interrupting(what, done, total):
-        seen.append((what, done, total))
-        if len(seen) == 6:
+        steps.append((what, done, total))
+        if len(steps) == 6:
             raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):
         list(convert(config, tmp_path / "out", progress=interrupting))
-    assert seen[0] == ("scene0 · hard", 1, 4)
-    assert seen[-1] == ("scene0 · soft", 2, 4)
+    assert steps[0] == ("scene0 · hard", 1, 4)
+    assert steps[-1] == ("scene0 · soft", 2, 4)
     assert not list((tmp_path / "out").rglob(".*"))  # nothing half-written
     (converted,) = convert(config, tmp_path / "out")
     assert converted.written == 4  # of each the ground truth was missing

@@ -233,9 +233,9 @@ def test_the_tables_of_a_study_have_the_numbers_of_its_units(studied) -> None:
     found, _ = studied
     base = {record.unit.model: record.statistics for record in found.select()}
     for row in rows_of(found, "temporal_agreement"):
-        own = base[row["model"]]
-        assert row["psa_op2"] == pytest.approx(dataclasses.asdict(own.agreement.psa_op2), nan_ok=True)
-        assert row["flip_rate"] == own.drift.flips.rate.value
+        statistics = base[row["model"]]
+        assert row["psa_op2"] == pytest.approx(dataclasses.asdict(statistics.agreement.psa_op2), nan_ok=True)
+        assert row["flip_rate"] == statistics.drift.flips.rate.value
     for row in rows_of(found, "drift"):
         assert row["voxels"] == base[row["model"]].drift.voxels
         assert row["sbd_op2"] - row["sbd_null_op2"] == pytest.approx(row["sbd_excess_op2"]["value"])

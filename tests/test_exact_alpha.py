@@ -43,7 +43,9 @@ def test_its_error_is_how_much_it_varies_with_the_points_drawn():
         unit = np.repeat(np.arange(300), times)
         truth = rng.choice(3, 300, p=(0.6, 0.3, 0.1))[unit]
         found.append(exact.alpha_of(unit, np.where(rng.random(len(unit)) < 0.2, (truth + 1) % 3, truth)))
-    assert np.mean([own.error for own in found]) == pytest.approx(np.std([own.value for own in found]), rel=0.15)
+    assert np.mean([exact_value.error for exact_value in found]) == pytest.approx(
+        np.std([exact_value.value for exact_value in found]), rel=0.15
+    )
 
 
 def plane(K, frames, seed=0):
@@ -101,25 +103,25 @@ def test_a_box_hides_what_is_in_its_shadow():
     flown = above_a_box()
     xy = np.random.default_rng(0).uniform(-8, 8, (4000, 2))
     points = np.column_stack([xy, np.zeros(len(xy))])
-    some, seen = flown.meet(0, points, np.full(len(xy), 4))
+    some, met = flown.meet(0, points, np.full(len(xy), 4))
     f = flown.sensor.intrinsics.fx
     image = np.abs(xy * f / 10)
     inside = (image[:, 0] < 40.5) & (image[:, 1] < 30.5)
     shadow = np.abs(xy).max(axis=1) < 10 / 6  # of the top's edges, 6 m below the camera
     assert set(some) == set(np.flatnonzero(inside & ~shadow))
-    assert seen.u == pytest.approx(40 + xy[some, 0] * f / 10)
-    assert seen.v == pytest.approx(30 - xy[some, 1] * f / 10)
-    assert seen.t == pytest.approx(10.0)
-    assert seen.point == pytest.approx(points[some])
+    assert met.u == pytest.approx(40 + xy[some, 0] * f / 10)
+    assert met.v == pytest.approx(30 - xy[some, 1] * f / 10)
+    assert met.t == pytest.approx(10.0)
+    assert met.point == pytest.approx(points[some])
 
 
 def test_an_image_shows_the_box_and_the_ground():
     flown = above_a_box()
-    (seen,) = flown.images
+    (image,) = flown.images
     f = flown.sensor.intrinsics.fx
-    top = np.maximum(np.abs(seen.u - 40), np.abs(seen.v - 30)) < f / 6
-    assert (seen.truth == np.where(top, 2, 0)).all()
-    assert seen.t == pytest.approx(np.where(top, 6.0, 10.0))
+    top = np.maximum(np.abs(image.u - 40), np.abs(image.v - 30)) < f / 6
+    assert (image.truth == np.where(top, 2, 0)).all()
+    assert image.t == pytest.approx(np.where(top, 6.0, 10.0))
 
 
 def test_points_are_as_frequent_as_their_surface_is_large():
@@ -129,8 +131,8 @@ def test_points_are_as_frequent_as_their_surface_is_large():
 
 
 def test_the_tool_is_near_the_exact_value_where_errors_are_alike_everywhere():
-    true, own = exact.trial(exact.Condition("orbit", "pixels", 12), 0, (90, 120), 4000)
-    assert own.value == pytest.approx(true.value, abs=0.03)
+    true, told = exact.trial(exact.Condition("orbit", "pixels", 12), 0, (90, 120), 4000)
+    assert told.value == pytest.approx(true.value, abs=0.03)
 
 
 @pytest.mark.parametrize("error", [name for name in ERRORS if name != "none"])
@@ -139,9 +141,9 @@ def test_stronger_errors_leave_less_agreement_than_weak_ones(error):
         rng = np.random.default_rng(3)
         flown = flight("orbit", 8, 6, (45, 60), rng)
         wrong = [
-            ERRORS[error](flown, 6, np.random.default_rng(4), strength)(seen) != seen.truth for seen in flown.images
+            ERRORS[error](flown, 6, np.random.default_rng(4), strength)(image) != image.truth for image in flown.images
         ]
-        return np.mean(np.concatenate(wrong)[np.concatenate([seen.face for seen in flown.images]) >= 0])
+        return np.mean(np.concatenate(wrong)[np.concatenate([image.face for image in flown.images]) >= 0])
 
     assert 0 < at(0.3) < at(1.0) < 0.6
 

@@ -31,10 +31,10 @@ CLASSES = ("building", "road", "tree", "car")
 
 def bash(script: str, cwd: Path, **more: str) -> subprocess.CompletedProcess[str]:
     """Run a script as GitHub does, with the installed command; SLURM_* of the machine are hidden."""
-    known = {name: value for name, value in os.environ.items() if not name.startswith("SLURM_")}
-    known |= {"PATH": f"{Path(sys.executable).parent}:{known['PATH']}", "COLUMNS": "160"} | more
+    environment = {name: value for name, value in os.environ.items() if not name.startswith("SLURM_")}
+    environment |= {"PATH": f"{Path(sys.executable).parent}:{environment['PATH']}", "COLUMNS": "160"} | more
     words = ["bash", "--noprofile", "--norc", "-eo", "pipefail", "-c", script]
-    return subprocess.run(words, cwd=cwd, env=known, capture_output=True, text=True, check=False)
+    return subprocess.run(words, cwd=cwd, env=environment, capture_output=True, text=True, check=False)
 
 
 def network(file: Path, *, of_the_image: float) -> None:
@@ -85,18 +85,18 @@ def test_the_workflow_judges_the_model_of_a_pull_request(repository, of_the_imag
     assert done.returncode == code, done.stdout + done.stderr
     assert bash(show, repository, **summary).returncode == 0
     assert f"the gate {outcome}" in (repository / "summary.md").read_text()
-    kept = next(
+    paths = next(
         step["with"]["path"] for step in WORKFLOW["jobs"]["gate"]["steps"] if step.get("name") == "Keep the report"
     )
-    assert [path for path in kept.split() if not [*repository.glob(path)]] == []
+    assert [path for path in paths.split() if not [*repository.glob(path)]] == []
 
 
 def test_the_workflow_asks_for_what_it_needs_and_no_more() -> None:
     assert WORKFLOW[True] == {"pull_request": {"paths": ["models/**", "ci/**"]}}  # YAML 1.1 reads 'on' as true
     assert WORKFLOW["permissions"] == {"contents": "read"}
-    own = yaml.safe_load((SOURCE / ".github/workflows/ci.yml").read_text(encoding="utf-8"))
-    known = {step["uses"] for job in own["jobs"].values() for step in job["steps"] if "uses" in step}
-    assert {step["uses"] for step in WORKFLOW["jobs"]["gate"]["steps"] if "uses" in step} <= known
+    workflow = yaml.safe_load((SOURCE / ".github/workflows/ci.yml").read_text(encoding="utf-8"))
+    actions = {step["uses"] for job in workflow["jobs"].values() for step in job["steps"] if "uses" in step}
+    assert {step["uses"] for step in WORKFLOW["jobs"]["gate"]["steps"] if "uses" in step} <= actions
     assert requirement(STEPS["Install"]) <= extras()
 
 

@@ -131,10 +131,10 @@ def test_the_raster_lies_where_the_voxels_do(fused, table):
         x, y, z = (table.centers + OFFSET).T
         edge, _, west, _, _, north = raster.transform[:6]
         bands = raster.read()[:, ((north - y) // edge).astype(int), ((x - west) // edge).astype(int)]
-        seen = bands[5] == z.astype(np.float32)  # the topmost of its column
-        assert seen.any()
-        assert (bands[0][seen] == dominant(table)[seen] + 1).all()
-        np.testing.assert_allclose(bands[1][seen], vss(table)[seen], rtol=1e-6)
+        topmost = bands[5] == z.astype(np.float32)  # the topmost of its column
+        assert topmost.any()
+        assert (bands[0][topmost] == dominant(table)[topmost] + 1).all()
+        np.testing.assert_allclose(bands[1][topmost], vss(table)[topmost], rtol=1e-6)
         assert (classes.read(1) == np.nan_to_num(raster.read(1))).all()
         assert classes.nodata == 0
         assert classes.colormap(1)[1][:3] == tuple(
@@ -391,8 +391,8 @@ def turned(request, fused):
 def test_every_format_has_the_coordinates_of_the_projection(fused, table, turned):
     run, linear = turned
     expected = table.centers @ linear.T + OFFSET
-    (kept,) = semstab.load_result(fused / run).georeference.values()
-    assert (np.array(kept.linear) == linear).all()
+    (georeference,) = semstab.load_result(fused / run).georeference.values()
+    assert (np.array(georeference.linear) == linear).all()
     cloud = laspy.read(written(fused, "t.las", run))
     np.testing.assert_allclose(cloud.xyz, expected, atol=5.1e-4)
     ply = o3d.t.io.read_point_cloud(str(written(fused, "t.ply", run)))

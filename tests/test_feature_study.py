@@ -15,14 +15,18 @@ RESULTS, PAGE = ROOT / "results", ROOT / "docs/open-vocabulary.md"
 def made(network, street, feature_alpha, alpha, **more):
     """A row of a network on a street, with all columns of alpha."""
     numbers = {"feature_alpha": feature_alpha, "alpha": alpha, "meaning": alpha, "groups": alpha}
-    known = {"data": "streets", "network": network, "street": street, "family": network[0], "merged": "", "level": ""}
-    return known | numbers | {"verdict": "unstable", "accuracy": alpha, "miou": alpha} | more
+    fields = {"data": "streets", "network": network, "street": street, "family": network[0], "merged": "", "level": ""}
+    return fields | numbers | {"verdict": "unstable", "accuracy": alpha, "miou": alpha} | more
 
 
 def test_features_are_compared_with_labels_network_by_network(monkeypatch):
     monkeypatch.setattr(analysis, "SAMPLES", 20)
     alphas = ((0.3, 0.6, 0.4), (0.5, 0.4, 0.45), (0.7, 0.9, 0.8))
-    rows = [made(f"n{n}", f"{s}", alpha + 0.2, alpha) for n, own in enumerate(alphas) for s, alpha in enumerate(own)]
+    rows = [
+        made(f"n{n}", f"{s}", alpha + 0.2, alpha)
+        for n, of_network in enumerate(alphas)
+        for s, alpha in enumerate(of_network)
+    ]
     grid = analysis.Grid(rows)
     assert "| features | +.20 (+.20 to +.20) | 100 % |" in feature_study.differences_table(grid)
     assert "| groups | +.00 (+.00 to +.00) | 0 % |" in feature_study.differences_table(grid)
@@ -53,12 +57,12 @@ def test_the_rows_of_the_page_are_those_of_the_results(monkeypatch):
     """Ends of bootstrap intervals are left out: they take a minute."""
     monkeypatch.setattr(analysis, "SAMPLES", 3)
     rows = analysis.load(RESULTS / "features.csv")
-    of_streets = [each for each in analysis.load(RESULTS / "streets.csv") if each["condition"] == "main"]
-    accuracy = {(each["network"], each["street"]): each for each in of_streets}
+    of_streets = [row for row in analysis.load(RESULTS / "streets.csv") if row["condition"] == "main"]
+    accuracy = {(row["network"], row["street"]): row for row in of_streets}
     tables = feature_study.tables(rows, accuracy)
     ends = re.compile(r" \([+-]?\d?\.\d+ to [+-]?\d?\.\d+\)")
     lines = {ends.sub("", line) for table in tables.values() for line in table}
     page = PAGE.read_text().partition("## Real networks")[2].partition("\n## ")[0]
-    shown = [ends.sub("", line) for line in page.splitlines() if line.startswith("| ")]
-    assert len(shown) > 20
-    assert [line for line in shown if line not in lines] == []
+    printed = [ends.sub("", line) for line in page.splitlines() if line.startswith("| ")]
+    assert len(printed) > 20
+    assert [line for line in printed if line not in lines] == []

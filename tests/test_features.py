@@ -56,16 +56,16 @@ def sampled(frames, budget=1 << 19):
     return sampler
 
 
-def agreement_of(seen):
+def agreement_of(features):
     """Alpha of features of observations, with all that goes with it."""
-    alike = likeness(seen)
-    return feature_agreement(seen, alike, feature_sums(seen, alike))
+    alike = likeness(features)
+    return feature_agreement(features, alike, feature_sums(features, alike))
 
 
 def seen_by(vectors, index=None):
     """Features (n, F, D) of F views at n spots on a floor."""
     n, F, _ = vectors.shape
-    spot, view = (each.ravel() for each in np.indices((n, F)))
+    spot, view = (indices.ravel() for indices in np.indices((n, F)))
     index = grid(int(n**0.5)) if index is None else index
     labels = np.zeros(n * F, np.uint16)
     spots = spots_at(index * 0.125, spot, view, labels, F, 1)
@@ -109,10 +109,10 @@ def test_their_intervals_are_those_of_the_labels():
 def test_alpha_is_that_of_all_pairs(D):
     rng = np.random.default_rng(D)
     vectors = rng.normal(size=(64, 1, D)) + 0.8 * rng.normal(size=(64, 5, D)) + 0.5
-    seen = seen_by(vectors)
-    exact = seen.rows(slice(0, len(seen))).reshape(64, 5, D)
-    assert alpha_of_features(seen) == pytest.approx(alpha_by_hand(exact), abs=1e-12)
-    assert alpha_of_features(seen) == pytest.approx(
+    features = seen_by(vectors)
+    exact = features.rows(slice(0, len(features))).reshape(64, 5, D)
+    assert alpha_of_features(features) == pytest.approx(alpha_by_hand(exact), abs=1e-12)
+    assert alpha_of_features(features) == pytest.approx(
         alpha_by_hand(vectors / np.linalg.norm(vectors, axis=2, keepdims=True)), abs=2e-3
     )
 
@@ -128,9 +128,9 @@ def test_agreement_of_pairs_in_a_bin_is_that_of_all_their_vectors():
     rng = np.random.default_rng(2)
     drift = np.cumsum(rng.normal(size=(1, 24, 60)), axis=1) * 0.3
     vectors = rng.normal(size=(400, 1, 60)) + rng.normal(size=(400, 24, 60)) + drift
-    seen = seen_by(vectors)
-    s = seen.rows(slice(0, len(seen))).reshape(400, 24, 60)
-    found = {(each.low, each.high): each.alpha.value for each in agreement_of(seen).correlogram.time}
+    features = seen_by(vectors)
+    s = features.rows(slice(0, len(features))).reshape(400, 24, 60)
+    found = {(stratum.low, stratum.high): stratum.alpha.value for stratum in agreement_of(features).correlogram.time}
     a, b = s[:, :-1].reshape(-1, 60), s[:, 1:].reshape(-1, 60)  # pairs of views next to each other
     both = np.concatenate([a, b])
     n, total = len(both), both.sum(axis=0)
@@ -151,19 +151,19 @@ def test_memory_is_bounded_by_dropping_every_second_spot(caplog):
     few, all_of_them = small.features(), whole.features()
     assert len(few.vectors) <= (1 << 18) / (2 * 64) < len(all_of_them.vectors)
     assert few.one_in >= 2
-    kept, known = set(map(tuple, few.spots.point)), set(map(tuple, all_of_them.spots.point))
-    assert kept <= known
+    few_points, all_points = set(map(tuple, few.spots.point)), set(map(tuple, all_of_them.spots.point))
+    assert few_points <= all_points
     assert alpha_of_features(few) == pytest.approx(alpha_of_features(all_of_them), abs=0.1)
 
 
 def test_a_sampler_that_drops_spots_drops_their_features():
     frames = [dataclasses.replace(frame, features=of_classes(frame.labels)) for frame in flight()]
     sampler = sampled(frames, budget=2_000)
-    spots, seen = sampler.sample(), sampler.features()
+    spots, features = sampler.sample(), sampler.features()
     assert len(spots) <= 2_000
-    assert len(seen.vectors) == len(spots)
+    assert len(features.vectors) == len(spots)
     first = sums_of_spots(spots).answers[0]
-    assert alpha_of_features(seen) == pytest.approx(value(first, "voxel_alpha"), abs=1e-12)
+    assert alpha_of_features(features) == pytest.approx(value(first, "voxel_alpha"), abs=1e-12)
 
 
 def test_frames_of_a_standing_camera_are_one_view():
@@ -175,11 +175,11 @@ def test_frames_of_a_standing_camera_are_one_view():
     ]
     moved = rigid(turn(0, 0), (0.2, 0, -1))
     frames.append(semstab.Frame(3, render(moved)[0], CAMERA, moved, features=np.ones((9, 12, 8), np.float32)))
-    seen = sampled(frames).features()
-    assert len(seen.spots.views) == 2
-    own = likeness(seen).own
-    assert own[seen.log.frame == 0].max() < 0.99  # the mean of three vectors is shorter
-    assert own[seen.log.frame == 3] == pytest.approx(1)
+    features = sampled(frames).features()
+    assert len(features.spots.views) == 2
+    similarity = likeness(features).own
+    assert similarity[features.log.frame == 0].max() < 0.99  # the mean of three vectors is shorter
+    assert similarity[features.log.frame == 3] == pytest.approx(1)
 
 
 def test_a_bad_frame_is_named_and_a_bad_place_is_found():
@@ -190,7 +190,7 @@ def test_a_bad_frame_is_named_and_a_bad_place_is_found():
     corner = (index[:, 0] < 8) & (index[:, 1] < 8)
     vectors[corner] = rng.normal(size=(corner.sum(), 10, 12))
     found = agreement_of(seen_by(vectors, index))
-    assert [each.frame for each in found.outlying_frames.frames] == [4]
+    assert [outlier.frame for outlier in found.outlying_frames.frames] == [4]
     assert found.places[0].centre[0] < 1 > found.places[0].centre[1]
     assert found.places[0].cosine < 0.2 < found.places[-1].cosine
 
@@ -205,7 +205,7 @@ def test_agreement_falls_with_the_angle_between_views():
         turned[..., 6], turned[..., 7] = np.cos(0.15 * i), np.sin(0.15 * i)
         turned = turned + 0.02 * rng.normal(size=turned.shape)
         frames.append(semstab.Frame(i, depth, CAMERA, T, features=turned.astype(np.float32)))
-    alphas = [each.alpha.value for each in agreement_of(sampled(frames).features()).correlogram.time]
+    alphas = [stratum.alpha.value for stratum in agreement_of(sampled(frames).features()).correlogram.time]
     assert len(alphas) >= 4
     assert alphas == sorted(alphas, reverse=True)
     assert alphas[0] - alphas[-1] > 0.2
@@ -213,8 +213,8 @@ def test_agreement_falls_with_the_angle_between_views():
 
 def test_sums_of_a_half_and_the_other_half_add_up():
     rng = np.random.default_rng(5)
-    seen = seen_by(rng.normal(size=(400, 6, 12)) + 1)
-    sums = feature_sums(seen, likeness(seen))
+    features = seen_by(rng.normal(size=(400, 6, 12)) + 1)
+    sums = feature_sums(features, likeness(features))
     assert value(sums.coarsened(sums.edge * 4, 2), FEATURE_ALPHA) == pytest.approx(value(sums, FEATURE_ALPHA))
 
 
@@ -294,8 +294,8 @@ def test_a_metric_takes_features_and_adds_up_over_processes():
     metric, halves = TemporalStability(K), [TemporalStability(K), TemporalStability(K)]
     for i, frame in enumerate(flight(12)):
         features = np.moveaxis(of_classes(frame.labels), -1, 0)
-        for each in (metric, halves[i % 2]):
-            each.update(frame.labels, frame.depth, CAMERA, frame.T_wc, features=features)
+        for part in (metric, halves[i % 2]):
+            part.update(frame.labels, frame.depth, CAMERA, frame.T_wc, features=features)
     numbers = metric.compute()
     assert numbers["feature_alpha"] == pytest.approx(alpha_of_features(metric.states()[""].features))
     assert numbers["feature_alpha"] > 0.3
@@ -557,8 +557,8 @@ def test_sums_of_features_are_in_the_file_of_sums(tmp_path):
 
 def sums_with_features(sampler):
     """Sums of spots with sums of their features, as a run stores them."""
-    seen = sampler.features()
-    return dataclasses.replace(sums_of_spots(sampler.sample()), features=feature_sums(seen, likeness(seen)))
+    observed = sampler.features()
+    return dataclasses.replace(sums_of_spots(sampler.sample()), features=feature_sums(observed, likeness(observed)))
 
 
 def test_a_baseline_of_features_is_paired(runs_of_features):

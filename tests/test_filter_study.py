@@ -19,7 +19,7 @@ NAN = float("nan")
 
 
 def result_of(filters="", flicker=0.2, worth=0.8, **more):
-    known = {
+    defaults = {
         "plain": flicker,
         "alpha": 0.5,
         "next_frame": worth,
@@ -29,7 +29,7 @@ def result_of(filters="", flicker=0.2, worth=0.8, **more):
         "changed": 0.2 if filters else 0.0,
         "seen": 0.9,
     }
-    return FilterResult(filters, flicker, **{**known, "lag": 0.0, "coverage": 1.0, "milliseconds": 2.0, **more})
+    return FilterResult(filters, flicker, **{**defaults, "lag": 0.0, "coverage": 1.0, "milliseconds": 2.0, **more})
 
 
 def study(*rows, truth=True):
@@ -92,8 +92,8 @@ def test_a_filter_that_changes_next_to_nothing_is_not_recommended():
 def test_nothing_is_recommended_where_flicker_is_known_of_next_to_nothing():
     found = study(result_of("ema:0.3", flicker=0.1, worth=0.9))
     assert found.best is not None
-    for seen in (0.003, NAN):
-        blind = dataclasses.replace(found, unfiltered=dataclasses.replace(found.unfiltered, seen=seen))
+    for visible_share in (0.003, NAN):
+        blind = dataclasses.replace(found, unfiltered=dataclasses.replace(found.unfiltered, seen=visible_share))
         assert blind.best is None
         assert said(blind).startswith("No filter over net is recommended: two frames in a row see the same surface at")
 
@@ -195,7 +195,7 @@ def test_filters_that_warp_are_refused(sparse, tmp_path, words):
     assert "of a pixel with depth have depth, 50 % are needed; ema-warped:0.3 would find few" in line
 
 
-def test_the_shipped_ones_that_warp_are_left_out_and_flicker_is_of_all_that_both_frames_see(sparse, tmp_path):
+def test_shipped_ones_that_warp_are_left_out_flicker_is_of_what_both_frames_see(sparse, tmp_path):
     result = command(sparse, "filters", "--out", tmp_path / "out", "--report", "off")
     assert result.exit_code == 0, result.output
     assert "flight: left out, because depth is sparse" in result.output
@@ -210,7 +210,7 @@ def test_the_shipped_ones_that_warp_are_left_out_and_flicker_is_of_all_that_both
 
 
 @pytest.mark.parametrize(("count", "named"), [(4, "ema:0.1, ema:0.2, ema:0.3, ema:0.4."), (6, "ema:0.4 and 2 more.")])
-def test_filters_that_change_nothing_are_named_up_to_four(count, named):
+def test_filters_that_change_nothing_are_named_up_to_four(count, listed):
     found = study(*(result_of(f"ema:0.{k + 1}", changed=0.0) for k in range(count)))
     (line,) = (line for line in advice(found) if line.startswith("These filters change fewer than"))
-    assert line.endswith(named)
+    assert line.endswith(listed)

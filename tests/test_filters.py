@@ -35,9 +35,9 @@ def after(text, given):
 
 def moved(values):
     """What the next frame's camera sees of these pixels: it is 2 of them further to the right."""
-    seen = np.zeros_like(values)
-    seen[:, :-2] = values[:, 2:]
-    return seen
+    shifted = np.zeros_like(values)
+    shifted[:, :-2] = values[:, 2:]
+    return shifted
 
 
 # --- Each filter ------------------------------------------------------------------------------------------------------

@@ -102,8 +102,8 @@ def test_over_labels_that_are_there_they_say_what_they_say_over_the_model(scene,
             for k in range(6):
                 np.testing.assert_array_equal(opened.frame(k, name).predicted, wanted[k].labels, err_msg=text)
         on_disk = PredictorConfig(model="stored", options={"source": source}, filters=filters)
-        shown, model = stored_labels(on_disk, open_dataset("posed_folder", {"root": str(scene)}).scene("flight"))
-        predict_sequence(shown, model, range(6), scene, SequenceOptions("out", overwrite=True, batch=2))
+        recorded, model = stored_labels(on_disk, open_dataset("posed_folder", {"root": str(scene)}).scene("flight"))
+        predict_sequence(recorded, model, range(6), scene, SequenceOptions("out", overwrite=True, batch=2))
         for k, labels in enumerate(stored(scene, "out")):
             np.testing.assert_array_equal(opened.frame(k, name).predicted, labels, err_msg=text)
 
@@ -155,20 +155,20 @@ def net(image):
 
 
 @pytest.mark.parametrize("shown", [True, False])
-def test_filters_over_one_model_share_its_maps(scene, monkeypatch, shown):
+def test_filters_over_one_model_share_its_maps(scene, monkeypatch, unfiltered):
     (scene.parent / "counted.py").write_text(COUNTED)
     monkeypatch.setenv("COUNTS", str(scene.parent / "count"))
     file = f"{scene.parent / 'counted.py'}:net"
     chains = [["ema:0.6"], ["vote:3"], ["guided:4", "vote:3"]]
-    models = [parse_predictor(file)] * shown + [parse_predictor(file, filters=chain) for chain in chains]
+    models = [parse_predictor(file)] * unfiltered + [parse_predictor(file, filters=chain) for chain in chains]
     out = scene.parent / "run"
     config = predicted_config(models, None, {"dataset": dataset_of(scene), "voxel_size": 0.25})
     found = run(config, out=out, report=False)
     assert (scene.parent / "count").read_text() == "x" * 6
-    base = "net" if shown else "net-ema-0.6-unfiltered"
+    base = "net" if unfiltered else "net-ema-0.6-unfiltered"
     assert {path.name for path in (out / "predictions/flight/scores").iterdir()} == {base}
     names = ["net-ema-0.6", "net-vote-3", "net-guided-4-vote-3"]
-    assert [record.unit.model for record in found.runs] == ["net"] * shown + names
+    assert [record.unit.model for record in found.runs] == ["net"] * unfiltered + names
     for name, chain in zip(names, chains, strict=True):
         alone = load_predictor(parse_predictor(file, filters=chain))
         frames = [predicted_scene.frame(k, 1) for k in range(6)]

@@ -226,9 +226,9 @@ def test_coordinates_as_large_as_utm_change_nothing(seed):
 
 def test_any_image_can_be_warped():
     source, target = at_x(0, [[0, 0, 1, 2]], 2), at_x(0.25, [[0, 0, 0, 0]], 2)
-    labels, seen = warp(source.labels, source, target, fill=255)
+    labels, visible = warp(source.labels, source, target, fill=255)
     assert labels.tolist() == [[0, 1, 2, 255]]
-    assert seen.tolist() == [[True, True, True, False]]
+    assert visible.tolist() == [[True, True, True, False]]
     color = np.arange(12, dtype=np.uint8).reshape(1, 4, 3)
     warped, _ = warp(color, source, target)
     assert warped.tolist() == [[[3, 4, 5], [6, 7, 8], [9, 10, 11], [0, 0, 0]]]
@@ -239,8 +239,8 @@ def test_warping_there_and_back_keeps_the_pixels_that_are_seen_both_times():
     source = at_x(0, rng.integers(0, 4, (5, 9)), 2)
     target = at_x(0.5, rng.integers(0, 4, (5, 9)), 2)
     there, _ = warp(source.labels, source, target, fill=9)
-    back, seen = warp(there, target, source, fill=9)
-    assert seen[:, 2:].all()
+    back, visible = warp(there, target, source, fill=9)
+    assert visible[:, 2:].all()
     assert (back[:, 2:] == source.labels[:, 2:]).all()
 
 

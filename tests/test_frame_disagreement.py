@@ -47,10 +47,10 @@ def spots(places):
 
 
 def test_a_view_stands_alone_where_those_before_and_after_agree_on_another_class() -> None:
-    seen = spots(
+    answers = spots(
         [dict(enumerate(labels)) for labels in ((0, 1, 0), (0, 0, 1, 1), (1, 1, 1, 1, 1, 0), (0, 1), (2, 0, 1))]
     )
-    alone = stands_alone(seen.observations()).tolist()
+    alone = stands_alone(answers.observations()).tolist()
     assert alone == [False, True, False, *4 * [False], *5 * [False], True, False, False, *3 * [False]]
 
 
@@ -59,8 +59,8 @@ def test_the_frames_beside_a_bad_one_are_not_blamed() -> None:
     found = lone_disagreement(spots([{t: int(t == 3) for t in range(7)} for _ in range(60)]))
     assert found.frame.tolist() == [0, 10, 20, 30, 40, 50, 60]
     assert found.share.tolist() == [0, 0, 0, 1, 0, 0, 0]
-    named = outlying_frames(found, 7, name="frame-{}".format).frames
-    assert [(each.frame, each.name, each.places, each.share, each.null) for each in named] == [
+    blamed = outlying_frames(found, 7, name="frame-{}".format).frames
+    assert [(outlier.frame, outlier.name, outlier.places, outlier.share, outlier.null) for outlier in blamed] == [
         (30, "frame-30", 60, 1, 0)
     ]
 
@@ -115,7 +115,7 @@ def test_an_excess_below_three_in_a_hundred_places_is_not_named() -> None:
         outlying_frames(LoneDisagreement(np.arange(10), np.full(10, 900), times * share, 0 * share), 10).frames
         for times in (1, 2)
     ]
-    assert [len(each) for each in outliers] == [0, 1]
+    assert [len(outlying) for outlying in outliers] == [0, 1]
 
 
 # --- A run ------------------------------------------------------------------------------------------------------------
@@ -126,7 +126,7 @@ def run(tmp_path_factory):
     """A camera moves along a wall; blocks of labels err anew in each frame, in every third one 15 % more of them."""
     root = tmp_path_factory.mktemp("frames") / "wall"
     camera, depth = Intrinsics(FOCAL, FOCAL, W / 2, H / 2), np.full((H, W), DEPTH, np.float32)
-    seen = {model: [] for model in BAD}
+    frames = {model: [] for model in BAD}
     for i in range(FRAMES):
         truth = np.tile(((np.arange(W) + i * 0.2 * FOCAL / DEPTH).astype(int) // 48 % 3).astype(np.uint8), (H, 1))
         pose = np.eye(4)
@@ -137,8 +137,8 @@ def run(tmp_path_factory):
             shift = np.kron(wrong.reshape(H // BLOCK, W // BLOCK), np.ones((BLOCK, BLOCK), np.uint8))
             color = np.repeat(truth[..., None] * 80, 3, axis=2)
             labels = ((truth + shift) % 3).astype(np.uint8)
-            seen[model].append(Frame(i, depth, camera, pose, labels=labels, color=color))
-    write_posed(root, [f"shot-{7 * i:03d}" for i in range(FRAMES)], seen, classes=CLASSES, up_axis="-y")
+            frames[model].append(Frame(i, depth, camera, pose, labels=labels, color=color))
+    write_posed(root, [f"shot-{7 * i:03d}" for i in range(FRAMES)], frames, classes=CLASSES, up_axis="-y")
     folder = Path(tmp_path_factory.mktemp("run")) / "out"
     return run_study(configure(root, voxel_size=0.125, check=None), folder, report=False), folder
 
@@ -156,13 +156,13 @@ def test_the_bad_frames_and_no_other_are_named_by_statistics_series_table_and_vi
     result, _ = run
     record = result.record(model=model)
     found = record.statistics.outlying_frames
-    assert {each.name for each in found.frames} == names(BAD[model])
+    assert {outlier.name for outlier in found.frames} == names(BAD[model])
     assert found.judged == FRAMES
     with record.series.open(newline="") as file:
         rows = list(csv.DictReader(file))
     assert {row["name"] for row in rows if row["outlying"] == "1"} == names(BAD[model])
     of_series = {row["name"]: float(row["lone_percent"]) for row in rows}
-    assert all(of_series[each.name] == pytest.approx(100 * each.share) for each in found.frames)
+    assert all(of_series[outlier.name] == pytest.approx(100 * outlier.share) for outlier in found.frames)
     (table,) = (table for table in tables(result) if table.name == "frames")
     (group,) = (group for group in table.groups if group.name == model)
     assert {row[1] for row in group.rows} == (names(BAD[model]) or {"none"})
@@ -174,13 +174,13 @@ def test_screen_and_report_name_the_same_frames_with_pictures_of_the_worst(run) 
     assert in_text("\n".join(screen(result))) == names(BAD["every-third"])
     page = render(result, folder)
     visible = re.sub(r"<script.*?</script>", "", page, flags=re.DOTALL)
-    named = "".join(re.findall(r"frames that stand out[^<]*", visible))  # worst places list their own frames
-    assert in_text(named) == names(BAD["every-third"])
+    sentence = "".join(re.findall(r"frames that stand out[^<]*", visible))  # worst places list their own frames
+    assert in_text(sentence) == names(BAD["every-third"])
     worst = result.record(model="every-third").statistics.outlying_frames.frames[:3]
     titles = re.findall(r"<figcaption>every-third, (shot-\d+): alone at", visible)
-    assert titles == [each.name for each in worst]
+    assert titles == [outlier.name for outlier in worst]
     pictures = re.findall(r'<img src="data:image/png;base64,([^"]*)" alt="alone"', visible)
-    shares = [(pixels(each) == [213, 94, 0]).all(axis=2).mean() for each in pictures]
+    shares = [(pixels(outlier) == [213, 94, 0]).all(axis=2).mean() for outlier in pictures]
     assert len(shares) == len(worst)
     assert all(0.05 < share < 0.2 for share in shares)  # 19 % of the blocks err, not all where both neighbours see them
 

@@ -62,7 +62,7 @@ def test_the_share_of_changed_labels_is_of_those_of_the_model():
     assert judged(maps).changed == 0
 
 
-def test_flicker_is_of_all_that_both_frames_see_also_where_the_frame_before_has_no_depth():
+def test_flicker_is_of_all_that_both_frames_see_where_the_one_before_has_no_depth():
     """A point is hidden where the frame before has another depth; one without depth there hides nothing."""
 
     def flight(depth_before):

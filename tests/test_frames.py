@@ -87,9 +87,9 @@ def test_an_index_below_0_is_refused() -> None:
 def test_what_has_one_meaning_is_taken() -> None:
     matrix = [[2, 0, 1], [0, 3, 0.5], [0, 0, 1]]
     assert a_frame(intrinsics=matrix).intrinsics == CAMERA
-    for values, kept in (([0, 2, 255], np.uint8), ([0, 2, 256], np.uint16), ([True, False, True], np.uint8)):
+    for values, dtype in (([0, 2, 255], np.uint8), ([0, 2, 256], np.uint16), ([True, False, True], np.uint8)):
         labels = a_frame(labels=np.array([values, values])).labels
-        assert labels.dtype == kept
+        assert labels.dtype == dtype
         np.testing.assert_array_equal(labels, [values, values])
 
 

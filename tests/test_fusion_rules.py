@@ -35,8 +35,8 @@ class Direct(FromObservations):
     """The reference's association behind the one method, as a user's backend has it."""
 
     def observe(self, frame):
-        seen = observe(frame, self.voxel_size, self.num_classes)
-        return seen.index, seen.s_bar, seen.pixels
+        observed = observe(frame, self.voxel_size, self.num_classes)
+        return observed.index, observed.s_bar, observed.pixels
 
 
 class TestFromObservations(BackendConformance):
@@ -56,28 +56,28 @@ class TestNumbaObservations(BackendConformance):
 # --- Each rule, voxel by voxel ----------------------------------------------------------------------------------------
 
 
-def one_by_one(rule, seen):
+def one_by_one(rule, observations):
     """Return the evidence of a voxel from its observations (frame, s_bar, pixels, distance), in plain Python."""
     if rule == "bayes":  # as a product, not as a sum of logarithms
         p = [1 / K] * K
-        for _, s, _, _ in seen:
+        for _, s, _, _ in observations:
             likelihood = [sum(s[j] * (0.9 if j == k else 0.1 / (K - 1)) for j in range(K)) for k in range(K)]
             p = [a * b for a, b in zip(p, likelihood, strict=True)]
-            p = [each / sum(p) for each in p]
+            p = [value / sum(p) for value in p]
         return p
-    newest = max(frame for frame, *_ in seen)
-    assert newest == seen[-1][0]
+    newest = max(frame for frame, *_ in observations)
+    assert newest == observations[-1][0]
     terms = {
         "mean": lambda frame, s, n, d: s,
-        "votes": lambda frame, s, n, d: [n * each for each in s],
-        "weighted": lambda frame, s, n, d: [each / d**2 for each in s],
-        "recent": lambda frame, s, n, d: [each * 0.5 ** ((newest - frame) / 10) for each in s],
+        "votes": lambda frame, s, n, d: [n * value for value in s],
+        "weighted": lambda frame, s, n, d: [value / d**2 for value in s],
+        "recent": lambda frame, s, n, d: [value * 0.5 ** ((newest - frame) / 10) for value in s],
     }
     if rule in terms:
-        return [math.fsum(term) for term in zip(*(terms[rule](*each) for each in seen), strict=True)]
+        return [math.fsum(term) for term in zip(*(terms[rule](*value) for value in observations), strict=True)]
     if rule == "max":
-        return [max(column) for column in zip(*(s for _, s, *_ in seen), strict=True)]
-    return seen[0 if rule == "first" else -1][1]
+        return [max(column) for column in zip(*(s for _, s, *_ in observations), strict=True)]
+    return observations[0 if rule == "first" else -1][1]
 
 
 def seen_by(frames, voxel_size):
@@ -311,9 +311,11 @@ def test_rules_stand_side_by_side(folder) -> None:
     keys, (group,) = [column.key for column in table.columns], table.groups
     assert [row[0] for row in group.rows] == ["numba", "numba+bayes", "numba+sharp"]
     for row in group.rows:
-        known = result.record(backend=row[0]).statistics.correctness
-        assert row[keys.index("accuracy_op2")] == pytest.approx(known.accuracy_op2.value)
-        assert row[keys.index("ece_op2")] == next(own.ece for own in known.strata if own.name == "OP>=2")
+        correctness = result.record(backend=row[0]).statistics.correctness
+        assert row[keys.index("accuracy_op2")] == pytest.approx(correctness.accuracy_op2.value)
+        assert row[keys.index("ece_op2")] == next(
+            stratum.ece for stratum in correctness.strata if stratum.name == "OP>=2"
+        )
 
 
 def test_a_rule_alone_is_checked_by_the_reference_with_that_rule(folder) -> None:
@@ -330,7 +332,7 @@ def test_settings_name_rules_with_options(folder) -> None:
     content = {"name": "numba", "options": {"rule": "recent", "rule_options": {"half_life": 3}}}
     slow = {"name": "numba+slow", "options": {"rule": "recent", "rule_options": {"half_life": 30}}}
     config = load_config(overrides={"backends": [content, slow]})
-    assert [each.name for each in config.backends] == ["numba+recent", "numba+slow"]
+    assert [backend.name for backend in config.backends] == ["numba+recent", "numba+slow"]
     assert config.backends[1].ruled == slow["options"]
 
 
@@ -356,5 +358,5 @@ def test_a_rule_that_is_not_there_is_one_line(folder, words, line) -> None:
 
 def test_frames_in_memory_are_fused_by_a_rule() -> None:
     fused = [semstab.fuse(random_frames(3, count=4, K=K), voxel_size=0.3, rule=rule) for rule in ("mean", "first")]
-    assert [each.backend for each in fused] == ["numba", "numba+first"]
+    assert [unit.backend for unit in fused] == ["numba", "numba+first"]
     assert fused[1].summary.sbd_op3 == 0 < fused[0].summary.sbd_op3

@@ -47,9 +47,9 @@ def test_coincidences_are_those_of_all_pairs_of_views():
     spots = spots_of(labels, 3)
     pairs = np.zeros((3, 3))
     for row in labels:
-        seen = row[row >= 0]
-        for a, b in itertools.permutations(range(len(seen)), 2):
-            pairs[seen[a], seen[b]] += 1 / (len(seen) - 1)
+        given = row[row >= 0]
+        for a, b in itertools.permutations(range(len(given)), 2):
+            pairs[given[a], given[b]] += 1 / (len(given) - 1)
     found = halves_of(spots, sums_of_spots(spots))
     assert found.sum(axis=0) == pytest.approx(pairs)
 
@@ -114,7 +114,7 @@ def test_labels_at_random_have_no_groups_on_which_views_agree():
 
 def test_the_choice_of_merges_does_not_flatter():
     """Merges chosen on one flight have at least the stated alpha on a long flight over the same place, in the mean."""
-    stated, kept, chosen = [], [], []
+    stated, later, chosen = [], [], []
     for seed in range(10):
         spots, again = (
             sampled(flight(np.random.default_rng(seed), side=40, frames=frames, confused=0.35, wrong=0.15))
@@ -125,8 +125,8 @@ def test_the_choice_of_merges_does_not_flatter():
             group = groups_after(5, merges_of(whole)[: n + 1])
             stated.append(merge.alpha)
             chosen.append(whole.merged(group).alpha())
-            kept.append(value(sums_of_spots(grouped(again, group)), "alpha"))
-    assert np.mean(kept) - 0.05 < np.mean(stated) < np.mean(kept) + 0.005
+            later.append(value(sums_of_spots(grouped(again, group)), "alpha"))
+    assert np.mean(later) - 0.05 < np.mean(stated) < np.mean(later) + 0.005
     assert np.mean(stated) < np.mean(chosen)
 
 
@@ -151,7 +151,7 @@ def home(tmp_path_factory):
     """A wall of five classes that twelve frames see; two pairs of classes are confused, in blocks of pixels."""
     base, rng = tmp_path_factory.mktemp("groupings"), np.random.default_rng(0)
     other = np.array([0, 2, 1, 4, 3])
-    seen = []
+    frames = []
     for i in range(16):
         truth = np.tile(((np.arange(96) + 12 * i) // 20 % 5).astype(np.uint8), (72, 1))
         flips = (rng.random((9, 12)) < 0.5).repeat(8, axis=0).repeat(8, axis=1)
@@ -159,16 +159,16 @@ def home(tmp_path_factory):
         T[:3, 3] = [0.25 * i + 0.01, 0.01, 0.01]
         depth = np.full(truth.shape, 2, np.float32)
         labels = np.where(flips, other[truth], truth).astype(np.uint8)
-        seen.append(semstab.Frame(i, depth, semstab.Intrinsics(96, 96, 48, 36), T, labels=labels))
-    write_posed(base / "wall", [f"{i:04d}" for i in range(16)], {"net": seen}, classes=CLASSES, up_axis="-y")
+        frames.append(semstab.Frame(i, depth, semstab.Intrinsics(96, 96, 48, 36), T, labels=labels))
+    write_posed(base / "wall", [f"{i:04d}" for i in range(16)], {"net": frames}, classes=CLASSES, up_axis="-y")
     bench("wall", "--voxel-size", "0.1", "-o", "run", cwd=base, report=True)
     return base
 
 
 def test_the_screen_the_report_and_a_table_say_which_classes_hold(home):
-    shown = " ".join(bench("show", "run", cwd=home).stdout.split())
+    screen = " ".join(bench("show", "run", cwd=home).stdout.split())
     assert re.search(
-        r"stable if 5 classes become 3, worth .* of equal share: door \+ curtain, window \+ blinds; alpha", shown
+        r"stable if 5 classes become 3, worth .* of equal share: door \+ curtain, window \+ blinds; alpha", screen
     )
     page = (home / "run/report.html").read_text()
     assert "Which distinctions hold" in page

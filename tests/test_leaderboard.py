@@ -49,11 +49,13 @@ def write_scene(root: Path, seed: int) -> Path:
     """Write a wall that twelve frames see, with labels of three models and the truth."""
     rng = np.random.default_rng(seed)
     truth = [np.tile(((np.arange(32) + 4 * i) // 16 % 3).astype(np.uint8), (24, 1)) for i in range(FRAMES)]
-    seen = {"gt": [frame(i, labels) for i, labels in enumerate(truth)]}
+    views = {"gt": [frame(i, labels) for i, labels in enumerate(truth)]}
     for model, share in WRONG.items():
-        maps = [np.where(rng.random(own.shape) < share, (own + 1) % 3, own).astype(np.uint8) for own in truth]
-        seen[model] = [frame(i, labels) for i, labels in enumerate(maps)]
-    return write_posed(root, [f"{i:04d}" for i in range(FRAMES)], seen, classes=CLASSES, up_axis="-y")
+        maps = [
+            np.where(rng.random(labels.shape) < share, (labels + 1) % 3, labels).astype(np.uint8) for labels in truth
+        ]
+        views[model] = [frame(i, labels) for i, labels in enumerate(maps)]
+    return write_posed(root, [f"{i:04d}" for i in range(FRAMES)], views, classes=CLASSES, up_axis="-y")
 
 
 def frame(i: int, labels: np.ndarray) -> semstab.Frame:
@@ -73,8 +75,8 @@ def define(path: Path, data: Path | None = None, **changes) -> Path:
     path.write_text(yaml.safe_dump(content))
     if data is not None:
         path.write_text(yaml.safe_dump(content | {"digests": load_benchmark(path).digests_of(data)}))
-        own = load_benchmark(path)
-        save_geometry(geometry_file(path), own.geometry_of(data), own.data_digest)
+        benchmark = load_benchmark(path)
+        save_geometry(geometry_file(path), benchmark.geometry_of(data), benchmark.data_digest)
     return path
 
 
@@ -98,8 +100,8 @@ def results(home, tmp_path):
 
 
 def definitions(home):
-    own = load_benchmark(home / "walls@1.yaml")
-    return {own.id: own}
+    benchmark = load_benchmark(home / "walls@1.yaml")
+    return {benchmark.id: benchmark}
 
 
 def rewritten(file: Path, change) -> None:
@@ -121,14 +123,18 @@ def test_a_published_definition_does_not_change() -> None:
 
 @pytest.mark.parametrize("name", shipped_benchmarks())
 def test_a_shipped_definition_can_be_run_and_says_where_its_data_is(name) -> None:
-    own = load_benchmark(name)
-    assert (own.id, own.name, own.version) == (name, name.partition("@")[0], int(name.partition("@")[2]))
-    assert own.superseded_by is None or own.superseded_by in shipped_benchmarks()
-    config = own.configured(Path("DATA") if own.get else None)
-    assert own.changed(config) == []
+    benchmark = load_benchmark(name)
+    assert (benchmark.id, benchmark.name, benchmark.version) == (
+        name,
+        name.partition("@")[0],
+        int(name.partition("@")[2]),
+    )
+    assert benchmark.superseded_by is None or benchmark.superseded_by in shipped_benchmarks()
+    config = benchmark.configured(Path("DATA") if benchmark.get else None)
+    assert benchmark.changed(config) == []
     assert config.benchmark is not None
-    assert str(config.benchmark) == f"{name} ({own.digest})"
-    assert set(own.places()) <= {*own.scenes, *own.flights}
+    assert str(config.benchmark) == f"{name} ({benchmark.digest})"
+    assert set(benchmark.places()) <= {*benchmark.scenes, *benchmark.flights}
 
 
 def test_the_last_version_of_a_name_is_taken_and_an_unknown_one_is_one_line() -> None:
@@ -148,33 +154,35 @@ def test_words_may_change_in_a_version_and_settings_may_not(tmp_path) -> None:
 
 
 def test_the_city_is_that_of_its_definition(monkeypatch) -> None:
-    own = load_benchmark("city@1")
-    own.require_data()
+    benchmark = load_benchmark("city@1")
+    benchmark.require_data()
     monkeypatch.setattr(city, "GENERATOR_VERSION", city.GENERATOR_VERSION + 1)
-    fails(DataError, r"scene0: frame 0 differs from that of city@1", own.require_data)
+    fails(DataError, r"scene0: frame 0 differs from that of city@1", benchmark.require_data)
 
 
 def test_another_copy_of_the_data_is_refused_with_the_first_file_that_differs(home, tmp_path) -> None:
     shutil.copytree(home / "data", tmp_path / "data")
-    own, data = load_benchmark(home / "walls@1.yaml"), tmp_path / "data"
-    own.require_data(data)
+    benchmark, data = load_benchmark(home / "walls@1.yaml"), tmp_path / "data"
+    benchmark.require_data(data)
     (data / "two/labels/bad/0003.png").write_bytes((data / "two/labels/bad/0002.png").read_bytes())
-    own.require_data(data)  # labels are what is assessed
+    benchmark.require_data(data)  # labels are what is assessed
     pose = data / "two/pose/0004.txt"
     text = pose.read_text()
     moved = np.loadtxt(pose)
     moved[0, 3] += 1e-3
     np.savetxt(pose, moved)
-    fails(DataError, re.escape("two: pose/0004.txt differs from that of walls@1 (frame 4)"), own.require_data, data)
+    fails(
+        DataError, re.escape("two: pose/0004.txt differs from that of walls@1 (frame 4)"), benchmark.require_data, data
+    )
     pose.write_text(text)
     depth = next((data / "one/depth").glob("0002.*"))
-    kept = depth.read_bytes()
+    content = depth.read_bytes()
     depth.write_bytes(next((data / "one/depth").glob("0003.*")).read_bytes() + b" ")
-    fails(DataError, re.escape(f"one: depth/{depth.name} differs from"), own.require_data, data)
-    depth.write_bytes(kept)
+    fails(DataError, re.escape(f"one: depth/{depth.name} differs from"), benchmark.require_data, data)
+    depth.write_bytes(content)
     for kind in ("depth", "pose", "labels/good"):
         next((data / "one" / kind).glob("0011.*")).unlink()
-    fails(DataError, "one: 11 frames are selected, but walls@1 has 12", own.require_data, data)
+    fails(DataError, "one: 11 frames are selected, but walls@1 has 12", benchmark.require_data, data)
 
 
 @pytest.mark.parametrize(("words", "line"), [
@@ -195,8 +203,8 @@ def test_what_cannot_be_run_is_one_line(home, words, line) -> None:
 
 
 def test_name_version_and_definition_stand_with_every_number(home, tmp_path) -> None:
-    own = load_benchmark(home / "walls@1.yaml")
-    stated = f"walls@1 ({own.digest})"
+    benchmark = load_benchmark(home / "walls@1.yaml")
+    stated = f"walls@1 ({benchmark.digest})"
     result = semstab.load_result(home / "run")
     assert result.benchmark == stated
     assert set(result.to_arrow()["benchmark"].to_pylist()) == {stated}
@@ -211,7 +219,7 @@ def test_name_version_and_definition_stand_with_every_number(home, tmp_path) -> 
     assert stated in pq.read_schema(tmp_path / "bad.parquet").metadata[b"semstab"].decode()
     page = (home / "run/report.html").read_text()
     assert "Benchmark walls@1" in page
-    assert f"definition {own.digest}" in page
+    assert f"definition {benchmark.digest}" in page
 
 
 def test_the_numbers_of_a_result_are_those_of_the_run(home, results) -> None:
@@ -223,12 +231,12 @@ def test_the_numbers_of_a_result_are_those_of_the_run(home, results) -> None:
     assert results["bad"].stat().st_size < 1_000_000
     run, stored = open_run(f"{home / 'run'}:bad"), open_run(results["bad"])
     for scene, entry in run.scenes.items():
-        own, counted = stored.scenes[scene], handle.scenes[scene].sums
-        kept, first = own.record, entry.record.without_files()
-        assert kept == first or kept.statistics.headline == first.statistics.headline
+        submitted, counted = stored.scenes[scene], handle.scenes[scene].sums
+        record, first = submitted.record, entry.record.without_files()
+        assert record == first or record.statistics.headline == first.statistics.headline
         for key in ("alpha", "psa", "accuracy", "miou"):
-            assert value(own.sums, key) == pytest.approx(value(entry.sums, key), abs=1e-6)
-            again, first = (estimate(each.sums, key, scope=scope_of(each.sums, key=key)) for each in (own, entry))
+            assert value(submitted.sums, key) == pytest.approx(value(entry.sums, key), abs=1e-6)
+            again, first = (estimate(made.sums, key, scope=scope_of(made.sums, key=key)) for made in (submitted, entry))
             assert (again.low, again.high) == pytest.approx((first.low, first.high), abs=1e-5)
         assert value(counted, "accuracy") == pytest.approx(value(entry.sums, "accuracy"), abs=1e-6)
         assert value(counted, "alpha") == pytest.approx(value(entry.sums, "alpha"), abs=1e-6)
@@ -237,7 +245,7 @@ def test_the_numbers_of_a_result_are_those_of_the_run(home, results) -> None:
 def test_a_result_can_be_compared_as_a_run(home, results) -> None:
     small = semstab.compare(results["good"], results["bad"])
     whole = semstab.compare(f"{home / 'run'}:good", f"{home / 'run'}:bad")
-    one, other = (each.overall[0].contrasts[0] for each in (small, whole))
+    one, other = (comparison.overall[0].contrasts[0] for comparison in (small, whole))
     assert one.measure == other.measure == "alpha"
     assert one.difference.value == pytest.approx(other.difference.value, abs=0.01)
     assert one.change == other.change == "worse"
@@ -363,7 +371,7 @@ def test_the_level_of_a_verdict_is_computed_from_the_sums(home, results) -> None
     run = semstab.load_result(home / "run")
     for row in board.rows:
         levels = [record.statistics.verdict.level for record in run.select(model=row.name)]
-        assert [own.level for own in row.scenes.values()] == levels
+        assert [scene.level for scene in row.scenes.values()] == levels
 
 
 def test_a_model_that_alpha_does_not_assess_is_shown_without_a_rank(home, results, monkeypatch) -> None:
@@ -428,9 +436,9 @@ def test_flights_over_one_place_count_once_together(home, results, tmp_path) -> 
         "off",
         cwd=tmp_path,
     )
-    own = load_benchmark(file)
-    assert own.places() == ("first", "first", "two")
-    (board,) = boards(tmp_path / "out", {own.id: own})
+    benchmark = load_benchmark(file)
+    assert benchmark.places() == ("first", "first", "two")
+    (board,) = boards(tmp_path / "out", {benchmark.id: benchmark})
     one, two = (board.rows[0].scenes[scene].alpha.value for scene in ("one", "two"))
     assert board.rows[0].scenes[again].alpha.value == one != two
     assert board.rows[0].alpha.value == pytest.approx((one + two) / 2, abs=1e-9)
@@ -494,7 +502,7 @@ def test_a_scene_of_files_and_a_scene_without_have_hashes_of_geometry_alone(tmp_
     scene = dataset.scene(dataset.scenes[0])
     found = [scene.fingerprints(k) for k in range(len(scene))]
     assert [*found[0]] == ["depth/0000.npy", "pose/0000.txt"] or [*found[0]][1] == "pose/0000.txt"
-    assert len({own[f"pose/{k:04d}.txt"] for k, own in enumerate(found)}) == len(scene)
+    assert len({hashes[f"pose/{k:04d}.txt"] for k, hashes in enumerate(found)}) == len(scene)
     plain = semstab.datasets.Scene.fingerprints(scene, 0)
     assert [*plain] == ["depth of 0000", "pose of 0000"]
     assert plain["pose of 0000"] == found[0]["pose/0000.txt"]

@@ -44,11 +44,11 @@ def test_eleven_scenes_and_five_models_take_forty_lines(result):
 
 def test_a_model_that_truth_refutes_is_named_once_for_all_scenes(result):
     def misleading(record):
-        own = record.statistics
-        verdict = dataclasses.replace(own.verdict, level="misleading")
-        wrong = dataclasses.replace(own.headline.wrong_of_consistent_op3, value=0.57, low=0.43, high=0.7)
-        headline = dataclasses.replace(own.headline, wrong_of_consistent_op3=wrong)
-        statistics = dataclasses.replace(own, verdict=verdict, headline=headline)
+        statistics = record.statistics
+        verdict = dataclasses.replace(statistics.verdict, level="misleading")
+        wrong = dataclasses.replace(statistics.headline.wrong_of_consistent_op3, value=0.57, low=0.43, high=0.7)
+        headline = dataclasses.replace(statistics.headline, wrong_of_consistent_op3=wrong)
+        statistics = dataclasses.replace(statistics, verdict=verdict, headline=headline)
         return dataclasses.replace(record, statistics=statistics)
 
     records = [misleading(r) if r.unit.model == "random" and r.unit.scene < "scene03" else r for r in result.records]

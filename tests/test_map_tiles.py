@@ -131,9 +131,9 @@ def soft_wall(tmp_path_factory):
     rng = np.random.default_rng(2)
     frames = []
     for i in (*range(8), *range(8)):
-        seen = tiny_scene.frame(i, np.zeros((tiny_scene.HEIGHT, tiny_scene.WIDTH), np.uint8))
-        scores = rng.random((*seen.shape, 3)).astype(np.float32) ** 4
-        frames.append(dataclasses.replace(seen, index=len(frames), labels=None, scores=scores))
+        frame = tiny_scene.frame(i, np.zeros((tiny_scene.HEIGHT, tiny_scene.WIDTH), np.uint8))
+        scores = rng.random((*frame.shape, 3)).astype(np.float32) ** 4
+        frames.append(dataclasses.replace(frame, index=len(frames), labels=None, scores=scores))
     root = tmp_path_factory.mktemp("soft") / "wall"
     return write_posed(root, [f"{i:02d}" for i in range(16)], {"a": frames}, classes=["x", "y", "z"], up_axis="-y")
 
@@ -214,7 +214,8 @@ def test_statistics_of_tiles_are_those_of_the_whole_map(judged) -> None:
         np.testing.assert_array_equal(*(np.asarray(getattr(log, name)) for log in logs))
     sums = [ClusterSums.load(run.result.records[0].sums_file) for run in (one, other)]
     ordered = [
-        own.columns[np.lexsort((own.frame, *own.cell.T))] for own in (own.coarsened(own.edge, own.step) for own in sums)
+        part.columns[np.lexsort((part.frame, *part.cell.T))]
+        for part in (part.coarsened(part.edge, part.step) for part in sums)
     ]
     np.testing.assert_allclose(*ordered, rtol=1e-12, atol=1e-12)
 
@@ -271,9 +272,11 @@ def test_rasters_and_meshes_of_tiles_are_those_of_the_whole_map(both, tmp_path, 
                 rasters.append((bands.read(), bands.transform, bands.descriptions, bands.tags(1)))
         scene = trimesh.load(files[1])
         found = []
-        for own in scene.geometry.values():
-            corners = own.triangles.round(5).reshape(len(own.faces), -1)
-            found += [(*row, *own.visual.vertex_colors[face[0]]) for row, face in zip(corners, own.faces, strict=True)]
+        for mesh in scene.geometry.values():
+            corners = mesh.triangles.round(5).reshape(len(mesh.faces), -1)
+            found += [
+                (*row, *mesh.visual.vertex_colors[face[0]]) for row, face in zip(corners, mesh.faces, strict=True)
+            ]
         meshes.append(sorted(map(tuple, np.array(found).tolist())))
     for one, other in zip(rasters[:2], rasters[2:], strict=True):
         np.testing.assert_array_equal(one[0], other[0])
@@ -413,7 +416,7 @@ def test_a_map_that_outgrows_the_memory_is_given_up_in_one_line(settings, line, 
 
 def forced_sizes(config, missing, width) -> Sizing:
     """As if every map were expected to fit."""
-    sizes = {each.identity: config.tile_size for each in missing} if isinstance(config.tile_size, int) else {}
+    sizes = {unit.identity: config.tile_size for unit in missing} if isinstance(config.tile_size, int) else {}
     return Sizing(tile_sizes=sizes)
 
 
@@ -487,7 +490,7 @@ def test_no_pixel_falls_into_a_tile_that_its_frustum_does_not_meet(seed, size, v
     met = set(map(tuple, tiles_met(frame, voxel_size, size).tolist()))
     backend = backends.create("numpy", voxel_size=voxel_size, num_classes=2)
     backend.integrate(frame)
-    assert {tuple(own) for own in (backend.table().index[:, :2] // size).tolist()} <= met
+    assert {tuple(tile) for tile in (backend.table().index[:, :2] // size).tolist()} <= met
 
 
 def test_a_frustum_meets_few_tiles_and_too_many_are_told_with_the_file() -> None:

@@ -89,9 +89,9 @@ def test_sums_with_distances_are_read_back(tmp_path):
     sums = told(RELIABILITY - 1, tree_distances(("a", "a", "b", "", "")), 5)
     sums.save(tmp_path / "sums.parquet")
     back = ClusterSums.load(tmp_path / "sums.parquet")
-    for part, own in zip(back.answers, sums.answers, strict=True):
-        assert dict(part.layout) == dict(own.layout)
-        np.testing.assert_array_equal(part.columns, own.columns)
+    for part, written in zip(back.answers, sums.answers, strict=True):
+        assert dict(part.layout) == dict(written.layout)
+        np.testing.assert_array_equal(part.columns, written.columns)
     assert value(back, "alpha_by_meaning") == value(sums, "alpha_by_meaning")
 
 
@@ -195,10 +195,10 @@ def test_the_screen_compare_and_gate_say_how_far_labels_agree_by_meaning(home):
     net, worse = numbers["net"].spots.meaning, numbers["worse"].spots.meaning
     assert net.alpha.value > worse.alpha.value + 0.1
     assert (net.near, worse.near) == (1.0, 0.0)
-    shown = " ".join(bench("show", "run", cwd=home).stdout.split())
+    screen = " ".join(bench("show", "run", cwd=home).stdout.split())
     assert (
         f"net: by meaning: alpha {net.alpha.text()}; 100 % of the disagreement is between classes of near meaning"
-        in shown
+        in screen
     )
     compared = semstab.compare(f"{home / 'run'}:net", f"{home / 'run'}:worse")
     rows = {row.measure: row for row in compared.overall[0].contrasts}

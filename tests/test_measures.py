@@ -151,9 +151,9 @@ def test_figures_show_it(study) -> None:
     )
     for figure in panels:
         assert any("rival" in title.lower() for title in titles(figure)), titles(figure)
-    (shown,) = (axes for axes in panels[2].axes if axes.get_title(loc="left").endswith("Rival (parts)"))
+    (bars,) = (axes for axes in panels[2].axes if axes.get_title(loc="left").endswith("Rival (parts)"))
     means = [level.mean(lambda p: p.every[RIVAL]) for level in swept["a"]]
-    assert shown.containers[0].lines[0].get_ydata() == pytest.approx(means)
+    assert bars.containers[0].lines[0].get_ydata() == pytest.approx(means)
 
 
 def test_the_recording_colours_by_it(run) -> None:
@@ -192,8 +192,8 @@ def test_one_that_was_declared_later_is_undefined_in_earlier_results(run, study)
         assert np.isnan(table.recurrent[LATER])
         assert (table.recurrent.defined(LATER), table[RIVAL]) == (0, run[0].select()[0].map_summary[RIVAL])
         assert np.isnan(earlier.agreement[0].difference("later").max)
-        shown = {made.name: to_csv(made) for made in (*tables(earlier), *tables(load_result(study[1])))}
-        (row, *_) = csv.DictReader(io.StringIO(shown["agreement"]))
+        texts = {made.name: to_csv(made) for made in (*tables(earlier), *tables(load_result(study[1])))}
+        (row, *_) = csv.DictReader(io.StringIO(texts["agreement"]))
         assert (row["max_later"], row["verdict"]) == ("", "agree")
         print_summary(earlier, Console(file=(text := io.StringIO()), width=120), verbose=True)
         assert "voxels" in text.getvalue()
@@ -209,19 +209,19 @@ def test_a_key_that_names_another_number_is_refused(key) -> None:
 def test_reserved_keys_are_those_beside_a_measure_and_other_compared_numbers() -> None:
     def inline(cls):
         hints = get_type_hints(cls)
-        return [hints[own.name] for own in dataclasses.fields(cls) if "inline" in own.metadata]
+        return [hints[field.name] for field in dataclasses.fields(cls) if "inline" in field.metadata]
 
     def has_means(cls):
         return cls is MeasureMeans or any(map(has_means, inline(cls)))
 
     def fields(cls):
-        own = set() if cls is MeasureMeans else {own.name for own in dataclasses.fields(cls)}
-        return own.union(*map(fields, inline(cls)))
+        names = set() if cls is MeasureMeans else {names.name for names in dataclasses.fields(cls)}
+        return names.union(*map(fields, inline(cls)))
 
     kinds = {
         kind for module in (records, results, statistics) for kind in vars(module).values() if isinstance(kind, type)
     }
     beside = [kind for kind in kinds - {MeasureMeans} if dataclasses.is_dataclass(kind) and has_means(kind)]
     compared = {quantity.key for quantity in quantities()} | {*FUNCTIONALS, *BY_CLASS}
-    own = {measure.key for measure in measures()}
-    assert set().union(*map(fields, beside), compared, {"op", "evidence", "label"}) - own == RESERVED - own
+    keys = {measure.key for measure in measures()}
+    assert set().union(*map(fields, beside), compared, {"op", "evidence", "label"}) - keys == RESERVED - keys

@@ -93,7 +93,7 @@ def test_a_unit_that_will_not_fit_is_fused_in_tiles(root, monkeypatch) -> None:
     assert not sizing.planned_sizes(config, plan.units, 1).tile_sizes
     monkeypatch.setattr(memory, "available_bytes", lambda: 1000)
     found = sizing.planned_sizes(config, plan.units, 1)
-    assert found.tile_sizes.keys() == {each.identity for each in plan.units}
+    assert found.tile_sizes.keys() == {unit.identity for unit in plan.units}
     assert re.search(r"2\.5e-07 GB are free: it is fused in tiles of .* m, which take .* GB$", found.lines[0])
 
 

@@ -57,7 +57,7 @@ def two_frames_that_disagree(disagreeing, voxels):
     return fuse([sight_line(0, first), sight_line(1, second)])
 
 
-def test_the_row_op_2_of_the_persistence_table_is_one_hot_labels_of_which_a_quarter_disagree():
+def test_the_row_op_2_of_the_persistence_table_has_a_quarter_that_disagree():
     row = summarise(two_frames_that_disagree(65, 256)).strata[1]
     assert row.name == "OP=2"
     assert (round(row[VSS], 3), round(row[SBD], 4), round(row[ENTROPY], 4)) == (0.873, 0.0790, 0.1602)

@@ -86,21 +86,21 @@ def test_pairs_without_a_label_are_counted_as_stated(seed):
     rng = np.random.default_rng(seed)
     a, b = rng.choice([0, 1, 2, 255], (2, 3, 4)).astype(np.uint8)
     counted = rng.random(a.shape) < 0.8
-    known = counted & (a != 255)
-    both = known & (b != 255)
+    labelled = counted & (a != 255)
+    both = labelled & (b != 255)
     ious = {k: ((a == k) & (b == k) & both).sum() / n if (n := (((a == k) | (b == k)) & both).sum()) else None
             for k in range(3)}  # fmt: skip
     there = [iou for iou in ious.values() if iou is not None]
     pair = TemporalConsistency(3, "ssp")
     assert pair.add(a, b, counted) == pytest.approx(np.mean(there) if there else math.nan, nan_ok=True)
-    own = [ious[k] for k in range(3) if ((a == k) & both).any()]
+    of_class = [ious[k] for k in range(3) if ((a == k) & both).any()]
     vspw, etc = TemporalConsistency(3, "vspw"), TemporalConsistency(3, "etc")
-    for each in (vspw, etc):
-        each.add(a, b, counted)
-    assert vspw.value == pytest.approx(np.mean(own) if own else math.nan, nan_ok=True)
-    union = [(((a == k) & known) | ((b == k) & known)).sum() for k in range(3)]
-    hits = [((a == k) & (b == k) & known).sum() for k in range(3)]
-    expected = np.mean([h / max(u, 1) for h, u in zip(hits, union, strict=True)]) if known.any() else math.nan
+    for measure in (vspw, etc):
+        measure.add(a, b, counted)
+    assert vspw.value == pytest.approx(np.mean(of_class) if of_class else math.nan, nan_ok=True)
+    union = [(((a == k) & labelled) | ((b == k) & labelled)).sum() for k in range(3)]
+    hits = [((a == k) & (b == k) & labelled).sum() for k in range(3)]
+    expected = np.mean([h / max(u, 1) for h, u in zip(hits, union, strict=True)]) if labelled.any() else math.nan
     assert etc.value == pytest.approx(expected, nan_ok=True)
 
 

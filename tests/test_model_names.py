@@ -55,9 +55,9 @@ def test_a_certain_class_that_the_taxonomy_lacks_is_not_the_rest():
 
 
 def test_what_a_taxonomy_says_itself_comes_before_the_rest():
-    own = LabelSpace("own", ("green", "walkable"), members=(("tree", "low vegetation"), ("road", "sidewalk")), ignored=("clutter", "building", "car", "human"))  # fmt: skip  # noqa: E501
-    assert targets(CITYSCAPES, own)["sidewalk"] == "walkable"
-    assert targets(CITYSCAPES, own)["vegetation"] == "green"
+    taxonomy = LabelSpace("own", ("green", "walkable"), members=(("tree", "low vegetation"), ("road", "sidewalk")), ignored=("clutter", "building", "car", "human"))  # fmt: skip  # noqa: E501
+    assert targets(CITYSCAPES, taxonomy)["sidewalk"] == "walkable"
+    assert targets(CITYSCAPES, taxonomy)["vegetation"] == "green"
 
 
 def test_other_classes_go_by_their_own_names():
@@ -73,20 +73,20 @@ def test_other_classes_go_by_their_own_names():
 
 def test_a_mapping_that_leaves_out_most_classes_warns(caplog):
     """Names as some checkpoints have them, of a vocabulary that is not recognised: 145 of 150."""
-    known = ("building, edifice", "road, route", "tree", "car, auto, automobile, machine, motorcar", "human")
-    model = LabelSpace("model", (*known, *(f"thing {k}" for k in range(145))))
+    names = ("building, edifice", "road, route", "tree", "car, auto, automobile, machine, motorcar", "human")
+    model = LabelSpace("model", (*names, *(f"thing {k}" for k in range(145))))
     mapping = class_mapping(model, UAVID, "lenient")
     assert sum(row is not None for row in mapping.rows) == 5
     assert "does not have 145 of the 150 classes of model; they are left out, among them thing 0," in caplog.text
     caplog.clear()
-    class_mapping(LabelSpace("model", (*known, "thing 0")), UAVID, "lenient")
+    class_mapping(LabelSpace("model", (*names, "thing 0")), UAVID, "lenient")
     assert not caplog.text
 
 
 def test_vocabularies_name_classes_of_uavid_once():
     for vocabulary in vocabularies().values():
-        known = {*UAVID.classes}
-        assert {*vocabulary.strict, *vocabulary.lenient, vocabulary.rest} <= known
+        uavid = {*UAVID.classes}
+        assert {*vocabulary.strict, *vocabulary.lenient, vocabulary.rest} <= uavid
         names = [
             name for table in (vocabulary.strict, vocabulary.lenient) for group in table.values() for name in group
         ]

@@ -52,8 +52,10 @@ def save_onnx(path, net, size=("h", "w"), inputs=1, kind=TensorProto.FLOAT, afte
 
 def expected(net, image=IMAGE, size=None, mean=MEAN, std=STD):
     """Logits (K, H, W) at the image's size, by torch and Pillow alone."""
-    seen = image if size is None else np.asarray(PIL.Image.fromarray(image).resize(size[::-1], PIL.Image.BILINEAR))
-    pixels = (torch.from_numpy(seen.copy()).float() / 255 - torch.tensor(mean)) / torch.tensor(std)
+    network_input = (
+        image if size is None else np.asarray(PIL.Image.fromarray(image).resize(size[::-1], PIL.Image.BILINEAR))
+    )
+    pixels = (torch.from_numpy(network_input.copy()).float() / 255 - torch.tensor(mean)) / torch.tensor(std)
     with torch.inference_mode():
         logits = net(pixels.permute(2, 0, 1)[None])
         return torch.nn.functional.interpolate(logits, size=image.shape[:2], mode="bilinear")[0]

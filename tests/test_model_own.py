@@ -125,7 +125,7 @@ def test_two_repositories_may_call_their_modules_the_same(tmp_path, lazy):
         np.testing.assert_array_equal(labels_of(second), IMAGE.mean(axis=2) < 128)
 
 
-def test_what_lies_beside_a_file_comes_before_what_lies_in_the_folder_that_a_program_works_in(tmp_path, monkeypatch):
+def test_what_lies_beside_a_file_comes_before_what_lies_in_the_working_folder(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     (tmp_path / "shapes.py").write_text(
         "SIGN = -1\nclass Net:\n    def predict(self, image):\n        return image[..., 0]\n"
@@ -187,7 +187,7 @@ def test_a_sequential_one(file):
     for _ in range(2):
         model.reset()
         found = model.predict([IMAGE] * 3)
-        assert [int(each.labels[0, 0]) for each in found] == [1, 0, 1]
+        assert [int(prediction.labels[0, 0]) for prediction in found] == [1, 0, 1]
 
 
 def test_less_than_no_class_is_ignored(tmp_path):
@@ -203,9 +203,9 @@ def test_less_than_no_class_is_ignored(tmp_path):
         ("from semstab import LabelSpace\nlabel_space = LabelSpace('x', ('a', 'b'), ids=(4, 2))", ("a", "b")),
     ],
 )
-def test_classes_of_the_file(tmp_path, said, known):
+def test_classes_of_the_file(tmp_path, said, classes):
     path = written(tmp_path, f"{said}\ndef f(image): pass\n")
-    assert create(f"{path}:f").label_space.classes == known
+    assert create(f"{path}:f").label_space.classes == classes
 
 
 def test_classes_of_another_file(file, tmp_path):
@@ -240,15 +240,15 @@ def test_threads_change_no_key_and_are_those_of_torch_or_of_the_code(file, tmp_p
     monkeypatch.setitem(sys.modules, "torch", SimpleNamespace(set_num_threads=asked.append))
     assert create(f"{file}:Bright", threads=2).identity() == create(f"{file}:Bright").identity()
     assert asked == [2]
-    own = tmp_path / "own.py"
-    own.write_text(
+    program = tmp_path / "own.py"
+    program.write_text(
         "class Own:\n    classes = ['a', 'b']\n    def __init__(self, threads=1):\n        self.threads = threads\n"
         "    def predict(self, image):\n        return image[..., 0] * 0 + self.threads - 2\n"
     )
-    model = create(f"{own}:Own", threads=3)
+    model = create(f"{program}:Own", threads=3)
     assert model.predict([IMAGE])[0].labels.max() == 1
     assert asked == [2]
-    assert model.identity() == create(f"{own}:Own").identity()
+    assert model.identity() == create(f"{program}:Own").identity()
 
 
 def test_a_predictor_is_called_as_its_class_and_found_from_anywhere(file, monkeypatch):

@@ -27,14 +27,14 @@ def test_a_torchscript_file_labels_as_the_networks_own_code(tmp_path):
         pytest.skip(f"no {NETWORKS} or no {DATA / 'livingroom'}; set SEMSTAB_NETWORKS and SEMSTAB_DATA")
     dataset = open_dataset("posed_folder", {"root": str(DATA / "livingroom")})
     image = dataset.scene(dataset.scenes[0]).image(60)
-    own = create(f"{NETWORKS / 'nets.py'}:dicenet_voc", scale=0.5)
+    by_code = create(f"{NETWORKS / 'nets.py'}:dicenet_voc", scale=0.5)
     wrapper = Code.load(f"{NETWORKS / 'nets.py'}:dicenet_voc", "model").target(scale=0.5)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
         torch.jit.trace(wrapper.net, torch.rand(1, 3, 384, 384), check_trace=False).save(tmp_path / "net.pt")
-    classes = list(own.label_space.classes)
+    classes = list(by_code.label_space.classes)
     network = create(str(tmp_path / "net.pt"), classes=classes, size=384, resize="antialias")
-    ((expected,), (found,)) = own.predict([image]), network.predict([image])
+    ((expected,), (found,)) = by_code.predict([image]), network.predict([image])
     assert len(np.unique(expected.labels)) > 1
     np.testing.assert_array_equal(found.labels, expected.labels)
 
@@ -52,7 +52,7 @@ def test_a_classifiers_weights_as_a_vocabulary_give_the_networks_labels(capsys):
         words = Vocabulary(space, weights, np.arange(len(weights)), None, name)
         logits = []
         feature_nets.classifier_of(network.network).register_forward_hook(
-            lambda *hook, seen=logits: seen.append(hook[2])
+            lambda *hook, outputs=logits: outputs.append(hook[2])
         )
         for index in (0, 60, 120):
             image = scene.image(index)

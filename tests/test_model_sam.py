@@ -81,18 +81,18 @@ def test_proposals_are_those_of_the_article(options, proposer):
         logits = torch.nn.functional.interpolate(square, IMAGE.shape[:2], mode="bilinear")[0]
     scores, offset = found.iou_scores[0].flatten(), settings.stability_offset
     stability = (logits > offset).sum((1, 2)) / (logits > -offset).sum((1, 2)).clamp(min=1)
-    kept = [
+    scored = [
         (float(score), mask.numpy() > 0)
         for score, mask, stable in zip(scores, logits, stability, strict=True)
         if score > settings.pred_iou and stable >= settings.stability and (mask > 0).any()
     ]
-    assert len(kept) >= len(proposer.propose(IMAGE))
-    boxes = np.array([box_of(mask) for _, mask in kept])
-    stay = brute_force_suppression(boxes, np.array([score for score, _ in kept]), settings.nms_iou)
+    assert len(scored) >= len(proposer.propose(IMAGE))
+    boxes = np.array([box_of(mask) for _, mask in scored])
+    stay = brute_force_suppression(boxes, np.array([score for score, _ in scored]), settings.nms_iou)
     proposals = proposer.propose(IMAGE)
     assert len(proposals) == len(stay)
     for k, row in enumerate(stay):
-        assert (proposals.mask(k) != kept[row][1]).sum() <= 2
+        assert (proposals.mask(k) != scored[row][1]).sum() <= 2
 
 
 def box_of(mask):

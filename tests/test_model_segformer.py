@@ -75,13 +75,13 @@ def test_classes_go_by_number_and_repeated_names_get_it():
 
 
 @pytest.mark.parametrize(("image_size", "seen"), [(None, (64, 96)), (32, (32, 64)), ((32, 128), (32, 128))])
-def test_the_size_that_the_model_sees(monkeypatch, image_size, seen):
+def test_the_size_that_the_model_sees(monkeypatch, image_size, size):
     model = create("segformer", checkpoint=str(tiny("segformer")), image_size=image_size)
     sizes = []
     logits = model.head.engine
     monkeypatch.setattr(model.head, "engine", lambda pixels: sizes.append(tuple(pixels.shape[2:])) or logits(pixels))
     assert model.predict(IMAGES[:1])[0].labels.shape == (48, 80)
-    assert sizes == [seen]
+    assert sizes == [size]
 
 
 def test_upsampling_in_chunks_is_upsampling_at_once(monkeypatch):
@@ -172,13 +172,13 @@ def test_what_cannot_be_exported_is_one_line(monkeypatch, tmp_path):
     def export(model, pixels, **told):
         raise RuntimeError("\x1b[31mUnsupported\x1b[0m:\naten::odd")
 
-    kept = tmp_path / "cache"
-    monkeypatch.setenv("SEMSTAB_CACHE", str(kept))
+    cache = tmp_path / "cache"
+    monkeypatch.setenv("SEMSTAB_CACHE", str(cache))
     monkeypatch.setattr(torch.onnx, "export", export)
     model = create("segformer", checkpoint=str(tiny("segformer")), engine="onnx", image_size=32)
     with pytest.raises(DataError, match=r"cannot be exported to ONNX \(Unsupported: aten::odd\); use engine torch$"):
         model.predict(IMAGES[:1])
-    assert not list(kept.rglob("*.onnx"))
+    assert not list(cache.rglob("*.onnx"))
 
 
 @pytest.mark.parametrize("option", [{"dtype": "bfloat16"}, {"device": "meta"}])

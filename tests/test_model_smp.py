@@ -78,7 +78,7 @@ def test_a_network_is_what_it_is(tmp_path, net, kind, size):
         path = tmp_path / "net.safetensors"
         torch_files.save_file(weights, path)
     else:
-        lightning = {"state_dict": {f"model.{name}": each for name, each in weights.items()}, "epoch": 3}
+        lightning = {"state_dict": {f"model.{name}": tensor for name, tensor in weights.items()}, "epoch": 3}
         torch.save(weights if kind == "state_dict" else lightning, path)
     model = create(
         "smp", architecture="unet", encoder="resnet18", checkpoint=path, classes=CLASSES, resize="antialias", size=size

@@ -20,8 +20,8 @@ CLASSES = "a,b,c,d"
 
 def expected(image, size=(32, 64), mean=0.5, std=0.5):
     """Logits (K, H, W), by torch and Pillow alone; TFLite pads 'same' with stride 2 at the end only."""
-    seen = np.asarray(PIL.Image.fromarray(image).resize(size[::-1], PIL.Image.Resampling.BILINEAR))
-    pixels = (torch.from_numpy(seen.copy()).permute(2, 0, 1)[None].float() / 255 - mean) / std
+    network_input = np.asarray(PIL.Image.fromarray(image).resize(size[::-1], PIL.Image.Resampling.BILINEAR))
+    pixels = (torch.from_numpy(network_input.copy()).permute(2, 0, 1)[None].float() / 255 - mean) / std
     padded = torch.nn.functional.pad(pixels, (0, 1, 0, 1))
     weights = torch.from_numpy(tiny_tflite.WEIGHTS.transpose(0, 3, 1, 2).copy())
     logits = torch.nn.functional.conv2d(padded, weights, torch.from_numpy(tiny_tflite.BIAS), stride=2)

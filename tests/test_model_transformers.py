@@ -50,15 +50,15 @@ def test_universal_segmentation_is_that_of_transformers(universal, images):
         output.patch_offsets = offsets
     sizes = [image.shape[:2] for image in images]
     theirs = processor.post_process_semantic_segmentation(output, sizes, return_segmentation_scores=True)
-    seen = set()
+    labels = set()
     for prediction, wanted in zip(model.predict(images, scores=True), theirs, strict=True):
         values = wanted.segmentation_scores
         np.testing.assert_array_equal(prediction.labels, wanted.segmentation)
         np.testing.assert_allclose(prediction.scores, (values / values.sum(0)).permute(1, 2, 0), atol=2e-6)
-        seen |= set(np.unique(prediction.labels))
+        labels |= set(np.unique(prediction.labels))
     streamed = np.stack(list(model.stream(images[0]).maps()), axis=2)
     np.testing.assert_array_equal(streamed, model.predict(images[:1], scores=True)[0].scores)
-    assert len(seen) > 1
+    assert len(labels) > 1
     assert model.label_space.classes == tuple(tiny_models.NAMES.values())
 
 

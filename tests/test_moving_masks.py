@@ -88,7 +88,7 @@ def test_exported_masks_take_the_movers_out_of_the_map(run, tmp_path) -> None:  
     (tmp_path / "moving").rename(converted.folder / "mask")
     config |= {"statistics": False}
     (after,) = semstab.run(config, out=tmp_path / "after", report=False).select()
-    (kept,) = semstab.run(config | {"exclude": {"masks": False}}, out=tmp_path / "kept", report=False).select()
+    (unmasked,) = semstab.run(config | {"exclude": {"masks": False}}, out=tmp_path / "kept", report=False).select()
 
     def cars(record) -> int:  # type: ignore[no-untyped-def]
         table = record.table()
@@ -98,8 +98,8 @@ def test_exported_masks_take_the_movers_out_of_the_map(run, tmp_path) -> None:  
     assert means[1][VSS] > means[0][VSS]
     assert means[1][SBD] < means[0][SBD]
     assert cars(after) < 0.5 * cars(before)
-    np.testing.assert_array_equal(kept.table().index, before.table().index)
-    assert kept.map_summary.recurrent[VSS] == before.map_summary.recurrent[VSS]
+    np.testing.assert_array_equal(unmasked.table().index, before.table().index)
+    assert unmasked.map_summary.recurrent[VSS] == before.map_summary.recurrent[VSS]
 
 
 def test_the_map_and_the_recording_have_a_layer_of_what_moved(run) -> None:  # type: ignore[no-untyped-def]
@@ -113,9 +113,9 @@ def test_the_map_and_the_recording_have_a_layer_of_what_moved(run) -> None:  # t
     assert (states == STAYED).mean() > 0.3
     rows = read(run / "recording.rrd")
     drawn = [row["moved:colors"] for at in rows if "/map/" in at for row in rows[at] if row.get("moved:colors")]
-    shown = np.unique(np.concatenate(drawn), return_counts=True)
+    counts = np.unique(np.concatenate(drawn), return_counts=True)
     expected = packed(STATE_COLORS)[states]
-    np.testing.assert_array_equal(shown, np.unique(expected, return_counts=True))
+    np.testing.assert_array_equal(counts, np.unique(expected, return_counts=True))
     views = [row for rows in read_blueprints(run / "recording.rrd") for row in rows]
     assert ["gt: orange moved, blue stayed"] in [row.get("ViewBlueprint:display_name") for row in views]
     assert 'data-layer="moved"' in (run / "report.html").read_text()

@@ -50,7 +50,7 @@ KINDS = {
 }
 
 
-@pytest.fixture(scope="module", params=corners(KINDS, kept=("scores", "truth", "two scenes", "scans")))
+@pytest.fixture(scope="module", params=corners(KINDS, always=("scores", "truth", "two scenes", "scans")))
 def run(request, tmp_path_factory):
     """A finished run and its folder."""
     folder = tmp_path_factory.mktemp("numbers") / "run"
@@ -69,19 +69,19 @@ WITHOUT = {"vss", "sbd", "entropy", "margin", "psa", "miou", "accuracy", "voxel_
 
 def numbers_of(record):
     """The numbers of a unit by their names, from its record in memory."""
-    own, recurrent = record.statistics, record.map_summary.recurrent
+    statistics, recurrent = record.statistics, record.map_summary.recurrent
     found = {
-        "alpha": own.headline.alpha.value,
+        "alpha": statistics.headline.alpha.value,
         "VSS (OP>=3)": recurrent.means.value["vss"],
         "SBD (OP>=3)": recurrent.means.value["sbd"],
-        "PSA (OP>=2)": own.headline.psa_op2.value,
+        "PSA (OP>=2)": statistics.headline.psa_op2.value,
         "flicker, %": record.image_space.compensated_flicker_percent,
     }
-    if own.correctness is not None:
+    if statistics.correctness is not None:
         found |= {
-            "accuracy (OP>=2)": own.correctness.accuracy_op2.value,
-            "mIoU (OP>=2)": own.correctness.miou_op2.value,
-            "consistent but wrong (OP>=3)": own.headline.wrong_of_consistent_op3.value,
+            "accuracy (OP>=2)": statistics.correctness.accuracy_op2.value,
+            "mIoU (OP>=2)": statistics.correctness.miou_op2.value,
+            "consistent but wrong (OP>=3)": statistics.headline.wrong_of_consistent_op3.value,
         }
     return found
 
@@ -128,23 +128,23 @@ def test_the_screen_has_the_numbers_of_the_record(run):
         if len(result.models) == 1:
             (paper,) = (line for line in lines if "in 3 frames or more: " in line)
             found = re.search(r"VSS (\S+), SBD (\S+)", paper)
-            shown = dict(zip(("VSS (OP>=3)", "SBD (OP>=3)"), found.groups(), strict=True))
+            printed = dict(zip(("VSS (OP>=3)", "SBD (OP>=3)"), found.groups(), strict=True))
             text = " ".join(" ".join(lines).split())
             if (static := record.statistics.static) is None:
-                shown["alpha"] = re.search(r"alpha (-?\.\d+|-?\d\.\d+)", text)[1]
+                printed["alpha"] = re.search(r"alpha (-?\.\d+|-?\d\.\d+)", text)[1]
             else:
-                shown["alpha"] = re.search(r"what stayed \S+, of all (-?\.\d+|-?\d\.\d+);", text)[1]
+                printed["alpha"] = re.search(r"what stayed \S+, of all (-?\.\d+|-?\d\.\d+);", text)[1]
                 assert agree(re.search(r"alpha \(static\) (-?\.\d+|-?\d\.\d+)", text)[1], static.alpha.value)
             flicker = re.search(r"flicker\s+(\S+) %", "\n".join(lines))
-            shown["flicker, %"] = "-" if flicker is None else flicker[1]
+            printed["flicker, %"] = "-" if flicker is None else flicker[1]
         else:
             (heads,) = (k for k, line in enumerate(lines) if line.split()[:2] == ["model", "verdict"])
             assert lines[heads + 1].split()[2:] == ["%", "%", "OP>=3", "OP>=3", "OP>=2"]
             row = next(line for line in lines[heads:] if line.split()[:1] == [record.unit.model])
             flicker, vss, sbd, miou = row.split()[-4:]
-            shown = {"flicker, %": flicker, "VSS (OP>=3)": vss, "SBD (OP>=3)": sbd, "mIoU (OP>=2)": miou}
-        for name, printed in shown.items():
-            assert printed == "-" or agree(printed, numbers[name]), name
+            printed = {"flicker, %": flicker, "VSS (OP>=3)": vss, "SBD (OP>=3)": sbd, "mIoU (OP>=2)": miou}
+        for name, cell in printed.items():
+            assert cell == "-" or agree(cell, numbers[name]), name
 
 
 def test_tables_have_the_numbers_of_the_record_in_csv_and_json(run, tmp_path):
@@ -155,7 +155,7 @@ def test_tables_have_the_numbers_of_the_record_in_csv_and_json(run, tmp_path):
         "verdicts": {"alpha": "alpha"},
         "temporal_agreement": {"alpha": "alpha", "psa_op2": "PSA (OP>=2)"},
     }
-    for table, named in columns.items():
+    for table, titles in columns.items():
         rows = rows_of_csv(tmp_path / "tables" / f"{table}.csv")
         content = json.loads((tmp_path / "tables/tables.json").read_text(encoding="utf-8"))[table]["rows"]
         for record in result.select() if len(result.scenes) == 1 else ():
@@ -163,12 +163,12 @@ def test_tables_have_the_numbers_of_the_record_in_csv_and_json(run, tmp_path):
             mine = [row for row in (*rows, *content) if row["model"] == record.unit.model]
             assert len(mine) >= 2
             for row in mine:
-                for key, name in named.items():
-                    shown = row[key]["value"] if isinstance(row[key], dict) else row[key]
-                    if isinstance(shown, str):
-                        assert shown in ("", "-") or agree(shown, numbers[name]), (table, key)
-                    elif shown is not None:
-                        assert shown == pytest.approx(numbers[name]), (table, key)
+                for key, name in titles.items():
+                    cell = row[key]["value"] if isinstance(row[key], dict) else row[key]
+                    if isinstance(cell, str):
+                        assert cell in ("", "-") or agree(cell, numbers[name]), (table, key)
+                    elif cell is not None:
+                        assert cell == pytest.approx(numbers[name]), (table, key)
     if "mIoU (OP>=2)" in numbers_of(result.records[0]) and len(result.scenes) == 1:
         rows = rows_of_csv(tmp_path / "tables/correctness.csv")
         for record in result.select():
@@ -198,20 +198,20 @@ def test_compare_and_gate_judge_the_numbers_of_the_screen(run):
     result, folder = run
     titles = {quantity.name: quantity.named for quantity in quantities()}
     names = {model: f"{folder}:{model}" for model in result.models}
-    compared = {model: semstab.compare(own, own) for model, own in names.items()}
+    compared = {model: semstab.compare(source, source) for model, source in names.items()}
     for record in result.select():
-        own = names[record.unit.model]
+        source = names[record.unit.model]
         (scene,) = (s for s in compared[record.unit.model].scenes if s.scene == record.unit.scene)
-        shown = {titles[row.measure].lower(): row.base for row in scene.against[0].contrasts}
+        told = {titles[row.measure].lower(): row.base for row in scene.against[0].contrasts}
         numbers = {name.lower().removesuffix(", %"): value for name, value in numbers_of(record).items()}
-        known = {name: value for name, value in numbers.items() if not math.isnan(value)}
-        assert known.keys() <= shown.keys()
-        for name, value in known.items():
-            assert shown[name] == pytest.approx(value, abs=2e-6, nan_ok=True), name
+        finite = {name: value for name, value in numbers.items() if not math.isnan(value)}
+        assert finite.keys() <= told.keys()
+        for name, value in finite.items():
+            assert told[name] == pytest.approx(value, abs=2e-6, nan_ok=True), name
         rules = {"alpha": "alpha", "vss": "vss (op>=3)", "sbd": "sbd (op>=3)", "psa": "psa (op>=2)"}
         rules |= {"accuracy": "accuracy (op>=2)", "miou": "miou (op>=2)"} if "miou (op>=2)" in numbers else {}
         config = semstab.GateConfig(rules=tuple(f"scene {record.unit.scene}: {rule} > -1" for rule in rules))
-        for rule, judged in zip(rules.values(), semstab.gate(own, None, config).judgements, strict=True):
+        for rule, judged in zip(rules.values(), semstab.gate(source, None, config).judgements, strict=True):
             assert judged.new == pytest.approx(numbers[rule], abs=2e-6), rule
             population = rule.partition("(")[2].rstrip(")").upper()
             assert judged.values.startswith(f"{population}: " if population else judged.values[:1])
@@ -252,9 +252,9 @@ def test_the_recording_has_them_in_its_text_and_at_the_end_of_its_series(run):
             values = series(rows, path(unit.scene, "series", f"map_{key}_all", unit.model, unit.backend))
             assert values[max(values)] == pytest.approx(table.means.value[key], rel=1e-6), key
         flicker = series(rows, path(unit.scene, "series", "compensated_flicker_percent", unit.model))
-        known = [value for value in flicker.values() if not math.isnan(value)]
-        if known:
-            assert sum(known) / len(known) == pytest.approx(numbers_of(record)["flicker, %"], rel=1e-6)
+        finite = [value for value in flicker.values() if not math.isnan(value)]
+        if finite:
+            assert sum(finite) / len(finite) == pytest.approx(numbers_of(record)["flicker, %"], rel=1e-6)
 
 
 def test_the_leaderboard_has_the_numbers_of_the_runs(tmp_path):
@@ -267,8 +267,8 @@ def test_the_leaderboard_has_the_numbers_of_the_runs(tmp_path):
     words = ("leaderboard", "results", "--benchmark", "walls@1.yaml", "--out", "site")
     said = bench(*words, cwd=tmp_path).stdout
     page = (tmp_path / "site/index.html").read_text(encoding="utf-8")
-    own = load_benchmark(tmp_path / "walls@1.yaml")
-    (board,) = boards(tmp_path / "results", {own.id: own})
+    benchmark = load_benchmark(tmp_path / "walls@1.yaml")
+    (board,) = boards(tmp_path / "results", {benchmark.id: benchmark})
     columns = {column.key: k for k, column in enumerate(headline(board).columns)}
     assert not WITHOUT & columns.keys()
     result = semstab.load_result(tmp_path / "run")
@@ -276,7 +276,7 @@ def test_the_leaderboard_has_the_numbers_of_the_runs(tmp_path):
     (found,) = (row for row in rows if "model" in row and "rank" in row)
     heads = [html.unescape(head).replace("\N{GREATER-THAN OR EQUAL TO}", ">=").lower() for head in found]
     wrong = {
-        model: [own.statistics.headline.wrong_of_consistent_op3 for own in result.select(model=model)]
+        model: [record.statistics.headline.wrong_of_consistent_op3 for record in result.select(model=model)]
         for model in result.models
     }
     for row in headline(board).groups[0].rows:
@@ -284,17 +284,17 @@ def test_the_leaderboard_has_the_numbers_of_the_runs(tmp_path):
         of_model = [numbers_of(record) for record in result.select(model=model)]
         names = {"accuracy_op2": "accuracy (OP>=2)", "miou_op2": "mIoU (OP>=2)"}
         names |= {"wrong_of_consistent_op3": "consistent but wrong (OP>=3)", "alpha": "alpha"}
-        shown = next(row for row in rows if model in row[:2] and len(row) == len(heads))
+        cells = next(row for row in rows if model in row[:2] and len(row) == len(heads))
         for key, name in names.items():
-            value, mean = row[columns[key]].value, sum(each[name] for each in of_model) / len(of_model)
+            value, mean = row[columns[key]].value, sum(entry[name] for entry in of_model) / len(of_model)
             if math.isnan(value):  # no location counts as consistent: the run states no interval either
-                assert {math.isnan(each.low) for each in wrong[model]} == {True}
+                assert {math.isnan(entry.low) for entry in wrong[model]} == {True}
             else:
                 assert value == pytest.approx(mean, abs=1e-6), name
             (at,) = (k for k, head in enumerate(heads) if head.startswith(name.lower()))
-            assert agree(shown[at].split()[0].replace("\N{EN DASH}", "-"), value), name
+            assert agree(cells[at].split()[0].replace("\N{EN DASH}", "-"), value), name
         (line,) = (line for line in lines([board]) if f" {model} " in line)
-        assert line.split() in [each.split() for each in said.splitlines()]
+        assert line.split() in [entry.split() for entry in said.splitlines()]
         assert agree(re.search(r"alpha (\S+)", line)[1], row[columns["alpha"]].value)
 
 
@@ -306,16 +306,16 @@ def test_a_video_has_its_flicker_on_every_screen(tmp_path):
     page, said = (folder / "report.html").read_text(encoding="utf-8"), screen(result).splitlines()
     (table,) = (folder / "tables").glob("flicker*.csv")
     for record, content in zip(result.records, summary, strict=True):
-        known = record.image_space
-        assert content["image_space"]["compensated_flicker_percent"] == known.compensated_flicker_percent
+        image_space = record.image_space
+        assert content["image_space"]["compensated_flicker_percent"] == image_space.compensated_flicker_percent
         (line,) = (line.split() for line in said if line.split()[:1] == [record.unit.model])
-        assert agree(line[1], known.compensated_flicker_percent)
-        assert agree(line[2], known.flicker_percent)
+        assert agree(line[1], image_space.compensated_flicker_percent)
+        assert agree(line[2], image_space.flicker_percent)
         (row,) = (row for row in rows_of_csv(table) if record.unit.model in row.values())
-        assert agree(row["compensated_flicker_percent"], known.compensated_flicker_percent)
-        assert agree(row["flicker_percent"], known.flicker_percent)
-        assert f"{known.compensated_flicker_percent:.2f}" in page
+        assert agree(row["compensated_flicker_percent"], image_space.compensated_flicker_percent)
+        assert agree(row["flicker_percent"], image_space.flicker_percent)
+        assert f"{image_space.compensated_flicker_percent:.2f}" in page
         with record.series.open(encoding="utf-8") as file:
             frames = [row["compensated_flicker_percent"] for row in csv.DictReader(file)]
         values = [float(value) for value in frames if value]
-        assert sum(values) / len(values) == pytest.approx(known.compensated_flicker_percent)
+        assert sum(values) / len(values) == pytest.approx(image_space.compensated_flicker_percent)

@@ -52,18 +52,18 @@ def test_a_generator_gives_what_a_run_gives(steady, city):
         "dataset": {"name": "city", "options": OPTIONS}, "scenes": ["scene0"], "models": ["sim-steady"],
         "voxel_size": SIZE, "taxonomy": None, "exclude": {}, "check": None, "check_geometry": False, "truth": False,
     })  # fmt: skip
-    own, other = steady.record(), run.record()
-    assert own.map_summary == other.map_summary
+    generated, other = steady.record(), run.record()
+    assert generated.map_summary == other.map_summary
     for part in ("headline", "spots", "agreement"):
-        assert to_json(getattr(own.statistics, part)) == to_json(getattr(other.statistics, part))
-    assert own.statistics.verdict.level == other.statistics.verdict.level == steady.summary.verdict
+        assert to_json(getattr(generated.statistics, part)) == to_json(getattr(other.statistics, part))
+    assert generated.statistics.verdict.level == other.statistics.verdict.level == steady.summary.verdict
     alpha = other.statistics.headline.alpha
     assert steady.summary.alpha == alpha.value
     assert (steady.summary.alpha_low, steady.summary.alpha_high, steady.summary.confidence) == (
         alpha.low, alpha.high, 0.95,
     )  # fmt: skip
     assert steady.summary.psa_op2 == other.statistics.agreement.psa_op2.value
-    assert steady.summary.flicker == own.image_space.compensated_flicker_percent > 0
+    assert steady.summary.flicker == generated.image_space.compensated_flicker_percent > 0
     assert steady.summary.frames == len(city)
     assert len(steady.record().table()) == steady.summary.voxels
 
@@ -93,10 +93,10 @@ def test_truth_tells_what_is_right(city, classes):
 def test_results_are_compared_gated_and_exported_as_runs_are(steady, city, classes, tmp_path):
     other = semstab.fuse(frames_of(city, "sim-flicker"), voxel_size=SIZE, classes=classes, model="flicker")
     comparison = semstab.compare(steady, other, out=tmp_path / "versus")
-    assert [own.name for own in comparison.runs] == ["steady", "flicker"]
+    assert [compared.name for compared in comparison.runs] == ["steady", "flicker"]
     assert (tmp_path / "versus/report.html").exists()
     assert repr(other).startswith("<FusedResult 'frames': 1 unit, fused by numba>\n  frames, flicker: ")
-    assert [own.source for own in comparison.runs] == [None, None]
+    assert [compared.source for compared in comparison.runs] == [None, None]
     assert repr(comparison).startswith("<RunComparison with steady on frames>\n  flicker: alpha -")
     again = semstab.fuse(frames_of(city, "sim-steady"), voxel_size=SIZE, classes=classes, model="steady")
     with pytest.raises(ConfigError, match=r"two results are named 'steady'; give each a name: semstab\.fuse"):
@@ -105,8 +105,8 @@ def test_results_are_compared_gated_and_exported_as_runs_are(steady, city, class
     assert repr(semstab.gate(other, steady, gate)).splitlines()[0] == (
         "<GateResult: fails; flicker against steady on frames>"
     )
-    assert [each.verdict for each in semstab.gate(other, steady, gate).judgements] == ["fails"]
-    assert [each.verdict for each in semstab.gate(steady, steady, gate).judgements] == ["passes"]
+    assert [judgement.verdict for judgement in semstab.gate(other, steady, gate).judgements] == ["fails"]
+    assert [judgement.verdict for judgement in semstab.gate(steady, steady, gate).judgements] == ["passes"]
     semstab.export(steady, tmp_path / "map.ply")
     assert (tmp_path / "map.ply").stat().st_size > 1000
 
@@ -114,7 +114,7 @@ def test_results_are_compared_gated_and_exported_as_runs_are(steady, city, class
 def test_a_rule_of_every_class_names_those_that_it_leaves_out(city, classes):
     flown = semstab.fuse(frames_of(city, "sim-steady"), voxel_size=SIZE, classes=(*classes, "boat"), model="steady")
     result = semstab.gate(flown, None, semstab.GateConfig(rules=("class *: alpha > -2",)))
-    assert "boat" not in [each.rule.class_name for each in result.judgements]
+    assert "boat" not in [judgement.rule.class_name for judgement in result.judgements]
     assert [
         note
         for note in result.notes
@@ -137,7 +137,7 @@ def test_nothing_is_written_unless_asked_and_then_all_of_it(city, classes, tmp_p
     assert "alpha" in (tmp_path / "x.html").read_text(encoding="utf-8")
     folder = result.save(tmp_path / "run")
     assert (folder / "report.html").exists()
-    saved, held = (own.record().without_files() for own in (semstab.load(folder).result, result))
+    saved, held = (fused.record().without_files() for fused in (semstab.load(folder).result, result))
     assert to_json(saved) == to_json(held)
     assert len(semstab.load(folder).table()) == result.summary.voxels
     with pytest.raises(ConfigError, match=r"is not empty"):

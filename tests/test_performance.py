@@ -56,7 +56,7 @@ LONG = ("tiles", "end-to-end", "growth", "scores", "recording", "threads")
 """Cases that start processes or runs: each takes seconds at any size."""
 
 
-@pytest.mark.parametrize("name", corners(SMALL, kept=SMALL.keys() - {*LONG}))
+@pytest.mark.parametrize("name", corners(SMALL, always=SMALL.keys() - {*LONG}))
 def test_a_case_prints_its_table_and_writes_it(name, tmp_path, capsys, monkeypatch) -> None:
     text, words, *more = SMALL[name]
     monkeypatch.setattr("timed.tiles.SIZE", (160, 120))

@@ -58,10 +58,10 @@ def test_the_notebook_says_what_it_says_in_the_documentation(tmp_path, tmp_path_
     startup = Path(os.environ["IPYTHONDIR"]) / "profile_default/startup"
     startup.mkdir(parents=True)
     (startup / "coarse.py").write_text(COARSE)
-    kept = nbformat.read(NOTEBOOK, nbformat.NO_CONVERT)
-    assert len(kept.cells) <= 12
+    stored = nbformat.read(NOTEBOOK, nbformat.NO_CONVERT)
+    assert len(stored.cells) <= 12
     again = shown(executed(tmp_path))
-    assert again == shown(kept)
+    assert again == shown(stored)
     assert "the gate passes" in "".join(again)
     assert "<table>" in again[0]
 

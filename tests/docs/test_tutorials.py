@@ -96,7 +96,7 @@ def test_each_extension_is_a_file_that_runs(tmp_path, monkeypatch) -> None:
         assert command == "semstab-bench"
         assert bench(*words, cwd=tmp_path, columns=80).stdout
     exec(compile(measure, "second.py", "exec"), {})
-    assert "second" not in {each.key for each in measures()}
+    assert "second" not in {declared.key for declared in measures()}
     assert load_result("model").models == ("bright",)
     assert load_result("reader").models == ("mine",)
     assert "numba+capped" in Path("rule/summary.json").read_text()

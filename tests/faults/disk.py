@@ -83,11 +83,11 @@ def fault_of(words: kills.Words, left: Left, expected: Any, out: Path, log: Path
     _, status = os.waitpid(kills.in_a_child(words, log), 0)
     code = os.waitstatus_to_exitcode(status)
     fault = problem(code, log.read_text(errors="replace"))
-    kept = finished(out)
+    times = finished(out)
     enlarge(out.parent)
     kills.finished(words, log)
-    if any(not path.exists() or path.stat().st_mtime_ns != when for path, when in kept.items()):
-        fault = f"of {len(kept)} finished files not all were kept"
+    if any(not path.exists() or path.stat().st_mtime_ns != when for path, when in times.items()):
+        fault = f"of {len(times)} finished files not all were kept"
     return code, "differs, started again" if left(out) != expected else fault
 
 

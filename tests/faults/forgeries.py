@@ -85,12 +85,12 @@ def forgeries(parts: Parts, *, fields: bool) -> Iterator[Forgery]:
 
 def of_fields(content: Content) -> Iterator[Forgery]:
     """Yield a change of each field of the text, one of those that differ in a number in their path."""
-    seen = set()
+    yielded = set()
     for path, value in leaves(content):
         name = ".".join("0" if isinstance(step, int) else step for step in path)
         for how, new in replacements(value):
-            if (name, how) not in seen:
-                seen.add((name, how))
+            if (name, how) not in yielded:
+                yielded.add((name, how))
                 yield (
                     "a field of the text",
                     f"{name} {how}",
@@ -209,7 +209,7 @@ def forged_text() -> Iterator[Forgery]:
     yield (
         "text",
         "an unknown class",
-        lambda parts: [own["spots"]["classes"][0].update(name="x") for own in statistics(parts)],
+        lambda parts: [record["spots"]["classes"][0].update(name="x") for record in statistics(parts)],
     )
     yield "text", "a scene twice", lambda parts: parts.content["scenes"].append(parts.content["scenes"][0])
     yield "text", "a scene fewer", lambda parts: parts.content["scenes"].pop()
@@ -255,13 +255,13 @@ def forged_places() -> Iterator[Forgery]:
         each(put_all(frame=lambda s: np.where(s["frame"] < 0, -1, s["frame"].max() - s["frame"]))),
     )
     yield "places", "one frame", each(put_all(frame=lambda sums: np.minimum(sums["frame"], 0)))
-    yield "places", "groups of 0 frames", each(said(step=lambda own: [0] * len(own)))
-    yield "places", "groups of 64 frames", each(said(step=lambda own: [64] * len(own)))
-    yield "places", "100 frames more were fused", each(said(fused=lambda own: [n + 100 for n in own]))
-    yield "places", "0 frames were fused", each(said(fused=lambda own: [0] * len(own)))
-    yield "places", "cubes said to be twice as large", each(said(edge=lambda own: [2 * x for x in own]))
-    yield "places", "cubes said to be half as large", each(said(edge=lambda own: [x / 2 for x in own]))
-    yield "places", "voxels said to be larger", each(said(voxel_size=lambda own: [2 * x for x in own]))
+    yield "places", "groups of 0 frames", each(said(step=lambda values: [0] * len(values)))
+    yield "places", "groups of 64 frames", each(said(step=lambda values: [64] * len(values)))
+    yield "places", "100 frames more were fused", each(said(fused=lambda values: [n + 100 for n in values]))
+    yield "places", "0 frames were fused", each(said(fused=lambda values: [0] * len(values)))
+    yield "places", "cubes said to be twice as large", each(said(edge=lambda values: [2 * x for x in values]))
+    yield "places", "cubes said to be half as large", each(said(edge=lambda values: [x / 2 for x in values]))
+    yield "places", "voxels said to be larger", each(said(voxel_size=lambda values: [2 * x for x in values]))
     for times, groups in ((2, 1), (4, 1), (64, 1), (1, 2), (1, 16), (64, 64)):
         yield "places", f"cubes {times} times as large, groups of {groups}", each(larger(times, groups))
 
@@ -306,9 +306,9 @@ def forged_agreement() -> Iterator[Forgery]:
 
 def forged_classes() -> Iterator[Forgery]:
     """Yield edits of classes."""
-    yield "classes", "an unknown class", each(named(lambda own: ["x", *own[1:]]))
-    yield "classes", "classes in another order", each(named(lambda own: own[::-1]))
-    yield "classes", "no names", each(named(lambda own: []))
+    yield "classes", "an unknown class", each(named(lambda names: ["x", *names[1:]]))
+    yield "classes", "classes in another order", each(named(lambda names: names[::-1]))
+    yield "classes", "no names", each(named(lambda names: []))
     yield (
         "classes",
         "a class more",
@@ -346,15 +346,15 @@ def statistics(parts: Parts) -> Iterator[Content]:
 
 def stated(key: str, **changes: Any) -> Callable[[Parts], None]:
     def change(parts: Parts) -> None:
-        for own in statistics(parts):
-            own["headline"].setdefault(key, {}).update(changes)
+        for record in statistics(parts):
+            record["headline"].setdefault(key, {}).update(changes)
 
     return change
 
 
 def level(parts: Parts, wanted: str = "stable") -> None:
-    for own in statistics(parts):
-        own["verdict"].update(level=wanted, of_all=None)
+    for record in statistics(parts):
+        record["verdict"].update(level=wanted, of_all=None)
 
 
 def each(change: Callable[[Table, Content], None]) -> Callable[[Parts], None]:
@@ -466,7 +466,7 @@ def answers(*of: int) -> Callable[[Table, Content], None]:
 
     def change(sums: Table, about: Content) -> None:
         rows = [np.flatnonzero(sums["part"] == part) for part in (0, *of)]
-        part = np.repeat(np.arange(4), [len(own) for own in rows]).astype(sums["part"].dtype)
+        part = np.repeat(np.arange(4), [len(record) for record in rows]).astype(sums["part"].dtype)
         take(sums, np.concatenate(rows))
         sums["part"] = part
 
@@ -522,8 +522,8 @@ def frames(parts: Parts) -> None:
 
 
 def classes(parts: Parts) -> None:
-    for own in statistics(parts):
-        own["spots"]["classes"] = own["spots"]["classes"][:1]
+    for record in statistics(parts):
+        record["spots"]["classes"] = record["spots"]["classes"][:1]
 
 
 number = lambda sums: np.arange(len(sums["part"]))  # noqa: E731
@@ -542,8 +542,8 @@ class Referee:
     honest: dict[str, Loaded]
 
     @classmethod
-    def of(cls, folder: Path, named: str, definitions: Mapping[str, Benchmark] | None = None) -> Referee:
-        files = sorted(folder.glob(f"{named}__*{SUFFIX}"))
+    def of(cls, folder: Path, benchmark_name: str, definitions: Mapping[str, Benchmark] | None = None) -> Referee:
+        files = sorted(folder.glob(f"{benchmark_name}__*{SUFFIX}"))
         loaded = {file.name: load_submission(file, definitions) for file in files}
         benchmark = next(iter(loaded.values()))[0]
         return cls(benchmark, {name: (name, about, handle) for name, (_, about, handle) in loaded.items()})
@@ -623,7 +623,9 @@ def main() -> None:
             print(f"{kind}: {what}: {outcome}", flush=True)
     print(f"{file}: {len(ranks)} honest results, {count.total()} forgeries")
     for kind in dict.fromkeys(kind for kind, _ in count):
-        print(f"  {kind:<40}", *(f"{what} {n}" for (own, what), n in sorted(count.items()) if own == kind), sep="  ")
+        print(
+            f"  {kind:<40}", *(f"{what} {n}" for (family, what), n in sorted(count.items()) if family == kind), sep="  "
+        )
     sys.exit(any(outcome == CHANGES for _, outcome in count))
 
 

@@ -108,10 +108,10 @@ def of_files(out: Path) -> Any:
     """What a conversion or a prediction leaves, file by file; manifests without times and places."""
     manifests = ("conversion.json", "predictions.json", "relabelled.json")
     files = sorted(path for path in out.rglob("*") if path.is_file())
-    kept = {str(path.relative_to(out)): path.read_bytes() for path in files if path.name not in manifests}
+    content = {str(path.relative_to(out)): path.read_bytes() for path in files if path.name not in manifests}
     told = [json.loads(path.read_text()) for path in files if path.name in manifests]
-    frames = [list(each["frames"]) for each in told if isinstance(each.get("frames"), dict)]
-    return kept, frames, [{**each, "folder": None} for each in told if "confirmed" in each]
+    frames = [list(line["frames"]) for line in told if isinstance(line.get("frames"), dict)]
+    return content, frames, [{**line, "folder": None} for line in told if "confirmed" in line]
 
 
 def kinds(base: Path) -> dict[str, tuple[Callable[[Path], Words], Callable[[Path], Any]]]:
@@ -173,7 +173,7 @@ def main(count: int, seed: int, *only: str) -> None:
     with tempfile.TemporaryDirectory() as temporary:
         base = Path(temporary)
         made, whole, seconds = kinds(base), {}, {}
-        made = {kind: own for kind, own in made.items() if kind in (only or made)}
+        made = {kind: kill for kind, kill in made.items() if kind in (only or made)}
         for kind, (words, left) in made.items():
             started = time.monotonic()
             finished(words(base / kind), base / "log")

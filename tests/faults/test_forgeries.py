@@ -16,10 +16,10 @@ RESULTS = Path(__file__).parents[2] / "results"
     pytest.param("livingroom@1", "espnetv2-1.0", 1, marks=combination),
     pytest.param("city@1", "trick-world-locked", 6, marks=combination),
 ])  # fmt: skip
-def test_no_forgery_changes_a_rank(named, model, one_in) -> None:
-    referee = forgeries.Referee.of(RESULTS, named)
-    file = RESULTS / f"{named}__{model}.semstab"
+def test_no_forgery_changes_a_rank(name, model, one_in) -> None:
+    referee = forgeries.Referee.of(RESULTS, name)
+    file = RESULTS / f"{name}__{model}.semstab"
     outcomes = [(what, outcome) for _, what, outcome in forgeries.judged(referee, file, fields=False, one_in=one_in)]
     assert len(outcomes) >= 100 // one_in
-    assert [each for each in outcomes if each[1] not in ("refused", "no rank changes")] == []
+    assert [outcome for outcome in outcomes if outcome[1] not in ("refused", "no rank changes")] == []
     assert sum(outcome == "refused" for _, outcome in outcomes) > len(outcomes) / 2

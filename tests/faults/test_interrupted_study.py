@@ -44,6 +44,6 @@ def test_processes_that_start_end_at_once_and_say_nothing(tmp_path):
     assert process.returncode == 130
     assert len(said.splitlines()) == 1, said
     assert said.startswith("interrupted; ")
-    gone = [each for each in started if not each.is_running() or each.status() == psutil.STATUS_ZOMBIE]
+    gone = [process for process in started if not process.is_running() or process.status() == psutil.STATUS_ZOMBIE]
     assert started
     assert gone == started

@@ -143,7 +143,7 @@ def test_a_summary_that_lacks_what_its_tables_are_made_of_is_refused(folder, pla
 
 
 @pytest.mark.parametrize("name", ["summary.json", "manifest.json"])
-def test_a_digit_that_was_changed_in_a_file_of_a_run_is_one_line_in_whatever_reads_it(folder, tmp_path, name) -> None:
+def test_a_changed_digit_in_a_file_of_a_run_is_one_line_in_whatever_reads_it(folder, tmp_path, name) -> None:
     run = shutil.copytree(folder / "run", tmp_path / "run")
     change_a_digit(run / name)
     for words in (("show", "run"), ("gate", "run", "--save-baseline", "x.semstab"), ("export", "run", "--to", "x.ply")):

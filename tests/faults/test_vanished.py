@@ -31,7 +31,9 @@ def test_a_predicted_map_that_vanishes_is_told_and_predicted_again(tmp_path, mon
     with monkeypatch.context() as patch:
         whole = PredictionFolder.close
         patch.setattr(
-            PredictionFolder, "close", lambda own: (whole(own), min(own.path.glob("*.png")).unlink(missing_ok=True))[0]
+            PredictionFolder,
+            "close",
+            lambda predicted: (whole(predicted), min(predicted.path.glob("*.png")).unlink(missing_ok=True))[0],
         )
         said = error_of(*words, cwd=tmp_path)
     assert ".png: was written, and is gone; run the same command again" in said

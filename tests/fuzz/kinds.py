@@ -266,11 +266,11 @@ def read_result(folder: Path) -> None:
         print_summary(result, Console(file=StringIO()))
 
 
-def compared(*named: Path | str) -> None:
-    runs = open_runs(named)
+def compared(*paths: Path | str) -> None:
+    runs = open_runs(paths)
     for scene in shared_scenes(runs):
-        entries = [each.scenes[scene] for each in runs]
-        contrasts(pair(entries, [each.name for each in runs]), *entries, 1)
+        entries = [run.scenes[scene] for run in runs]
+        contrasts(pair(entries, [run.name for run in runs]), *entries, 1)
 
 
 def predict(folder: Path) -> None:

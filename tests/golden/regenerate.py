@@ -74,7 +74,9 @@ def golden_city():
             "pose": frame.T_wc.tolist(),
             "depth": float(frame.depth.mean()),
             "color": frame.color.mean(axis=(0, 1)).tolist(),
-            "labels": {model: np.bincount(own.ravel(), minlength=8).tolist() for model, own in labels.items()},
+            "labels": {
+                model: np.bincount(label_map.ravel(), minlength=8).tolist() for model, label_map in labels.items()
+            },
         }
     return content
 
@@ -85,13 +87,13 @@ def surface_content(surface):
     area = np.linalg.norm(np.cross(b - a, c - a), axis=1) / 2
     content = {}
     for k in np.unique(surface.classes).tolist():
-        own = surface.classes == k
-        weight = area[own, None] / area[own].sum()
+        of_class = surface.classes == k
+        weight = area[of_class, None] / area[of_class].sum()
         content[str(k)] = {
-            "triangles": int(own.sum()),
-            "area": float(area[own].sum()),
-            "centre": (weight * (a + b + c)[own] / 3).sum(axis=0).tolist(),
-            "color": (weight * surface.colors[own]).sum(axis=0).tolist(),
+            "triangles": int(of_class.sum()),
+            "area": float(area[of_class].sum()),
+            "centre": (weight * (a + b + c)[of_class] / 3).sum(axis=0).tolist(),
+            "color": (weight * surface.colors[of_class]).sum(axis=0).tolist(),
         }
     return content
 
@@ -102,8 +104,8 @@ def write_benchmark_digests():
     from semstab.leaderboard.definition import load_benchmark
 
     path = FILE.with_name("benchmarks.json")
-    known = json.loads(path.read_text()) if path.exists() else {}
-    write_json(path, {name: load_benchmark(name).digest for name in shipped_benchmarks()} | known)
+    stored = json.loads(path.read_text()) if path.exists() else {}
+    write_json(path, {name: load_benchmark(name).digest for name in shipped_benchmarks()} | stored)
 
 
 def write_table_files():
