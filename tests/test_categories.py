@@ -69,7 +69,7 @@ def test_thresholds_count_as_reached():
 
 
 @pytest.mark.parametrize(
-    ("settings", "named"),
+    ("settings", "name"),
     [({"min_op": 0}, "min_op = 0"), ({"drifting_bits": 0}, "drifting_bits = 0"), ({"uncertain_bits": math.nan}, "nan")],
 )
 def test_thresholds_out_of_range_are_refused(settings, name):

@@ -55,7 +55,7 @@ def test_a_label_source_is_selected_behind_a_colon_and_names_are_the_shortest(ru
     assert open_run(f"{tmp_path}/a:b:a").source == tmp_path / "a:b"
 
 
-@pytest.mark.parametrize(("named", "line"), [
+@pytest.mark.parametrize(("path", "line"), [
     ("{run}", "holds several label sources (a, b); name one: {run}:a"), ("{run}:q", "no model 'q'; known: a, b"),
     ("{run}/nothing", "there is no such folder"), ("{run}/units", "summary.json: cannot be read"),
     ("{run}/config.yaml", "neither a run's folder nor a small summary"),

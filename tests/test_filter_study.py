@@ -209,7 +209,7 @@ def test_shipped_ones_that_warp_are_left_out_flicker_is_of_what_both_frames_see(
     assert record.quality.flicker == pytest.approx(2 * 0.1 * 0.9, abs=0.04)
 
 
-@pytest.mark.parametrize(("count", "named"), [(4, "ema:0.1, ema:0.2, ema:0.3, ema:0.4."), (6, "ema:0.4 and 2 more.")])
+@pytest.mark.parametrize(("count", "listed"), [(4, "ema:0.1, ema:0.2, ema:0.3, ema:0.4."), (6, "ema:0.4 and 2 more.")])
 def test_filters_that_change_nothing_are_named_up_to_four(count, listed):
     found = study(*(result_of(f"ema:0.{k + 1}", changed=0.0) for k in range(count)))
     (line,) = (line for line in advice(found) if line.startswith("These filters change fewer than"))

@@ -154,7 +154,7 @@ def net(image):
 """
 
 
-@pytest.mark.parametrize("shown", [True, False])
+@pytest.mark.parametrize("unfiltered", [True, False])
 def test_filters_over_one_model_share_its_maps(scene, monkeypatch, unfiltered):
     (scene.parent / "counted.py").write_text(COUNTED)
     monkeypatch.setenv("COUNTS", str(scene.parent / "count"))

@@ -196,7 +196,7 @@ def test_less_than_no_class_is_ignored(tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("said", "known"),
+    ("said", "classes"),
     [
         ("classes = {1: 'b', 0: 'a'}", ("a", "b")),
         ("CLASSES = ['a', 'b', 'c']", ("a", "b", "c")),

@@ -74,7 +74,7 @@ def test_classes_go_by_number_and_repeated_names_get_it():
     assert label_space({0: "a", 1: "A ", 2: "b"}, "m").classes == ("a 0", "A 1", "b")
 
 
-@pytest.mark.parametrize(("image_size", "seen"), [(None, (64, 96)), (32, (32, 64)), ((32, 128), (32, 128))])
+@pytest.mark.parametrize(("image_size", "size"), [(None, (64, 96)), (32, (32, 64)), ((32, 128), (32, 128))])
 def test_the_size_that_the_model_sees(monkeypatch, image_size, size):
     model = create("segformer", checkpoint=str(tiny("segformer")), image_size=image_size)
     sizes = []

@@ -59,9 +59,9 @@ def test_it_says_what_the_command_says(flights):
     values = metric.compute()
     for name in Summary.NAMES:
         assert values[name] == pytest.approx(np.nanmean([row.scalars()[name] for row in rows]), abs=1e-9), name
-    own = metric.by_sequence()
-    assert [each.verdict for each in own.values()] == [row.verdict for row in rows]
-    assert own["scene3"].scalars() == pytest.approx(rows[1].scalars(), abs=1e-9, nan_ok=True)
+    summaries = metric.by_sequence()
+    assert [summary.verdict for summary in summaries.values()] == [row.verdict for row in rows]
+    assert summaries["scene3"].scalars() == pytest.approx(rows[1].scalars(), abs=1e-9, nan_ok=True)
 
 
 def test_batches_of_tensors_are_frames_one_by_one(flights, plain):
@@ -87,14 +87,14 @@ def test_soft_scores_are_fused_as_scores(flights):
     rng = np.random.default_rng(0)
     logits = [3 * rng.normal(size=(K, 54, 96)).astype(np.float32) for _ in range(10)]
     soft, given_soft = TemporalStability(K, SIZE, soft=True), TemporalStability(K, SIZE, soft=True)
-    scores = [torch.softmax(torch.from_numpy(each), 0).numpy() for each in logits]
+    scores = [torch.softmax(torch.from_numpy(values), 0).numpy() for values in logits]
     frames = flights["scene0"]
-    for frame, raw, own in zip(frames, logits, scores, strict=True):
+    for frame, raw, probabilities in zip(frames, logits, scores, strict=True):
         soft.update(raw, frame.depth, frame.intrinsics, frame.T_wc)
-        given_soft.update(own, frame.depth, frame.intrinsics, frame.T_wc)
+        given_soft.update(probabilities, frame.depth, frame.intrinsics, frame.T_wc)
     result = semstab.fuse([
-        {"scores": np.moveaxis(own, 0, -1), "depth": f.depth, "intrinsics": f.intrinsics, "T_wc": f.T_wc}
-        for f, own in zip(frames, scores, strict=True)
+        {"scores": np.moveaxis(probabilities, 0, -1), "depth": f.depth, "intrinsics": f.intrinsics, "T_wc": f.T_wc}
+        for f, probabilities in zip(frames, scores, strict=True)
     ], voxel_size=SIZE)  # fmt: skip
     assert given_soft.compute() == pytest.approx(result.summary.scalars(), abs=1e-9, nan_ok=True)
     assert soft.compute() == pytest.approx(given_soft.compute(), abs=1e-5, nan_ok=True)
@@ -108,8 +108,8 @@ def test_pixels_without_a_label_are_left_out(flights):
             labels = frame.labels.astype(kind)
             labels[:, :30] = none
             metric.update(labels, frame.depth, frame.intrinsics, frame.T_wc)
-            known = np.where(labels == none, 255, labels).astype(np.uint8)
-            expected.update(known, frame.depth, frame.intrinsics, frame.T_wc)
+            labelled = np.where(labels == none, 255, labels).astype(np.uint8)
+            expected.update(labelled, frame.depth, frame.intrinsics, frame.T_wc)
         assert metric.compute() == pytest.approx(expected.compute(), abs=1e-12)
     with pytest.raises(DataError, match="label 9 is not below num_classes = 8"):
         metric.update(np.full((54, 96), 9), frames[0].depth, frames[0].intrinsics, frames[0].T_wc)
@@ -122,7 +122,7 @@ def test_processes_add_up_to_one(flights, plain, owner):
     """However the frames are shared out; SBD and flicker are means over the steps that each process saw."""
     frames = flights["scene0"]
     parts = [
-        updated(TemporalStability(K, SIZE), [f for f, own in zip(frames, owner, strict=True) if own == k])
+        updated(TemporalStability(K, SIZE), [f for f, process in zip(frames, owner, strict=True) if process == k])
         for k in range(3)
     ]
     sent = [pickle.loads(pickle.dumps(part.states())) for part in parts]
@@ -257,12 +257,14 @@ def test_lightning_logs_it(flights, plain, tmp_path):
 
 
 def test_help_shows_the_arguments_of_the_metric_and_its_own_documentation():
-    of_torch, own = semstab.TemporalStability, TemporalStability
+    of_torch, of_numpy = semstab.TemporalStability, TemporalStability
     for name in ("__init__", "update"):
-        shown, known = (dict(inspect.signature(getattr(each, name)).parameters) for each in (of_torch, own))
-        shown.pop("of_torchmetrics", None)
-        assert [(each.name, each.default) for each in shown.values()] == [
-            (each.name, each.default) for each in known.values()
+        wrapped, arguments = (
+            dict(inspect.signature(getattr(metric, name)).parameters) for metric in (of_torch, of_numpy)
+        )
+        wrapped.pop("of_torchmetrics", None)
+        assert [(parameter.name, parameter.default) for parameter in wrapped.values()] == [
+            (parameter.name, parameter.default) for parameter in arguments.values()
         ]
-    assert of_torch.__doc__ == own.__doc__
+    assert of_torch.__doc__ == of_numpy.__doc__
     assert "T_wc: (4, 4)" in of_torch.update.__doc__

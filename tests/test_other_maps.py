@@ -46,18 +46,24 @@ def table(folder):
 
 
 def only(folder, other, run="nowhere", **options) -> MapAgreement:
-    (own,) = semstab.compare_maps(folder / run, folder / other, model="a", **options).agreements
-    return own
+    (agreement,) = semstab.compare_maps(folder / run, folder / other, model="a", **options).agreements
+    return agreement
 
 
 @pytest.mark.parametrize("run", ["run", "nowhere"])
 @pytest.mark.parametrize("suffix", ["ply", "las", "laz", "parquet"])
 def test_what_the_run_exported_agrees_fully(folder, run, suffix) -> None:
     export(folder / run, folder / f"{run}.{suffix}", model="a")
-    own = only(folder, f"{run}.{suffix}", run)
-    assert (own.covers, own.covered, own.same, own.outside, own.unlabelled) == (1, 1, 1, 0, 0)
-    assert own.places == ()
-    assert own.better == ""
+    agreement = only(folder, f"{run}.{suffix}", run)
+    assert (agreement.covers, agreement.covered, agreement.same, agreement.outside, agreement.unlabelled) == (
+        1,
+        1,
+        1,
+        0,
+        0,
+    )
+    assert agreement.places == ()
+    assert agreement.better == ""
 
 
 def test_the_tables_that_a_run_stores_are_maps_in_the_scene(folder) -> None:
@@ -74,25 +80,25 @@ def test_numbers_by_hand(folder, table) -> None:
     other[:10] = (other[:10] + 1) % 3
     far = np.array([[50.0, 50.0, 50.0]])
     cloud(folder / "some.ply", np.concatenate([table.centers[keep], far]), np.append(other, 0))
-    own = only(folder, "some.ply", "run", frame="scene")
+    agreement = only(folder, "some.ply", "run", frame="scene")
     n = np.count_nonzero(keep)
-    assert own.points == own.voxels == n + 1
-    assert own.covers == pytest.approx(n / len(table))
-    assert own.covered == pytest.approx(n / (n + 1))
-    assert own.outside == pytest.approx(1 / (n + 1))
-    assert (own.compared, own.same) == (n, pytest.approx(1 - 10 / n))
-    assert own.known == n
-    assert own.accuracy == pytest.approx((np.mean(ours[keep] == true[keep]), np.mean(other == true[keep])))
-    for row in own.classes:
+    assert agreement.points == agreement.voxels == n + 1
+    assert agreement.covers == pytest.approx(n / len(table))
+    assert agreement.covered == pytest.approx(n / (n + 1))
+    assert agreement.outside == pytest.approx(1 / (n + 1))
+    assert (agreement.compared, agreement.same) == (n, pytest.approx(1 - 10 / n))
+    assert agreement.known == n
+    assert agreement.accuracy == pytest.approx((np.mean(ours[keep] == true[keep]), np.mean(other == true[keep])))
+    for row in agreement.classes:
         k = ["wall", "door", "window"].index(row.name)
         assert row.voxels == np.count_nonzero(ours[keep] == k)
         assert row.same == pytest.approx(np.mean(other[ours[keep] == k] == k))
         of_class = true[keep] == k
         assert row.recall == pytest.approx((np.mean(ours[keep][of_class] == k), np.mean(other[of_class] == k)))
-    assert sum(row.voxels for row in own.strata) == len(table)
-    twice = next(row for row in own.strata if row.name == "OP=2")
-    seen = table.op == 2
-    assert (twice.voxels, twice.covered) == (np.count_nonzero(seen), pytest.approx(np.mean(keep[seen])))
+    assert sum(row.voxels for row in agreement.strata) == len(table)
+    twice = next(row for row in agreement.strata if row.name == "OP=2")
+    twice_seen = table.op == 2
+    assert (twice.voxels, twice.covered) == (np.count_nonzero(twice_seen), pytest.approx(np.mean(keep[twice_seen])))
 
 
 def truth(folder, table):
@@ -110,9 +116,9 @@ def test_places_are_neighbours_with_the_same_two_classes(folder, table) -> None:
     names, commonest = ["wall", "door", "window"], int(np.bincount(ours).argmax())
     patch, other = (table.centers[:, 0] > 0.5) & (ours == commonest), (commonest + 1) % 3
     assert np.count_nonzero(patch) >= 4
-    own = only(folder, cloud(folder / "patch.ply", table.centers, np.where(patch, other, ours)).name)
-    assert sum(place.voxels for place in own.places) <= np.count_nonzero(patch)
-    largest = own.places[0]
+    agreement = only(folder, cloud(folder / "patch.ply", table.centers, np.where(patch, other, ours)).name)
+    assert sum(place.voxels for place in agreement.places) <= np.count_nonzero(patch)
+    largest = agreement.places[0]
     assert (largest.ours, largest.theirs) == (names[commonest], names[other])
     assert patch[np.linalg.norm(table.centers - largest.centre, axis=1).argmin()]
     comparison = semstab.compare_maps(folder / "nowhere", folder / "patch.ply", model="a")
@@ -146,8 +152,8 @@ def test_a_wrong_frame_is_found_said_and_mended_by_its_option(folder, table, opt
     assert option.rstrip("=") in said
     if done.returncode == 0:
         assert only(folder, path).same < 1 or only(folder, path).covers < 1
-    named = said.partition("fits better with ")[2].partition(":")[0].split()
-    bench(*words, *named, "--out", "beside", cwd=tmp_path)
+    options = said.partition("fits better with ")[2].partition(":")[0].split()
+    bench(*words, *options, "--out", "beside", cwd=tmp_path)
     (row,) = json.loads((tmp_path / "beside/tables/tables.json").read_text())["maps"]["rows"]
     assert (row["covers"], row["covered"], row["same"]) == (100, 100, 100)
 
@@ -169,9 +175,9 @@ def test_another_map_that_is_merely_worse_is_not_moved(folder, table) -> None:
     rng = np.random.default_rng(0)
     keep = rng.random(len(table)) < 0.6
     label = np.where(rng.random(len(table)) < 0.4, rng.integers(0, 3, len(table)), dominant(table))
-    own = only(folder, cloud(folder / "worse.ply", table.centers[keep], label[keep]).name)
-    assert own.better == ""
-    assert 0 < own.same < 1
+    agreement = only(folder, cloud(folder / "worse.ply", table.centers[keep], label[keep]).name)
+    assert agreement.better == ""
+    assert 0 < agreement.same < 1
 
 
 def test_a_mesh_whose_colours_are_classes_as_kimera_writes_it(folder, table, tmp_path) -> None:
@@ -181,9 +187,9 @@ def test_a_mesh_whose_colours_are_classes_as_kimera_writes_it(folder, table, tmp
     lines = [f"{name}, {r}, {g}, {b}, 255, {k}" for k, (name, (r, g, b)) in enumerate(COLORS.items())]
     (tmp_path / "colours.csv").write_text("\n".join(["name, red, green, blue, alpha, id", *lines]))
     for name in ("colours.yaml", "colours.csv"):
-        own = only(folder, mesh, colours=tmp_path / name)
-        assert (own.covers, own.covered, own.same, own.unlabelled) == (1, 1, 1, 0)
-        assert any("mesh" in note for note in own.notes)
+        agreement = only(folder, mesh, colours=tmp_path / name)
+        assert (agreement.covers, agreement.covered, agreement.same, agreement.unlabelled) == (1, 1, 1, 0)
+        assert any("mesh" in note for note in agreement.notes)
     fails(DataError, "--colours", only, folder, mesh)
     corners = np.array([[0.0, 0, 0], [4, 0, 0], [0, 4, 0]])
     points, row = on_surface(corners, np.array([0, 1, 2]), np.array([[0, 1, 2]]), 0.1)
@@ -197,10 +203,10 @@ def test_classes_by_name_id_and_file(folder, table, tmp_path) -> None:
     ours = dominant(table)
     names = np.array(["Wall", "door", "pane"])[ours]
     pq.write_table(pa.table({**dict(zip("xyz", table.centers.T, strict=True)), "label": names}), tmp_path / "n.parquet")
-    own = only(folder, tmp_path / "n.parquet")
-    assert own.unlabelled == pytest.approx(np.mean(ours == 2))
-    assert any("pane" in note for note in own.notes)
-    assert own.same == 1
+    agreement = only(folder, tmp_path / "n.parquet")
+    assert agreement.unlabelled == pytest.approx(np.mean(ours == 2))
+    assert any("pane" in note for note in agreement.notes)
+    assert agreement.same == 1
     np.savez(tmp_path / "v.npz", index=table.index, label=ours * 10 + 5, voxel_size=table.voxel_size)
     fails(DataError, "id 15", only, folder, tmp_path / "v.npz")
     (tmp_path / "ids.yaml").write_text("5: wall\n15: door\n25: window\n")
@@ -259,7 +265,7 @@ def test_several_maps_are_rows_of_a_table_with_pictures_places_and_a_recording(f
     assert [row["map"] for row in rows] == ["same.ply", "other.ply"]
     assert rows[0]["same"] == 100 > rows[1]["same"]
     places = json.loads((tmp_path / "beside/places.geojson").read_text())
-    assert {each["properties"]["map"] for each in places["features"]} == {"other.ply"}
+    assert {feature["properties"]["map"] for feature in places["features"]} == {"other.ply"}
     lon, lat = places["features"][0]["geometry"]["coordinates"]
     assert (round(lon), round(lat)) == (-92, 47)
     lines = (tmp_path / "beside/places.csv").read_text().splitlines()

@@ -73,7 +73,9 @@ def test_what_is_published_holds_no_link(built) -> None:
     _, unpacked, wheel = built
     assert (SOURCE / "src/semstab").is_symlink()
     assert [path for path in unpacked.rglob("*") if path.is_symlink()] == []
-    assert [each.filename for each in zipfile.ZipFile(wheel).infolist() if stat.S_ISLNK(each.external_attr >> 16)] == []
+    assert [
+        member.filename for member in zipfile.ZipFile(wheel).infolist() if stat.S_ISLNK(member.external_attr >> 16)
+    ] == []
 
 
 def test_the_metadata_say_who_what_and_where(built) -> None:
@@ -125,8 +127,8 @@ def take_compiled(site: Path) -> None:
         for file in (SOURCE / folder).rglob("*.py"):
             there = site / package / file.relative_to(SOURCE / folder)
             shutil.copystat(file, there)
-            kept = file.parent / "__pycache__"
-            for code in (*kept.glob(f"{file.stem}.*.nb[ci]"), *kept.glob(f"{file.stem}.{TAG}.pyc")):
+            cache = file.parent / "__pycache__"
+            for code in (*cache.glob(f"{file.stem}.*.nb[ci]"), *cache.glob(f"{file.stem}.{TAG}.pyc")):
                 (there.parent / "__pycache__").mkdir(exist_ok=True)
                 shutil.copy2(code, there.parent / "__pycache__")
 

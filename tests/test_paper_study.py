@@ -34,16 +34,16 @@ def rows(table):
 def test_findings_are_the_papers_numbers_and_those_of_the_study(result) -> None:
     findings, _ = paper(result)
     found = rows(findings)
-    own = pooled(result.select(model="sim-flicker"))
-    once = next(row for row in own.strata if row.name == "OP=1")
+    pooled_means = pooled(result.select(model="sim-flicker"))
+    once = next(row for row in pooled_means.strata if row.name == "OP=1")
     assert found["VSS: seen once → OP>=3"] == (
-        "1.000 → 0.869", f"{once[VSS]:.3f} → {own.recurrent[VSS]:.3f}", "yes",
+        "1.000 → 0.869", f"{once[VSS]:.3f} → {pooled_means.recurrent[VSS]:.3f}", "yes",
     )  # fmt: skip
     both = [pooled(result.select(SHARED, model=name)) for name in ("sim-flicker", "sim-steady")]
-    here = " → ".join(f"{each.every[VSS]:.4f}" for each in both)
+    here = " → ".join(f"{level.every[VSS]:.4f}" for level in both)
     assert found["VSS of all voxels: SegEarth-OV → SegFormer"] == ("0.9657 → 0.9848", here, "yes")
     small, large = levels(result, "voxel_size", "sim-flicker")
-    here = " → ".join(f"{level.mean(lambda each: 100 * each.recurrent.share):.2f}" for level in (small, large))
+    here = " → ".join(f"{level.mean(lambda means: 100 * means.recurrent.share):.2f}" for level in (small, large))
     assert found["Voxels of 0.1 → 0.4 m: share with OP>=3, %"] == ("3.90 → 42.61", here, "yes")
 
 
@@ -54,8 +54,8 @@ def test_what_the_study_did_not_vary_is_left_open(result) -> None:
 
 def test_numbers_stand_beside_each_other(result) -> None:
     _, published = paper(result)
-    own = pooled(result.select(model="sim-flicker"))
-    stratum = next(row for row in own.strata if row.name == "OP=2")
+    pooled_means = pooled(result.select(model="sim-flicker"))
+    stratum = next(row for row in pooled_means.strata if row.name == "OP=2")
     row = next(row for group, row in published.rows() if row[0] == "OP=2")
     assert row[1:5] == (20.32, 0.873, 0.0790, 0.1602)
     assert row[5:8] == (100 * stratum.share, stratum[VSS], stratum[SBD])

@@ -160,7 +160,7 @@ def test_noise_is_of_the_pixel_and_none_changes_nothing(config) -> None:
     np.testing.assert_array_equal(read(task, 1).T_wc, original.T_wc)
 
     def keys(**settings):
-        return [each.identity for each in make_plan(config(**settings)).units]
+        return [unit.identity for unit in make_plan(config(**settings)).units]
 
     assert keys(seed=4) == keys(seed=5)
     assert keys(perturbation=NOISE, seed=4) == keys(perturbation=NOISE, seed=4) != keys(perturbation=NOISE, seed=5)

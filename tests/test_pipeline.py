@@ -47,7 +47,7 @@ class Watching(Observer):
 
     def run_started(self, plan, finished) -> None:
         self.seen.append(f"start {len(plan.tasks)}")
-        self.seen += [f"kept {each.name.model}" for each in plan.units if each.identity in finished]
+        self.seen += [f"kept {unit.name.model}" for unit in plan.units if unit.identity in finished]
 
     def frame_fused(self, task, frame, rows) -> None:
         self.seen += [f"{unit.slug} {row.report.frame}" for unit, row in rows.items()]
@@ -361,8 +361,8 @@ def test_the_time_of_a_frame_is_told_by_stage(root, tmp_path) -> None:
     assert all(run.stages_ms[stage] >= 0 for stage in ("decode", "wait", "flicker", "logging"))
     summary = json.loads((tmp_path / "run" / "summary.json").read_text())
     assert summary["runs"][0]["stages_ms"]["association"] is None  # numpy does not tell its parts apart
-    (kept,) = semstab.run(configure(root, models=["a"]), out=tmp_path / "run", report=False).runs
-    assert kept.stages_ms["decode"] == run.stages_ms["decode"]
+    (record,) = semstab.run(configure(root, models=["a"]), out=tmp_path / "run", report=False).runs
+    assert record.stages_ms["decode"] == run.stages_ms["decode"]
     header, first, *_ = (tmp_path / "run" / "frames" / "wall__a__numpy.csv").read_text().splitlines()
     row = dict(zip(header.split(","), first.split(","), strict=True))
     assert float(row["decode_ms"]) > 0
@@ -373,16 +373,16 @@ def test_colour_is_decoded_only_for_observers_that_want_it(root) -> None:
     (root / "color").mkdir()
     for i in range(tiny_scene.FRAMES):
         cv2.imwrite(str(root / f"color/{i:04d}.png"), np.full((6, 8, 3), i, np.uint8))
-    seen = []
+    decoded = []
 
     class Painting(Observer):
         def frame_fused(self, task, frame, rows) -> None:
-            seen.append(frame.color is not None)
+            decoded.append(frame.color is not None)
 
     semstab.run(configure(root, models=["a"]), observers=[Painting()], report=False)
     Painting.wants_color = True
     semstab.run(configure(root, models=["a"]), observers=[Painting()], report=False)
-    assert seen == [False] * 3 + [True] * 3
+    assert decoded == [False] * 3 + [True] * 3
 
 
 def test_each_image_is_read_once(root, tmp_path, monkeypatch) -> None:

@@ -40,9 +40,9 @@ WKT = pyproj.CRS.from_epsg(32615).to_wkt()
 def a_map(groups, r=0.5):
     """A map from groups of (indices, votes): the votes of each voxel are whole frames of a class."""
     index, evidence = [], []
-    for own, votes in groups:
-        index += own
-        evidence += [votes] * len(own)
+    for voxels, votes in groups:
+        index += voxels
+        evidence += [votes] * len(voxels)
     order = np.lexsort(np.array(index).T[::-1])
     index, evidence = np.array(index)[order], np.array(evidence, float)[order]
     op = evidence.sum(axis=1).astype(int)
@@ -59,7 +59,7 @@ def row(y, n=4):
 
 def spots_in(places, r=0.5):
     """Spots at points, each with the answers (view, label)."""
-    spot, view, label = zip(*((k, v, c) for k, (_, own) in enumerate(places) for v, c in own), strict=True)
+    spot, view, label = zip(*((k, v, c) for k, (_, answers) in enumerate(places) for v, c in answers), strict=True)
     views = Views.of([[10 * v, 0, 0, 0, v, 0.01] for v in range(4)])
     zeros = np.zeros(len(spot), np.float32)
     label = np.array(label, np.uint16)
@@ -72,7 +72,7 @@ def spots_in(places, r=0.5):
 # --- Places -----------------------------------------------------------------------------------------------------------
 
 
-def test_a_place_is_touching_voxels_on_which_half_of_the_frames_disagree_the_most_disagreement_first() -> None:
+def test_a_place_is_touching_voxels_on_which_half_of_the_frames_disagree_worst_first() -> None:
     table = a_map([(row(0, 5), [2, 1, 0]), (row(10, 9), [0, 2, 2]), (row(20, 9), [4, 0, 0]), (row(30, 3), [1, 1, 0])])
     first, second = worst_places((table,), None)
     assert (first.label, first.other, first.voxels, first.op) == (1, 2, 9, 4)
@@ -80,7 +80,7 @@ def test_a_place_is_touching_voxels_on_which_half_of_the_frames_disagree_the_mos
     assert (second.label, second.other, second.voxels) == (0, 1, 5)
     lost = 9 * 2 / 3, 5 * 2 / 3
     whole = sum(lost) + 3  # three voxels are too few for a place
-    assert [first.share, second.share] == pytest.approx([own / whole for own in lost])
+    assert [first.share, second.share] == pytest.approx([lost_votes / whole for lost_votes in lost])
     assert first.centre == (2.25, 5.25, 0.25)
     assert first.size == pytest.approx(math.hypot(4.5, 0.5, 0.5))
     assert first.views == ()
@@ -89,9 +89,9 @@ def test_a_place_is_touching_voxels_on_which_half_of_the_frames_disagree_the_mos
 def test_places_do_not_depend_on_tiles_and_are_at_most_so_many() -> None:
     groups = [(row(0, 5), [2, 1, 0]), (row(10, 9), [0, 2, 2])]
     whole = worst_places((a_map(groups),), None)
-    parts = worst_places([a_map([own]) for own in groups], None)
+    parts = worst_places([a_map([group]) for group in groups], None)
     whole, parts = (
-        [(p.number, p.label, p.voxels, round(p.share, 9), p.centre) for p in each] for each in (whole, parts)
+        [(p.number, p.label, p.voxels, round(p.share, 9), p.centre) for p in found] for found in (whole, parts)
     )
     assert whole == parts
     assert len(worst_places((a_map(groups),), None, 1)) == 1
@@ -100,7 +100,7 @@ def test_places_do_not_depend_on_tiles_and_are_at_most_so_many() -> None:
 def test_of_a_large_map_the_voxels_on_which_frames_agree_least_are_looked_at(monkeypatch) -> None:
     groups = [(row(0, 5), [2, 1, 0]), (row(10, 9), [2, 2, 2]), (row(20, 3), [1, 0, 1])]
     monkeypatch.setattr(places, "VOXELS", 9)
-    for tables in ((a_map(groups),), [a_map([own]) for own in groups]):
+    for tables in ((a_map(groups),), [a_map([group]) for group in groups]):
         (place,) = worst_places(tables, None)
         assert place.voxels == 6
     assert place.share == pytest.approx(6 * 0.8 / (5 * 2 / 3 + 9 * 0.8 + 3))
@@ -118,7 +118,7 @@ def test_voxels_of_other_pairs_of_classes_or_without_a_common_corner_are_apart()
     assert len({a, c, d}) == 3
 
 
-def test_the_views_of_a_place_are_those_of_the_spots_in_it_with_the_class_that_each_gives_most() -> None:
+def test_the_views_of_a_place_are_those_of_its_spots_with_the_likeliest_class() -> None:
     table = a_map([(row(0, 5), [2, 1, 0])])
     inside = [((0.1, 0.1, 0.1), [(2, 1), (0, 0)]), ((0.6, 0.2, 0.3), [(0, 0), (3, 3)]), ((1.1, 0.2, 0.3), [(0, 1)])]
     outside = [((0.1, 0.9, 0.1), [(1, 2)])]
@@ -150,13 +150,13 @@ def test_a_picture_is_cut_around_the_place_in_labels_and_in_a_larger_image() -> 
     camera, pose = Intrinsics(40.0, 40.0, 39.5, 29.5), np.eye(4)
     frame = Frame(0, np.full((60, 80), 2, np.float32), camera, pose, labels=labels)
     points = np.array([(x, y, 2.0) for x in (-0.2, 0.2) for y in (-0.2, 0.2)])
-    shown, image, (x, y, radius) = cut_out(frame, points)
-    assert shown.shape == (EDGE, EDGE)
+    around, image, (x, y, radius) = cut_out(frame, points)
+    assert around.shape == (EDGE, EDGE)
     assert image is None
     assert (x, y) == pytest.approx((0.5, 0.5), abs=0.02)
     assert 0.05 < radius < 0.5
-    assert shown[-1, -1] == 1
-    assert shown[0, 0] == shown[0, -1] == shown[-1, 0] == 0
+    assert around[-1, -1] == 1
+    assert around[0, 0] == around[0, -1] == around[-1, 0] == 0
     with_color = dataclasses.replace(frame, color=color[::2, ::2])
     assert cut_out(with_color, points)[1][-1, -1].tolist() == [255, 255, 255]
     assert cut_out(frame, np.subtract(points, (0, 0, 4))) is None
@@ -293,15 +293,15 @@ def test_geojson_has_longitude_and_latitude_and_the_coordinates_of_the_exports(r
     assert len(places) == len(content["features"]) > 0
     back = pyproj.Transformer.from_crs("EPSG:4326", CRS, always_xy=True)
     for place, feature in zip(places, content["features"], strict=True):
-        known, (lon, lat) = feature["properties"], feature["geometry"]["coordinates"]
+        properties, (lon, lat) = feature["properties"], feature["geometry"]["coordinates"]
         x, y, z = np.array(place.centre) + OFFSET
-        assert (known["x"], known["y"], known["z"]) == pytest.approx((x, y, z), abs=1e-3)
+        assert (properties["x"], properties["y"], properties["z"]) == pytest.approx((x, y, z), abs=1e-3)
         assert back.transform(lon, lat) == pytest.approx((x, y), abs=0.01)
-        assert known["class"] in CLASSES
-        assert known["confused_with"] in set(CLASSES) - {known["class"]}
-        assert known["crs"] == "WGS 84 / UTM zone 15N (EPSG:32615)"
-        assert len(known["frames"]) == len(known["given"]) == len(place.views)
-        assert set(known["frames"]) <= {f"{k:04d}" for k in range(6)}
+        assert properties["class"] in CLASSES
+        assert properties["confused_with"] in set(CLASSES) - {properties["class"]}
+        assert properties["crs"] == "WGS 84 / UTM zone 15N (EPSG:32615)"
+        assert len(properties["frames"]) == len(properties["given"]) == len(place.views)
+        assert set(properties["frames"]) <= {f"{k:04d}" for k in range(6)}
     assert any(feature["properties"]["frames"] for feature in content["features"])
 
 
@@ -311,9 +311,9 @@ def test_geojson_without_a_georeference_has_metres_and_says_so(runs) -> None:
     content = json.loads((runs / "local.geojson").read_text())
     assert (content["crs"], content["note"]) == (None, LOCAL)
     for feature in content["features"]:
-        known = feature["properties"]
-        assert feature["geometry"]["coordinates"] == [known["x"], known["y"]]
-        assert known["crs"] == ""
+        properties = feature["properties"]
+        assert feature["geometry"]["coordinates"] == [properties["x"], properties["y"]]
+        assert properties["crs"] == ""
 
 
 def test_the_table_has_the_same_places(runs) -> None:
@@ -322,9 +322,9 @@ def test_the_table_has_the_same_places(runs) -> None:
         rows = list(csv.DictReader(file))
     features = json.loads((runs / "same.geojson").read_text())["features"]
     for line, feature in zip(rows, features, strict=True):
-        known = feature["properties"]
-        assert [float(line[name]) for name in "xyz"] == [known[name] for name in "xyz"]
-        assert line["frames"].split("; ") == known["frames"]
+        properties = feature["properties"]
+        assert [float(line[name]) for name in "xyz"] == [properties[name] for name in "xyz"]
+        assert line["frames"].split("; ") == properties["frames"]
         assert float(line["latitude"]) == feature["geometry"]["coordinates"][1]
 
 
@@ -374,8 +374,8 @@ def test_areas_of_compare_are_in_the_coordinates_of_the_exports(runs) -> None:
     assert (scene.crs, local.crs) == ("WGS 84 / UTM zone 15N (EPSG:32615)", "")
     pairs = list(zip(scene.against[0].areas, local.against[0].areas, strict=True))
     assert pairs
-    for area, own in pairs:
-        np.testing.assert_allclose(area.centre, np.array(own.centre) + OFFSET)
+    for area, unplaced in pairs:
+        np.testing.assert_allclose(area.centre, np.array(unplaced.centre) + OFFSET)
     text = (runs / "versus-run" / "comparison.md").read_text()
     assert "Centres are in WGS 84 / UTM zone 15N (EPSG:32615)." in text
     assert "m of WGS 84 / UTM zone 15N (EPSG:32615)" in text

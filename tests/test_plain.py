@@ -9,7 +9,7 @@ import pytest
 
 
 def rules(file, source):
-    return [each.rule.partition(":")[0] for each in plain.findings(file, source)]
+    return [offence.rule.partition(":")[0] for offence in plain.findings(file, source)]
 
 
 def notebook(*cells):
@@ -91,9 +91,9 @@ def test_a_place_is_no_condition(sentence):
 
 def test_the_line_of_a_finding_is_that_of_the_word():
     found = list(plain.findings("a.py", '"""Return a.\n\nDrops so many.\n"""\n'))
-    assert [each.line for each in found] == [3]
+    assert [offence.line for offence in found] == [3]
     found = list(plain.findings("a.md", "| a | b |\n|---|---|\n| c | drawn anew |\n"))
-    assert [each.line for each in found] == [3]
+    assert [offence.line for offence in found] == [3]
 
 
 def test_the_line_of_a_finding_in_a_notebook_is_its_line_in_the_file():

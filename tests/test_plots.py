@@ -88,8 +88,8 @@ def test_histograms_say_what_the_voxels_say(sequence):
         values, bin_width = measure.of(table), measure.largest / BINS + 1e-9
         defined, far = ~np.isnan(values), distance(measure, values)
         mean, low, _ = by_op(measure, counts)
-        for k, seen in enumerate(range(1, 9)):
-            here = defined & (op(table) == seen)
+        for k, times in enumerate(range(1, 9)):
+            here = defined & (op(table) == times)
             assert counts[k].sum() == here.sum()
             if here.any():
                 assert mean[k] == pytest.approx(values[here].mean(), abs=bin_width / 2)
@@ -110,7 +110,7 @@ def fused(sequence):
 
 @checks
 @given(SEQUENCES)
-def test_no_voxel_drifts_further_than_the_scale_of_the_maps_which_two_contradicting_frames_reach(sequence):
+def test_no_voxel_drifts_further_than_two_contradicting_frames(sequence):
     drift = sbd(fused(sequence))
     assert (drift[~np.isnan(drift)] <= SBD_MAX + 1e-12).all()
     assert pytest.approx(-(0.75 * math.log2(0.75) + 0.25 * math.log2(0.25)) - 0.5) == SBD_MAX
@@ -216,13 +216,13 @@ def test_a_map_has_the_colours_of_its_categories_and_nothing_is_white():
 
 
 def test_the_overview_is_in_one_palette():
-    seen = FromAbove.of(at([(0, 0, 0), (1, 0, 0)], evidence=[[0, 1, 0], [0, 0, 1]]), (0, 0, 1))
+    above = FromAbove.of(at([(0, 0, 0), (1, 0, 0)], evidence=[[0, 1, 0], [0, 0, 1]]), (0, 0, 1))
     overview = Overview(7, np.array([[0, 1], [2, 255]]), np.zeros((2, 2, 3), np.uint8), PALETTE)
-    image, prediction, fused_map = draw_overview(seen, overview).axes
+    image, prediction, fused_map = draw_overview(above, overview).axes
     assert [axes.get_title(loc="left")[:3] for axes in (image, prediction, fused_map)] == ["(a)", "(b)", "(c)"]
     assert pixels(prediction).tolist() == [[[200, 0, 0], [0, 200, 0]], [[0, 0, 200], [255, 255, 255]]]
-    assert pixels(fused_map)[0].tolist() == [PALETTE[k].tolist() for k in dominant(seen.table)]
-    assert len(draw_overview(seen, dataclasses.replace(overview, color=None)).axes) == 2
+    assert pixels(fused_map)[0].tolist() == [PALETTE[k].tolist() for k in dominant(above.table)]
+    assert len(draw_overview(above, dataclasses.replace(overview, color=None)).axes) == 2
 
 
 def test_a_sweep_shows_all_voxels_and_recurrent_ones(walls):
@@ -279,7 +279,7 @@ def test_every_figure_is_written_in_the_same_bytes(drawn, tmp_path):
         assert path.read_bytes() == (folder / "figures" / path.name).read_bytes()
 
 
-def test_figures_have_texts_and_the_width_of_a_column_or_a_page_and_svg_files_no_date(drawn):
+def test_figures_have_texts_and_the_width_of_a_column_or_page_and_svg_no_date(drawn):
     for path in drawn[2]:
         if path.suffix == ".png":
             with Image.open(path) as image:

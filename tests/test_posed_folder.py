@@ -208,11 +208,11 @@ def reprojection_errors(scene, a, b):
     v, u = np.nonzero(depth_a > 0)
     rays = np.linalg.inv(K_a) @ np.stack([u, v, np.ones_like(u)])
     T_ba = np.linalg.inv(scene.T_wc(b)) @ scene.T_wc(a)
-    seen = T_ba[:3, :3] @ (rays * depth_a[v, u]) + T_ba[:3, 3:]
-    seen = seen[:, seen[2] > 0]
-    u_b, v_b, _ = np.rint(K_b @ (seen / seen[2])).astype(int)
+    points = T_ba[:3, :3] @ (rays * depth_a[v, u]) + T_ba[:3, 3:]
+    points = points[:, points[2] > 0]
+    u_b, v_b, _ = np.rint(K_b @ (points / points[2])).astype(int)
     inside = (u_b >= 0) & (v_b >= 0) & (u_b < depth_b.shape[1]) & (v_b < depth_b.shape[0])
-    found, expected = depth_b[v_b[inside], u_b[inside]], seen[2, inside]
+    found, expected = depth_b[v_b[inside], u_b[inside]], points[2, inside]
     return np.abs(found / expected - 1)[found > 0]
 
 

@@ -178,12 +178,12 @@ def test_scores_that_are_many_go_to_disk_class_by_class(tmp_path, monkeypatch, d
     np.testing.assert_allclose(stored[0].sum(0), 1, atol=1e-5)
 
 
-@pytest.mark.parametrize(("count", "kept"), [(1, [3]), (2, [2, 3]), (3, [1, 2, 3])])
-def test_only_the_largest_scores_are_kept(scene, count, kept):
+@pytest.mark.parametrize(("count", "largest"), [(1, [3]), (2, [2, 3]), (3, [1, 2, 3])])
+def test_only_the_largest_scores_are_kept(scene, count, largest):
     predict(scene, Streaming(), indices=[0], scores=True, top_k=count, score_type="float32")
     with np.load(scene / "scores/clusters/000.npz") as file:
         scores = np.sort(6 * file["scores"][:, 5, 7])
-    np.testing.assert_allclose(scores, [0] * (3 - count) + kept, atol=1e-6)
+    np.testing.assert_allclose(scores, [0] * (3 - count) + largest, atol=1e-6)
     assert manifest(scene / "scores/clusters")["settings"]["top_k"] == count
     with pytest.raises(ConfigError, match=r"other settings \(top_k: "):
         predict(scene, Streaming(), indices=[0], scores=True, score_type="float32")
@@ -339,8 +339,8 @@ def test_observers_see_every_frame(scene):
         def sequence_started(self, name, frames):
             self.said.append((name, frames))
 
-        def frame_done(self, shown, seconds):
-            self.said.append((shown.name, math.isnan(seconds)))
+        def frame_done(self, image, seconds):
+            self.said.append((image.name, math.isnan(seconds)))
 
     predict(scene, Shifting(), indices=[0, 2])
     counter = Counter()

@@ -38,8 +38,8 @@ def test_items_come_in_the_order_of_the_indices(threads) -> None:
 
     indices = [7, 0, 5, 3, 3, 9, 1, 2]
     fetched = list(prefetch(read, indices, threads=threads))
-    assert [each.item for each in fetched] == [index * index for index in indices]
-    assert all(each.seconds >= 0 and each.waited >= 0 for each in fetched)
+    assert [item.item for item in fetched] == [index * index for index in indices]
+    assert all(item.seconds >= 0 and item.waited >= 0 for item in fetched)
     assert list(prefetch(read, [], threads=threads)) == []
 
 
@@ -54,15 +54,15 @@ def test_an_error_is_raised_in_its_place(threads, bad) -> None:
             raise DataError(f"depth/{index}.png: damaged")
         return index
 
-    seen = []
+    items = []
 
     def consume() -> None:
         for fetched in prefetch(read, range(10), threads=threads):
-            seen.append(fetched.item)
+            items.append(fetched.item)
 
     with pytest.raises(DataError, match=f"^depth/{bad}.png: damaged$"):
         consume()
-    assert seen == list(range(bad))
+    assert items == list(range(bad))
 
 
 @pytest.mark.parametrize(("threads", "size", "most"), [(1, 0, 4), (3, 0, 6), (3, 60, 3), (3, 1000, 3), (3, 30, 5)])
@@ -121,7 +121,7 @@ def test_workers_run_while_the_caller_works() -> None:
     assert time.perf_counter() - started < 0.36
 
 
-def test_jobs_beside_the_caller_are_done_in_order_and_their_errors_are_raised_where_they_are_waited_for() -> None:
+def test_jobs_are_done_in_order_and_errors_raised_where_they_are_waited_for() -> None:
     done, jobs = list[int](), Background("beside", 2)
     for number in range(10):
         jobs.submit(lambda number=number: done.append(number))  # type: ignore[misc]

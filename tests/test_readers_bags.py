@@ -108,8 +108,8 @@ def test_messages_that_were_recorded_late_are_sorted_by_their_header(container, 
 
 def test_bag_time_replaces_headers_without_stamps(tmp_path, frames):
     def unstamped(ros, topic, time, message):
-        for each in getattr(message, "transforms", [message]):
-            each.header.stamp = ros.stamp(0)
+        for transform in getattr(message, "transforms", [message]):
+            transform.header.stamp = ros.stamp(0)
         return [(topic, time, message)]
 
     path = write(tmp_path, frames, unstamped)
@@ -163,10 +163,10 @@ def test_the_world_is_the_map_or_the_frame_that_is_named(tmp_path, frames):
     np.testing.assert_allclose(bags.ODOM_IN_MAP @ in_odom, frames[2].T_wc, atol=1e-12)
     with pytest.raises(DataError, match=rf"world_frame: 'earth' is not above '{OPTICAL}' in /tf.*camera_link, base"):
         opened(path, world_frame="earth")
-    known = "base_link, camera_color_optical_frame, camera_link, odom"
+    names = "base_link, camera_color_optical_frame, camera_link, odom"
     hint = rf"camera_frame: one of {OPTICAL}, or record /tf_static"
     with pytest.raises(
-        DataError, match=rf"'lidar', the frame of its images, is not in /tf, which has {known} \({hint}"
+        DataError, match=rf"'lidar', the frame of its images, is not in /tf, which has {names} \({hint}"
     ):
         opened(path, camera_frame="lidar")
 
@@ -241,7 +241,8 @@ def test_odometry_of_the_base_leads_to_the_camera_by_static_transforms(tmp_path,
     ds.assert_same_voxels(labelled(opened(path), frames), frames)
     bare = write(
         tmp_path, frames,
-        lambda *record: (each for each in posed_by(odometry, frames)(*record) if each[0] != "/tf_static"), name="bare",
+        lambda *record: (stored for stored in posed_by(odometry, frames)(*record) if stored[0] != "/tf_static"),
+        name="bare",
     )  # fmt: skip
     with pytest.raises(
         DataError, match=f"are of the frame 'base_link', from which no transform.*pose_frame: {OPTICAL}"
@@ -372,8 +373,8 @@ def test_compressed_depth_in_metres_is_inverse(tmp_path, frames):
 
     depth = opened(write(tmp_path, frames, inverse)).depth(0)
     np.testing.assert_array_equal(depth == 0, frames[0].depth == 0)
-    seen = depth > 0
-    assert np.abs(1 / depth[seen] - 1 / frames[0].depth[seen]).max() <= 0.51 / a
+    measured = depth > 0
+    assert np.abs(1 / depth[measured] - 1 / frames[0].depth[measured]).max() <= 0.51 / a
 
 
 # --- cameras
@@ -430,7 +431,7 @@ def test_rectified_images_take_the_projection_and_no_lens(tmp_path, frames):
     np.testing.assert_array_equal(scene.depth(0), frames[0].depth)
 
 
-def test_depth_that_is_not_registered_is_looked_up_with_the_camera_of_colour_and_said(tmp_path, frames, caplog):
+def test_unregistered_depth_is_looked_up_with_the_camera_of_colour_and_said(tmp_path, frames, caplog):
     """Colour sees half the field of view in as many pixels."""
     wide = frames[0].intrinsics
     tele = dataclasses.replace(wide, fx=2 * wide.fx, fy=2 * wide.fy)

@@ -59,8 +59,8 @@ def as_rows(path: Path) -> None:
 
 
 def as_named_rows(path: Path) -> None:
-    named = {"frame": path.stem, "transform": np.loadtxt(path)[:3].tolist()}
-    path.with_suffix(".JSON").write_text(json.dumps(named))
+    row = {"frame": path.stem, "transform": np.loadtxt(path)[:3].tolist()}
+    path.with_suffix(".JSON").write_text(json.dumps(row))
     path.unlink()
 
 

@@ -309,10 +309,10 @@ def test_the_shipped_file_says_the_defaults():
     said = read_yaml("configs/datasets/uavid3d.yaml")["dataset"]["options"]
     defaults = Uavid3dOptions(root=".").model_dump(mode="json")
     assert said == {key: defaults[key] for key in said}
-    own = set(Uavid3dOptions.model_fields) - {
+    options = set(Uavid3dOptions.model_fields) - {
         "root", "incomplete", "scores_layout", "classes", "taxonomies", "void_ids",
     }  # fmt: skip
-    assert set(said) == own - {"frames_per_second"}
+    assert set(said) == options - {"frames_per_second"}
 
 
 def test_a_run_starts_from_the_shipped_file(tmp_path):

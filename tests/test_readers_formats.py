@@ -280,31 +280,31 @@ def test_the_sample_commands_set_what_there_is(name, command):
 
 def test_the_options_in_tables_are_those_of_every_reader():
     table = TEXT.split("## Options that every dataset below has")[1].split("## Frames")[0]
-    named = set(
+    options = set(
         re.findall(r"`(\w+)`", "".join(line.split("|")[1] for line in table.splitlines() if line.startswith("|")))
     )
-    assert len(named) > 8
+    assert len(options) > 8
     models = {name: options_model(name) for name in SECTIONS}
     of_images = {name: model for name, model in models.items() if issubclass(model, FileOptions)}
     assert len(of_images) > 15
     for name, model in of_images.items():
-        assert named <= set(model.model_fields), name
+        assert options <= set(model.model_fields), name
 
 
 def test_the_options_of_scans_are_those_of_every_reader_of_them():
     table = TEXT.split("## Scans")[1].split("\n## ")[0]
-    named = re.findall(r"^\| `(\w+)`(?:, `(\w+)`)*", table, re.M)
-    assert len(named) > 5
+    rows = re.findall(r"^\| `(\w+)`(?:, `(\w+)`)*", table, re.M)
+    assert len(rows) > 5
     models = {name: options_model(name) for name in SECTIONS}
     of_scans = {name: model for name, model in models.items() if issubclass(model, ScanOptions)}
     assert set(of_scans) >= {"semantickitti"}
     for name, model in of_scans.items():
-        assert {word for words in named for word in words if word} <= set(model.model_fields), name
+        assert {word for words in rows for word in words if word} <= set(model.model_fields), name
 
 
 def test_the_frames_that_are_shown_are_settings():
     table = TEXT.split("## Frames")[1].split("## UAVid")[0]
-    shown = re.findall(r"\| `(\{.*?\})` \|", table)
-    assert len(shown) == 4
-    for text in shown:
+    texts = re.findall(r"\| `(\{.*?\})` \|", table)
+    assert len(texts) == 4
+    for text in texts:
         Config.build({"frames": parse_yaml(text, "docs/datasets.md")})

@@ -68,8 +68,8 @@ def test_a_pixel_with_depth_is_a_point_of_the_world(drive, camera):
         v, u = np.nonzero(frame.depth)
         assert len(v) > 300
         z = frame.depth[v, u].astype(float)
-        own = np.column_stack([(u - CX) / FX * z, (v - CY) / FX * z, z, np.ones(len(z))])
-        far, _ = cKDTree(points).query((own @ frame.T_wc.T)[:, :3])
+        in_camera = np.column_stack([(u - CX) / FX * z, (v - CY) / FX * z, z, np.ones(len(z))])
+        far, _ = cKDTree(points).query((in_camera @ frame.T_wc.T)[:, :3])
         assert (far <= z / FX * np.sqrt(0.5) + 1e-4).all()  # a point is up to half a pixel beside its middle
         centre = T @ imu_in_lidar @ CAMERAS[camera][:, 3]
         np.testing.assert_allclose(frame.T_wc[:3, 3], centre[:3], atol=1e-9)

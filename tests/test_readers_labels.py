@@ -112,8 +112,8 @@ def test_labels_and_scores_side_by_side(scene):
     assert soft.files["scores"].endswith(f"room/scores/net/{names[2]}.npz")
     np.testing.assert_array_equal(found.frame(2, "gt").labels, hard.labels)
     fails(ConfigError, "model 'nets' is not there; did you mean 'net'", found.frame, 0, "nets")
-    named = ds.opened(FORM, root, scores={"soft": "scores/net/{name}"}, labels={"hard": "labels/net/{name}"})
-    assert named.models == ("hard", "soft")
+    by_folder = ds.opened(FORM, root, scores={"soft": "scores/net/{name}"}, labels={"hard": "labels/net/{name}"})
+    assert by_folder.models == ("hard", "soft")
 
 
 def test_two_sources_of_one_name_are_refused(scene):
@@ -218,11 +218,11 @@ def test_labels_of_the_colour_camera_are_looked_up_with_its_intrinsics(tmp_path)
         for name in names:
             ds.save(tmp_path / f"labels/net/{name}.png", classes(K, shape))
         found = ds.opened(SCANNET, tmp_path, color_size=(96, 60)).frame(0, "net")
-        seen = found.labels != 255
+        labelled = found.labels != 255
         expected = classes(frames[0].intrinsics, (ds.H, ds.W))
-        assert 0.5 < seen.mean() < 1  # the colour camera sees less
-        assert (found.labels == expected)[seen].mean() > 0.9  # but for the borders of classes
-        assert not found.valid[~seen].any()
+        assert 0.5 < labelled.mean() < 1  # the colour camera sees less
+        assert (found.labels == expected)[labelled].mean() > 0.9  # but for the borders of classes
+        assert not found.valid[~labelled].any()
     plain = ds.opened(SCANNET, tmp_path, label_camera="depth")
     fails(DataError, "labels/net/0.png: labels are 192x120 but depth is 48x32, another view", plain.frame, 0, "net")
 

@@ -340,19 +340,19 @@ def test_topocentric_poses_are_brought_into_the_projection_by_the_matrix(tmp_pat
     assert float(found[1]) < 1e-3
 
 
-@pytest.mark.parametrize("kept", [True, False])
-def test_the_matrix_is_not_applied_to_poses_that_are_in_the_projection(tmp_path, kept, caplog) -> None:
+@pytest.mark.parametrize("with_matrix", [True, False])
+def test_the_matrix_is_not_applied_to_poses_that_are_in_the_projection(tmp_path, with_matrix, caplog) -> None:
     folder = write_project(tmp_path / "field")
     write_georeference(folder)
     write_matrix(folder, made_matrix())  # of an earlier run
-    if kept:
+    if with_matrix:
         shutil.copy(
             folder / "opensfm/undistorted/reconstruction.json", folder / "opensfm/reconstruction.topocentric.json"
         )
     scene = opened(folder)
     assert scene.georeference == Georeference(wkt(down.UTM, "x"), down.OFFSET)
     assert "less the offset of odm_georeferencing/coords.txt; cameras 0.00 m" in scene.placed
-    assert ("is a file left from another version of ODM?" in caplog.text) is not kept
+    assert ("is a file left from another version of ODM?" in caplog.text) is not with_matrix
 
 
 def test_without_the_matrix_the_reference_of_opensfm_gives_it(tmp_path, caplog) -> None:
@@ -778,8 +778,8 @@ def test_the_project_of_a_real_flight_is_its_posed_folder(brighton, project) -> 
         assert np.mean((ours.depth > 0) != (theirs.depth > 0)) < 3e-4  # rays along the surface's own border
 
 
-@pytest.mark.parametrize("known", ["matrix", "poses in the projection"])
-def test_the_real_flight_in_a_turned_frame_lies_where_it_lay(brighton, project, tmp_path, known, caplog) -> None:
+@pytest.mark.parametrize("told_by", ["matrix", "poses in the projection"])
+def test_the_real_flight_in_a_turned_frame_lies_where_it_lay(brighton, project, tmp_path, told_by, caplog) -> None:
     """Poses and mesh turned by 0.73 degrees and shifted by 24 m: what is exported is the same to a millimetre."""
     folder = tmp_path / "flight"
     shutil.copytree(brighton / "odm", folder)
@@ -787,15 +787,15 @@ def test_the_real_flight_in_a_turned_frame_lies_where_it_lay(brighton, project, 
         path.chmod(0o755)
     T = made_matrix()
     write_matrix(folder, T)
-    if known == "matrix":
+    if told_by == "matrix":
         bring_into(folder, T)
     images = {"casts": False, "images": brighton / "color"}
     there = project
     here = open_dataset("odm", {"root": folder} | images).scene("flight")
-    assert here.georeference.turned is (known == "matrix")
-    assert ("left from another version" in caplog.text) is (known != "matrix")
+    assert here.georeference.turned is (told_by == "matrix")
+    assert ("left from another version" in caplog.text) is (told_by != "matrix")
     np.testing.assert_allclose(where_cameras_lie(here), where_cameras_lie(there), atol=1e-4)
-    if known == "matrix":
+    if told_by == "matrix":
         ours, theirs = here.geometry(9), there.geometry(9)
         both = (ours.depth > 0) & (theirs.depth > 0)
         assert np.mean((ours.depth > 0) != (theirs.depth > 0)) < 3e-4

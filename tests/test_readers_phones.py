@@ -76,9 +76,9 @@ def test_confidence_that_is_lost_or_of_another_size_is_named(written, name) -> N
 
 
 @pytest.mark.parametrize("name", ["stray_scanner", "record3d"])
-@pytest.mark.parametrize("own", [True, False])
-def test_intrinsics_of_a_frame_go_before_those_of_the_recording(written, name, own) -> None:
-    form, folder, frames = written(name, own_intrinsics=own)
+@pytest.mark.parametrize("by_frame", [True, False])
+def test_intrinsics_of_a_frame_go_before_those_of_the_recording(written, name, by_frame) -> None:
+    form, folder, frames = written(name, own_intrinsics=by_frame)
     scene = ds.opened(form, folder)
     for k in range(3):
         found = scene.geometry(k).intrinsics

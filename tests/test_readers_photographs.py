@@ -139,11 +139,11 @@ def test_geocentric_cameras_see_a_place_of_the_projection_where_they_saw_it(tmp_
         assert frame.name == name.removesuffix(".JPG")
         for at in ([0.0, 0.0, 12.0], [3.0, -2.0, 11.0]):
             point = np.array(onto.transform(*(T[:3, :3] @ at + T[:3, 3]))) - scene.georeference.offset
-            seen = frame.pose[:3, :3].T @ (point - frame.pose[:3, 3])
+            in_camera = frame.pose[:3, :3].T @ (point - frame.pose[:3, 3])
             assert (
-                np.abs(seen[:2] / seen[2] - np.array(at[:2]) / at[2]).max() < 6e-4
+                np.abs(in_camera[:2] / in_camera[2] - np.array(at[:2]) / at[2]).max() < 6e-4
             )  # the projection scales lengths by 0.9997, heights not
-            assert seen[2] == pytest.approx(at[2], rel=2e-3)
+            assert in_camera[2] == pytest.approx(at[2], rel=2e-3)
         assert Rotation.from_matrix(frame.pose[:3, :3]).as_matrix() == pytest.approx(frame.pose[:3, :3], abs=1e-8)
 
 
@@ -320,8 +320,8 @@ def test_a_real_flight_has_the_voxels_that_its_odm_project_has(brighton, tmp_pat
     found, expected = create("numba", voxel_size=1.0, num_classes=2), create("numba", voxel_size=1.0, num_classes=2)
     for k in (0, 3, 5):
         assert scene.image_name(k) == project.image_name(k)
-        for own, backend in ((scene, found), (project, expected)):
-            backend.integrate(own.geometry(k).every(3))
+        for source, backend in ((scene, found), (project, expected)):
+            backend.integrate(source.geometry(k).every(3))
     ours, theirs = found.table(), expected.table()
     assert len(ours) == len(theirs) > 1000
     np.testing.assert_array_equal(ours.index, theirs.index)

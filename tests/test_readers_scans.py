@@ -366,7 +366,7 @@ def test_nuscenes_poses_are_of_the_lidar_in_the_world(nuscenes):
     assert (scene.name, scene.up.tolist(), len(scene.frame_name(0))) == ("scene-0061", [0, 0, 1], 32)
 
 
-def test_nuscenes_true_ids_are_those_of_its_categories_and_predicted_ones_the_challenges(nuscenes):
+def test_nuscenes_truth_has_ids_of_categories_and_predictions_those_of_the_challenge(nuscenes):
     name = read_nuscenes(nuscenes).frame_name(0)
     labels = nuscenes / f"predictions/net/{name}_lidarseg.bin"
     labels.write_bytes(bytes([5, 255, 0, 16] * (sw.POINTS // 4)))

@@ -77,8 +77,8 @@ def test_a_pixel_with_depth_is_a_point_of_the_world(sequence, camera):
         v, u = np.nonzero(frame.depth)
         assert len(v) > 500
         z = frame.depth[v, u].astype(float)
-        own = np.column_stack([(u - CX) / FX * z, (v - CY) / FX * z, z, np.ones(len(z))])
-        found = (own @ frame.T_wc.T)[:, :3]
+        in_camera = np.column_stack([(u - CX) / FX * z, (v - CY) / FX * z, z, np.ones(len(z))])
+        found = (in_camera @ frame.T_wc.T)[:, :3]
         far, _ = cKDTree(points).query(found)
         assert (far <= z / FX * np.sqrt(0.5) + 1e-4).all()  # a point is up to half a pixel beside its middle
         centre = np.linalg.inv(TO_CAMERA) @ [-BASELINE[camera], 0, 0, 1]
@@ -89,9 +89,9 @@ def test_a_pixel_with_depth_is_a_point_of_the_world(sequence, camera):
 def test_a_point_behind_a_nearer_surface_is_hidden_also_beside_its_pixels(sequence):
     points, ids = world()
     T_cl, K = TO_CAMERA, opened(sequence).intrinsics(0, (H, W))
-    seen = seen_points(points, T_cl, K, (H, W))
-    depth = seen.depth_image()
-    v, u = seen.v[ids[seen.points] == POST], seen.u[ids[seen.points] == POST]
+    visible = seen_points(points, T_cl, K, (H, W))
+    depth = visible.depth_image()
+    v, u = visible.v[ids[visible.points] == POST], visible.u[ids[visible.points] == POST]
     assert len(v) > 20
     around = depth[v.min() : v.max() + 1, u.min() - 2 : u.max() + 3]
     assert around[around > 0].max() < 5
@@ -99,12 +99,12 @@ def test_a_point_behind_a_nearer_surface_is_hidden_also_beside_its_pixels(sequen
     assert (wall_alone[v.min() : v.max() + 1, u.min() - 2] > 11).any()  # which else is seen there
 
 
-def test_of_two_points_on_a_pixel_the_nearer_is_seen_and_none_behind_the_camera_or_without_a_place():
+def test_of_two_points_on_a_pixel_the_nearer_is_seen_and_none_behind_the_camera():
     K = Intrinsics(FX, FX, CX, CY)
     points = np.array([[9, 0, 0], [8, 0, 0], [-8, 0, 0], [np.nan, 0, 0], [np.inf, 1, 1], [0.2, 0, 0]], np.float32)
     axes = np.array([[0, -1, 0, 0], [0, 0, -1, 0], [1, 0, 0, 0], [0, 0, 0, 1.0]])
-    seen = seen_points(points, axes, K, (H, W))
-    assert (seen.points.tolist(), seen.depth.tolist()) == ([1], [8.0])
+    visible = seen_points(points, axes, K, (H, W))
+    assert (visible.points.tolist(), visible.depth.tolist()) == ([1], [8.0])
     assert seen_points(points[2:], axes, K, (H, W)).depth_image().max() == 0
 
 
@@ -113,15 +113,15 @@ def test_the_truth_is_the_class_of_each_point_and_movers_are_masked(sequence):
     space = scene.label_space("gt")
     assert space.name == "semantickitti"
     frame = scene.frame(1, "gt")
-    known = frame.depth > 0
-    assert set(np.unique(frame.labels[known])) == {10, 50, 80}  # a moving car is a car
-    assert (frame.labels[~known] == 65535).all()
-    np.testing.assert_array_equal(frame.labels[known] == 10, frame.mask[known])
+    measured = frame.depth > 0
+    assert set(np.unique(frame.labels[measured])) == {10, 50, 80}  # a moving car is a car
+    assert (frame.labels[~measured] == 65535).all()
+    np.testing.assert_array_equal(frame.labels[measured] == 10, frame.mask[measured])
     assert frame.mask.sum() > 20
     assert scene.frame(1, "net").mask.sum() == frame.mask.sum()  # of every model
-    kept = opened(sequence, moving="keep")
-    assert kept.frame(1, "gt").mask is None
-    assert (kept.frame(1, "gt").labels == frame.labels).all()
+    with_movers = opened(sequence, moving="keep")
+    assert with_movers.frame(1, "gt").mask is None
+    assert (with_movers.frame(1, "gt").labels == frame.labels).all()
 
 
 def test_masks_of_ones_own_take_the_place_of_the_movers(sequence):

@@ -373,7 +373,7 @@ def test_a_pixel_of_airsim_lies_where_vehicle_and_mount_say(tmp_path):
     assert scene.timestamps.tolist() == [1.0, 1.05, 1.1, 1.15]
 
 
-def test_depth_of_airsim_begins_with_the_top_row_and_is_along_the_ray_where_its_type_says(tmp_path):
+def test_depth_of_airsim_begins_with_the_top_row_and_is_along_the_ray_by_its_type(tmp_path):
     write_airsim(tmp_path / "ray", source(), kind=2)
     write_airsim(tmp_path / "planar", source(), kind=1)
     first = source()[0]
@@ -397,13 +397,13 @@ def test_segmentation_of_airsim_is_the_truth_where_its_colours_have_classes(tmp_
         )
         lines[1 + k] += f";{other}.png"
     write_lines(tmp_path / "airsim_rec.txt", lines)
-    own = {
+    colors = {
         "classes": [
             {"name": "ground", "id": 1, "color": [153, 108, 6]},
             {"name": "wall", "id": 2, "color": [112, 105, 191]},
         ]
     }
-    (tmp_path / "colours.yaml").write_text(json.dumps(own))
+    (tmp_path / "colours.yaml").write_text(json.dumps(colors))
     assert not opened(AIRSIM, tmp_path).ground_truth
     scene = opened(AIRSIM, tmp_path, taxonomies={"gt": str(tmp_path / "colours.yaml")})
     assert scene.models == ("net",)  # by the names of the colour images

@@ -89,8 +89,8 @@ def test_each_is_the_others_nearest():
 def test_association_is_one_to_one_and_symmetric(a, b, limit):
     ours, theirs = np.array(a, float), np.array(b, float)
     found = mutual_nearest(ours, theirs, limit)
-    kept = found[found >= 0]
-    assert len(set(kept.tolist())) == len(kept)
+    matched = found[found >= 0]
+    assert len(set(matched.tolist())) == len(matched)
     for k in range(len(ours)):
         distances = np.abs(theirs - ours[k])
         if found[k] >= 0:

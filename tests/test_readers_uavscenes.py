@@ -29,13 +29,13 @@ def write_flight(root: Path, name="AMtown01", step=5, *, lens=LENS, nested=True)
 
     flight = inner(f"interval{step}_CAM_LIDAR") / f"interval{step}_{name}"
     cameras = []
-    for k, own in enumerate(NAMES):
+    for k, stamp in enumerate(NAMES):
         frame = down.frame(k)
-        save(flight / f"interval{step}_CAM/{own}.jpg", frame.color)
-        truth = inner(f"interval{step}_CAM_label") / flight.name / f"interval{step}_CAM_label_id/{own}.png"
+        save(flight / f"interval{step}_CAM/{stamp}.jpg", frame.color)
+        truth = inner(f"interval{step}_CAM_label") / flight.name / f"interval{step}_CAM_label_id/{stamp}.png"
         save(truth, np.array([1, 3, 24], np.uint8)[frame.labels])
-        save(flight / f"labels/net/{own}.png", np.array([1, 3, 24], np.uint8)[frame.labels])
-        cameras += [ds.uavscenes_camera(f"{own}.jpg", frame, lens), ds.uavscenes_camera(f"{own}9.jpg", frame, lens)]
+        save(flight / f"labels/net/{stamp}.png", np.array([1, 3, 24], np.uint8)[frame.labels])
+        cameras += [ds.uavscenes_camera(f"{stamp}.jpg", frame, lens), ds.uavscenes_camera(f"{stamp}9.jpg", frame, lens)]
     (flight / "sampleinfos_interpolated.json").write_text(json.dumps(cameras))
     place = inner("terra_3dmap_pointcloud_mesh") / re.sub(r"\d+$", "", name)
     place.mkdir(parents=True, exist_ok=True)

@@ -250,9 +250,9 @@ def test_every_condition_has_its_networks_commands_and_digests(rows, stated) -> 
 
 def test_the_rows_of_the_page_are_those_of_the_results(rows) -> None:
     head, dashes, *conditions = real_networks.condition_table(rows)
-    (shown,) = re.findall(rf"{re.escape(head)}\n{re.escape(dashes)}\n((?:\|.*\n)+)", PAGE.read_text(encoding="utf-8"))
-    assert len(shown.splitlines()) >= 4
-    assert set(shown.splitlines()) <= set(conditions)
+    (printed,) = re.findall(rf"{re.escape(head)}\n{re.escape(dashes)}\n((?:\|.*\n)+)", PAGE.read_text(encoding="utf-8"))
+    assert len(printed.splitlines()) >= 4
+    assert set(printed.splitlines()) <= set(conditions)
 
 
 @pytest.mark.parametrize("document", [PAGE, README])
@@ -263,27 +263,27 @@ def test_correlations_in_the_text_are_those_of_the_main_condition(document, rows
     pattern = rf"(?i)(alpha|VSS|agreement of two frames|flicker) {SIGNED}(?: \({SIGNED} to {SIGNED}\))?"
     keys = {"alpha": "alpha", "vss": "vss", "agreement of two frames": "agree", "flicker": "flicker"}
     found = {
-        each["measure"]: each
-        for each in stated["correlations"]
-        if (each["condition"], each["of"], each["against"]) == (real_networks.MAIN, "all", "published_miou")
+        row["measure"]: row
+        for row in stated["correlations"]
+        if (row["condition"], row["of"], row["against"]) == (real_networks.MAIN, "all", "published_miou")
     }
     said = re.findall(pattern, text)
     assert {"alpha", "vss"} <= {title.lower() for title, *_ in said}
     for title, *numbers in said:
-        each = found[keys[title.lower()]]
-        expected = [real_networks.signed(each[key]) for key in ("rho", "low", "high")]
+        row = found[keys[title.lower()]]
+        expected = [real_networks.signed(row[key]) for key in ("rho", "low", "high")]
         assert numbers in (expected, [expected[0], "", ""])
 
 
 def correlation(stated, measure, against, of):
-    (each,) = [
-        each
-        for each in stated["correlations"]
-        if (each["condition"], each["measure"]) == (real_networks.MAIN, measure)
-        and (each["against"], each["of"]) == (against, of)
+    (row,) = [
+        row
+        for row in stated["correlations"]
+        if (row["condition"], row["measure"]) == (real_networks.MAIN, measure)
+        and (row["against"], row["of"]) == (against, of)
     ]
-    rho, low, high = (real_networks.signed(each[key]) for key in ("rho", "low", "high"))
-    return each["networks"], rho, f"({low} to {high})"
+    rho, low, high = (real_networks.signed(row[key]) for key in ("rho", "low", "high"))
+    return row["networks"], rho, f"({low} to {high})"
 
 
 def test_correlations_without_the_uninformative_networks_are_those_of_the_results(stated) -> None:
@@ -295,10 +295,10 @@ def test_correlations_without_the_uninformative_networks_are_those_of_the_result
 
 def test_levels_and_alphas_in_the_text_are_those_of_the_rows(rows) -> None:
     row = {(row.condition, row.network): row for row in rows}
-    main = {network: each for (condition, network), each in row.items() if condition == real_networks.MAIN}
+    main = {network: of_network for (condition, network), of_network in row.items() if condition == real_networks.MAIN}
     text = re.sub(r"\s+", " ", PAGE.read_text(encoding="utf-8"))
     few, many = row["livingroom-labels-20-0.02", "espnetv2-2.0"], main["espnetv2-2.0"]
-    said = [f"{digits(each)} ({each.verdict}) in {each.frames}" for each in (few, many)]
+    said = [f"{digits(of_network)} ({of_network.verdict}) in {of_network.frames}" for of_network in (few, many)]
     assert f"espnetv2-2.0 has {said[0]} frames and {said[1]}," in text
     assert f"dicenet-0.75, with {digits(main['dicenet-0.75'])}, calls" in text
     assert "The verdict on these three is 'uninformative'" in text
@@ -315,7 +315,7 @@ def test_both_voxel_sizes_rank_the_networks_alike(rows) -> None:
             [row for row in rows if row.condition == f"livingroom-labels-{stride}-{v}"] for v in (0.02, 0.04)
         )
         for measure in real_networks.MEASURES:
-            of = [[getattr(row, measure) for row in each if not math.isnan(row.alpha)] for each in (small, large)]
+            of = [[getattr(row, measure) for row in of_size if not math.isnan(row.alpha)] for of_size in (small, large)]
             assert real_networks.spearman(*of)["rho"] == 1
 
 
@@ -333,9 +333,9 @@ def test_the_text_says_what_the_other_sequences_show(rows) -> None:
 
 def test_the_parts_of_disagreement_of_scores_are_those_of_the_results(stated) -> None:
     rho = {
-        each["measure"]: real_networks.signed(each["rho"])
-        for each in stated["correlations"]
-        if each["condition"].startswith("livingroom-scores") and each["measure"] in real_networks.PARTS
+        row["measure"]: real_networks.signed(row["rho"])
+        for row in stated["correlations"]
+        if row["condition"].startswith("livingroom-scores") and row["measure"] in real_networks.PARTS
     }
     text = re.sub(r"\s+", " ", PAGE.read_text(encoding="utf-8"))
     assert f"that part of disagreement has {rho['within']}; the part between frames has {rho['between']}" in text

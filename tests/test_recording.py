@@ -104,26 +104,26 @@ def grid(rows: dict[str, list[dict[str, Any]]], path: str) -> dict[str, Any]:
     """What a map shows at last, voxels sorted: indices, and each of `color_modes` by the name of its view."""
     chunks = []
     for at in sorted(at for at in rows if at.startswith(f"{path}/")):
-        shown: dict[str, Any] = {}
+        latest: dict[str, Any] = {}
         for row in sorted(rows[at], key=lambda row: (row["frame"], row["rerun.controls.RowId"])):
             if "Clear:is_recursive" in row:
-                shown = {}
-            shown |= {name: value for name, value in row.items() if value is not None}  # each component is the latest
-        if "VoxelGridMap:voxel_indices" in shown:
-            chunks.append(shown)
-    index = [tuple(cell) for shown in chunks for cell in shown["VoxelGridMap:voxel_indices"]]
+                latest = {}
+            latest |= {name: value for name, value in row.items() if value is not None}
+        if "VoxelGridMap:voxel_indices" in latest:
+            chunks.append(latest)
+    index = [tuple(cell) for chunk in chunks for cell in chunk["VoxelGridMap:voxel_indices"]]
     order = sorted(range(len(index)), key=index.__getitem__)
     assert len(set(index)) == len(index)
     components = {name: f"{name}:values" for name, mode in color_modes().items() if mode.range}
     components |= {"class": "VoxelGridMap:colors", "category": "category:colors"}
     found: dict[str, Any] = {"voxel_indices": [index[i] for i in order]}
     for name, component in components.items():
-        whole = [value for shown in chunks for value in shown[component]]
+        whole = [value for chunk in chunks for value in chunk[component]]
         assert len(whole) == len(index)
         found[name] = [whole[i] for i in order]
     return found | {
         "voxel_size": chunks[0]["VoxelGridMap:voxel_size"],
-        "frame": max(shown["frame"] for shown in chunks),
+        "frame": max(chunk["frame"] for chunk in chunks),
     }
 
 
@@ -202,9 +202,9 @@ def test_a_map_about_which_its_frames_say_nothing_has_no_categories(tmp_path, mo
     monkeypatch.setattr(observer, "not_assessed", lambda run: told if run.unit.model == "b" else "")
     file, root = tmp_path / "run.rrd", tiny_scene.write(tmp_path / "data" / "wall")
     semstab.run(config_of(root), out=tmp_path / "run", observers=[Recording(file)], report=False)
-    shown = {model: {*grid(read(file), f"/wall/map/{model}/numpy")["category"]} for model in "ab"}
-    assert shown["b"] == {*voxel_maps.packed([metrics.NOT_ASSESSED]).tolist()}
-    assert shown["a"] <= {*voxel_maps.packed(metrics.CATEGORY_COLORS).tolist()}
+    colors = {model: {*grid(read(file), f"/wall/map/{model}/numpy")["category"]} for model in "ab"}
+    assert colors["b"] == {*voxel_maps.packed([metrics.NOT_ASSESSED]).tolist()}
+    assert colors["a"] <= {*voxel_maps.packed(metrics.CATEGORY_COLORS).tolist()}
     titles = [row.get("ViewBlueprint:display_name") for rows in read_blueprints(file) for row in rows]
     assert ["b: not assessed (uninformative)"] in titles
     assert ["a: not assessed (uninformative)"] not in titles
@@ -239,14 +239,16 @@ def test_the_blueprint_shows_every_series_and_every_model(run) -> None:
     for views in read_blueprints(run / "recording.rrd"):
         names = {row["ViewBlueprint:display_name"][0] for row in views if "ViewBlueprint:display_name" in row}
         others = {"Classes", "Notes", "Depth", "Top contributing frames", "Verdict"}
-        assert names >= {*(own.plot for own in SERIES.values()), *maps, *pictures, *others}
+        assert names >= {*(one_series.plot for one_series in SERIES.values()), *maps, *pictures, *others}
 
 
 def test_the_viewer_opens_on_the_stability_categories(run) -> None:
     for rows in read_blueprints(run / "recording.rrd"):
-        named = {row["rerun.entity"]: row for row in rows if "ContainerBlueprint:display_name" in row}
+        containers = {row["rerun.entity"]: row for row in rows if "ContainerBlueprint:display_name" in row}
         (category,) = (
-            at for at, row in named.items() if row["ContainerBlueprint:display_name"] == [color_modes()["category"].tab]
+            at
+            for at, row in containers.items()
+            if row["ContainerBlueprint:display_name"] == [color_modes()["category"].tab]
         )
         opened = [row["ContainerBlueprint:active_tab"] for row in rows if row.get("ContainerBlueprint:active_tab")]
         assert [category.removeprefix("/")] in [[at.removeprefix("/") for at in tab] for tab in opened]
@@ -294,13 +296,15 @@ def test_each_view_of_a_map_shows_its_measure(run) -> None:
     chunks = [at for at in read(run / "recording.rrd") if at.startswith("/wall/map/a/numpy/")]
     assert chunks
     for rows in read_blueprints(run / "recording.rrd"):
-        for name, shown in color_modes().items():
-            (view,) = (r["rerun.entity"] for r in rows if r.get("ViewBlueprint:display_name") == [f"a: {shown.title}"])
+        for name, mode in color_modes().items():
+            (view,) = (r["rerun.entity"] for r in rows if r.get("ViewBlueprint:display_name") == [f"a: {mode.title}"])
             for chunk in chunks:
                 at = f"{view}/ViewContents/overrides{chunk}/visualizers/"
                 instructions = [row for row in rows if row["rerun.entity"].startswith(at)]
                 mappings = [
-                    each for row in instructions for each in row.get("VisualizerInstruction:component_map") or []
+                    component
+                    for row in instructions
+                    for component in row.get("VisualizerInstruction:component_map") or []
                 ]
                 sources = {mapping["target"]: mapping["source_component"] for mapping in mappings}
                 if name == "class":
@@ -310,7 +314,7 @@ def test_each_view_of_a_map_shows_its_measure(run) -> None:
                 else:
                     assert sources == {"VoxelGridMap:values": f"{name}:values", "VoxelGridMap:colors": None}
                     (defaults,) = (row for row in rows if row["rerun.entity"] == f"{view}/defaults")
-                    np.testing.assert_allclose(defaults["VoxelGridMap:value_range"], [shown.range], rtol=1e-6)
+                    np.testing.assert_allclose(defaults["VoxelGridMap:value_range"], [mode.range], rtol=1e-6)
 
 
 @pytest.mark.parametrize("up", [None, np.array([0.0, -1.0, 0.0]), np.array([0.0, 0.0, 2.0])])
@@ -325,10 +329,10 @@ def test_a_map_and_its_cameras_fill_the_view(up, aspect) -> None:
     toward, upright = direction(bounds)
     right = np.cross(upright, toward)
     right /= np.linalg.norm(right)
-    seen = np.concatenate([points, cameras[:, :3, 3]]) - (target + distance * toward)
-    depth = -seen @ toward  # by perspective projection, as the viewer does it
+    in_view = np.concatenate([points, cameras[:, :3, 3]]) - (target + distance * toward)
+    depth = -in_view @ toward  # by perspective projection, as the viewer does it
     half = math.tan(math.radians(55) / 2)
-    x, y = seen @ right / (aspect * half * depth), seen @ np.cross(toward, right) / (half * depth)
+    x, y = in_view @ right / (aspect * half * depth), in_view @ np.cross(toward, right) / (half * depth)
     inside = (depth > 0) & (np.abs(x) <= 1) & (np.abs(y) <= 1)
     assert inside[len(points) :].all()
     assert inside.mean() > 0.97
@@ -380,8 +384,8 @@ def test_a_resumed_run_says_what_it_does_not_show(tmp_path) -> None:
     semstab.run(config, out=path.parent, observers=[Recording(path)], report=False)
     verify(path)
     rows = read(path)
-    kept, fused_now = sorted(notes(rows))
-    assert kept.startswith("a, numpy: 60 voxels")
+    earlier, fused_now = sorted(notes(rows))
+    assert earlier.startswith("a, numpy: 60 voxels")
     assert fused_now.startswith("b, numpy: 60 voxels")
     for model in "ab":
         assert len(series(rows, f"/wall/series/updated_voxels/{model}/numpy")) == 3
@@ -470,13 +474,13 @@ def record(path: Path | Target, frames: list[Frame], *, finish: bool = True) -> 
     watching.run_started(Plan(config, {}, (unit,), ()), {})
     backend = backends.create("numpy", voxel_size=0.25, num_classes=3)
     watching.group_started(task, config, {UNIT: backend})
-    for each in frames:
-        watching.frame_fused(task, each, {UNIT: FrameRow(backend.integrate(each), each.timestamp, math.nan)})
+    for given in frames:
+        watching.frame_fused(task, given, {UNIT: FrameRow(backend.integrate(given), given.timestamp, math.nan)})
     table = backend.table()
     if finish:
-        kept = record_of(table)
-        watching.unit_finished(unit, kept, table, None)
-        watching.run_finished(Result("run", "numpy", (kept,)))
+        made = record_of(table)
+        watching.unit_finished(unit, made, table, None)
+        watching.run_finished(Result("run", "numpy", (made,)))
     return watching, table
 
 

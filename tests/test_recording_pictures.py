@@ -67,19 +67,19 @@ def compared(tmp_path_factory):
     return config, out
 
 
-@pytest.mark.parametrize(("given", "shown", "lines"), [
+@pytest.mark.parametrize(("given", "drawn", "lines"), [
     (["numba", "numpy"], "numba", ["numba"]),
     (["numba", {"name": "numpy", "check": False}], "numba", ["numba", "numpy"]),
     ([{"name": "numba", "check": False}, "numpy"], "numpy", ["numba", "numpy"]),
     (["open3d-projective", "numba"], "numba", ["open3d-projective", "numba"]),
     ([{"name": "open3d-projective", "check": True}, "numba"], "open3d-projective", ["open3d-projective"]),
 ])  # fmt: skip
-def test_backends_that_need_not_agree_have_lines_of_their_own(tmp_path, given, shown, lines) -> None:
+def test_backends_that_need_not_agree_have_lines_of_their_own(tmp_path, given, drawn, lines) -> None:
     config = config_of(tiny_scene.write(tmp_path / "wall", models=("a",)))
     given_backends = load_config(overrides={"backends": given}).backends
     plan = make_plan(config.model_copy(update={"backends": given_backends, "check": None}))
     (task,) = plan.tasks
-    assert layout.drawn(task) == shown
+    assert layout.drawn(task) == drawn
     views = layout._plot("wall", "map_vss_all", [task])
     assert views.contents == [entity("map_vss_all", UnitName("wall", "a", backend)) for backend in lines]
     watching = Recording(tmp_path / "recording.rrd")
@@ -88,7 +88,7 @@ def test_backends_that_need_not_agree_have_lines_of_their_own(tmp_path, given, s
         UnitName("wall", "a", name): backends.create(name, voxel_size=0.25, num_classes=3) for name in task.backends
     }
     watching.group_started(dataclasses.replace(task, apart=()), config, fused)
-    assert watching._fused is fused[UnitName("wall", "a", shown)]
+    assert watching._fused is fused[UnitName("wall", "a", drawn)]
 
 
 def frames_of(config: Any) -> list[Frame]:
@@ -205,15 +205,15 @@ def test_backends_that_differ_are_laid_over_each_other(compared) -> None:
         semstab.VoxelTable.load(out / "voxels" / f"wall__a__{name}.parquet") for name in ("numba", "open3d-projective")
     )
     a, b = ({tuple(index) for index in table.index.tolist()} for table in (first, second))
-    shown = {
+    drawn = {
         part: {tuple(index) for row in rows[rf"/wall/difference/a/numba\ and\ open3d-projective/{part}"]
                for index in row["VoxelGridMap:voxel_indices"]}
         for part in ("only_first", "only_second", "changed")
     }  # fmt: skip
-    assert shown["only_first"] == a - b
-    assert shown["only_second"] == b - a
+    assert drawn["only_first"] == a - b
+    assert drawn["only_second"] == b - a
     vss = [dict(zip(map(tuple, t.index.tolist()), metrics.vss(t), strict=True)) for t in (first, second)]
-    assert shown["changed"] == {voxel for voxel in a & b if abs(vss[0][voxel] - vss[1][voxel]) > 1e-9}
+    assert drawn["changed"] == {voxel for voxel in a & b if abs(vss[0][voxel] - vss[1][voxel]) > 1e-9}
     (report,) = rows[r"/wall/difference_report/a/numba\ and\ open3d-projective"]
     assert report["TextDocument:text"][0].startswith(
         f"{len(a - b)} voxels in numba only, {len(b - a)} in open3d-projective only; of {len(a & b)} in both"
@@ -394,10 +394,14 @@ def test_the_log_of_flips_is_bounded_and_keeps_those_of_the_worst(monkeypatch) -
     log, table = tracked(alternating(12))
     monkeypatch.setattr(drift, "MAX_MOVES", 12)
     bounded, _ = tracked(alternating(12))
-    kept, every = (np.concatenate(each._moves) for each in (bounded, log))
+    bounded_moves, every = (np.concatenate(log_of_flips._moves) for log_of_flips in (bounded, log))
     worst = drift.packed(table.index[drift.top_voxels(table)[:1]])
-    assert len(kept) <= 12
-    assert set(every["frame"][every["voxel"] == worst]) >= set(kept["frame"][kept["voxel"] == worst]) != set()
+    assert len(bounded_moves) <= 12
+    assert (
+        set(every["frame"][every["voxel"] == worst])
+        >= set(bounded_moves["frame"][bounded_moves["voxel"] == worst])
+        != set()
+    )
 
 
 def grow(path: Path, labels: list[np.ndarray], *, finish: bool) -> tuple[dict[str, list[dict[str, Any]]], Any]:
@@ -405,9 +409,9 @@ def grow(path: Path, labels: list[np.ndarray], *, finish: bool) -> tuple[dict[st
     fused = backends.create("numba", voxel_size=0.25, num_classes=3)
     growing = voxel_maps.VoxelLogger("/map", CLASSES, np.zeros(3, dtype=np.int64), frames=len(labels))
     with saved(path) as stream:
-        for index, each in enumerate(labels):
+        for index, of_frame in enumerate(labels):
             stream.set_time("frame", sequence=index)
-            report = fused.integrate(frame(index, each))
+            report = fused.integrate(frame(index, of_frame))
             for job in growing.update(stream, report.map_voxels, fused.table):
                 job()
         if finish:

@@ -137,9 +137,7 @@ def test_a_viewer_without_a_display_is_told_in_one_line(tmp_path, monkeypatch) -
     assert "x.rrd: there is no display for the viewer; copy the file to a machine with one" in done.stderr
 
 
-def test_a_display_that_does_not_answer_is_told_in_one_line_and_other_words_are_passed_on(
-    tmp_path, monkeypatch
-) -> None:
+def test_a_display_that_does_not_answer_is_one_line_and_other_words_are_passed_on(tmp_path, monkeypatch) -> None:
     (tmp_path / "x.rrd").write_bytes(b"")
     monkeypatch.setenv("DISPLAY", ":99")
     words = "Error: winit EventLoopError: os error at linux/mod.rs: Failed to open connection to X server"

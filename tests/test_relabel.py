@@ -55,14 +55,14 @@ def voxels_of(folder):
 
 @pytest.mark.parametrize("leave_one_out", [False, True])
 def test_each_pixel_gets_what_the_frames_said_of_its_voxel(fused, leave_one_out):
-    own, voxel = maps(fused / "scene/labels/a"), voxels_of(fused)
-    seen = np.ones(own.shape, bool)
-    seen[1, 0] = False
-    expected = np.full(own.shape, 255, np.uint8)
-    for t, v, u in np.argwhere(seen):
+    given, voxel = maps(fused / "scene/labels/a"), voxels_of(fused)
+    visible = np.ones(given.shape, bool)
+    visible[1, 0] = False
+    expected = np.full(given.shape, 255, np.uint8)
+    for t, v, u in np.argwhere(visible):
         votes = np.zeros(K)
         for other in range(4):
-            said = own[other][seen[other] & (voxel[other] == voxel[t, v, u])]
+            said = given[other][visible[other] & (voxel[other] == voxel[t, v, u])]
             if len(said) and not (leave_one_out and other == t):
                 votes += np.bincount(said, minlength=K) / len(said)
         if votes.any():
@@ -72,15 +72,15 @@ def test_each_pixel_gets_what_the_frames_said_of_its_voxel(fused, leave_one_out)
     found = maps(fused / "out/labels" / name)
     np.testing.assert_array_equal(found, expected)
     truth, has = maps(fused / "scene/labels/gt"), found != 255
-    assert report.pixels == own.size
-    assert report.confirmed == np.count_nonzero(has & (found == own))
-    assert report.changed == np.count_nonzero(has & (found != own)) > 0
+    assert report.pixels == given.size
+    assert report.confirmed == np.count_nonzero(has & (found == given))
+    assert report.changed == np.count_nonzero(has & (found != given)) > 0
     assert report.unseen == tiny_scene.WIDTH
-    assert report.unstable == np.count_nonzero(seen & ~has)
+    assert report.unstable == np.count_nonzero(visible & ~has)
     assert (report.unstable > 0) == leave_one_out
     assert report.correctness.after.accuracy == np.mean(found[has] == truth[has])
-    assert report.correctness.before.accuracy == np.mean(own[has] == truth[has])
-    assert report.correctness.all_before.accuracy == np.mean(own == truth)
+    assert report.correctness.before.accuracy == np.mean(given[has] == truth[has])
+    assert report.correctness.all_before.accuracy == np.mean(given == truth)
     assert report.correctness.after.accuracy > report.correctness.before.accuracy  # the noise is independent
     assert json.loads((fused / "out/labels" / name / "relabelled.json").read_text())["changed"] == report.changed
 
@@ -125,7 +125,7 @@ def test_pixels_of_voxels_that_are_not_believed_are_ignored(fused):
     assert (free >= 0).all()  # whatever the frame's own labels
     kinds = {CATEGORIES[k] for k in np.unique(categories(table))}
     assert {"low persistence", "stable"} <= kinds
-    for belief, kept in (
+    for belief, believed in (
         (Belief(min_op=3), table.op >= 3),
         (Belief(min_psa=0.9), np.nan_to_num(psa(table)) >= 0.9),
         (Belief(categories=("stable", "uncertain")), categories(table) >= 2),
@@ -133,7 +133,7 @@ def test_pixels_of_voxels_that_are_not_believed_are_ignored(fused):
         found = labels(table, belief).labels_of(frame)
         assert (found[found >= 0] == free[found >= 0]).all()
         rows = labels(dataclasses.replace(table, evidence=np.eye(len(table)), classes=()), Belief()).labels_of(frame)
-        np.testing.assert_array_equal(found == UNSTABLE, ~kept[rows])
+        np.testing.assert_array_equal(found == UNSTABLE, ~believed[rows])
         assert set(np.unique(found == UNSTABLE)) == {False, True}
 
 

@@ -117,9 +117,9 @@ def test_the_answer_comes_first_and_the_map_before_the_rest(walls):
     order = [text.index(f">{words}<") for words in ("calm", "Where", "When", "How often it was seen", "All numbers")]
     assert order == sorted(order)
     (card,) = re.findall(r'<article class="card">.*?</article>', text, re.DOTALL)
-    for each in result.select():
-        assert each.statistics.verdict.level in card
-        assert each.unit.scene in card
+    for unit_record in result.select():
+        assert unit_record.statistics.verdict.level in card
+        assert unit_record.unit.scene in card
     assert text.count("<details><summary>") == len(tables(result))
 
 
@@ -128,18 +128,18 @@ def test_the_map_of_the_page_has_the_numbers_of_the_voxels(walls):
     result, text = walls[0], (walls[1] / "report.html").read_text()
     maps = json.loads(re.search(r'id="maps">(.*?)</script>', text, re.DOTALL)[1])
     assert [(m["scene"], m["model"]) for m in maps] == [(r.unit.scene, r.unit.model) for r in result.select()]
-    for own, each in zip(maps, result.select(), strict=True):
-        above = FromAbove.of(each.table(), result.up[each.unit.scene])
-        first, second = (np.asarray(pixels(source)) for source in own["numbers"])
-        seen = above.rows != EMPTY
-        assert first.shape[:2] == tuple(reversed(own["size"])) == above.rows.shape
-        assert ((first[..., 2] == UNKNOWN) == ~seen).all()
-        at = above.rows[seen]
-        assert (first[seen][:, 0] == dominant(above.table)[at]).all()
-        assert (first[seen][:, 2] == categories(above.table)[at]).all()
-        assert (second[seen][:, 1] == above.table.op[at]).all()
-        np.testing.assert_allclose(second[seen][:, 0] / 255, vss(above.table)[at], atol=1 / 255)
-        assert own["names"] == list(above.table.classes)
+    for map_of_page, unit_record in zip(maps, result.select(), strict=True):
+        above = FromAbove.of(unit_record.table(), result.up[unit_record.unit.scene])
+        first, second = (np.asarray(pixels(source)) for source in map_of_page["numbers"])
+        occupied = above.rows != EMPTY
+        assert first.shape[:2] == tuple(reversed(map_of_page["size"])) == above.rows.shape
+        assert ((first[..., 2] == UNKNOWN) == ~occupied).all()
+        at = above.rows[occupied]
+        assert (first[occupied][:, 0] == dominant(above.table)[at]).all()
+        assert (first[occupied][:, 2] == categories(above.table)[at]).all()
+        assert (second[occupied][:, 1] == above.table.op[at]).all()
+        np.testing.assert_allclose(second[occupied][:, 0] / 255, vss(above.table)[at], atol=1 / 255)
+        assert map_of_page["names"] == list(above.table.classes)
 
 
 def pixels(source):
@@ -194,7 +194,7 @@ def test_the_page_is_the_same_again(walls):
     assert (folder / "report.html").read_bytes() == before
 
 
-def test_a_study_of_sweeps_has_their_charts_and_one_in_which_everything_failed_has_a_report(tmp_path):
+def test_a_study_of_sweeps_has_charts_and_one_in_which_all_failed_has_a_report(tmp_path):
     result = study(*(record(voxels((5, 4, SURE)), "frame_count", n) for n in (5, 9)), record(voxels((5, 2, SURE))))
     page = page_of(result, tmp_path)
     assert "VSS (OP>=3) by temporal sampling, frames" in {attributes["aria-label"] for attributes in page.all("svg")}
@@ -206,8 +206,8 @@ def test_a_study_of_sweeps_has_their_charts_and_one_in_which_everything_failed_h
 
 def test_names_are_shown_as_they_are_whatever_they_are(tmp_path):
     found = study(*(record(voxels((5, 2, SURE)), scene=EVIL, model=name) for name in (EVIL, "b")), failures=())
-    named = dataclasses.replace(found, name=EVIL, manifest={"command": [EVIL], EVIL: EVIL})
-    page = page_of(named, tmp_path)
+    renamed = dataclasses.replace(found, name=EVIL, manifest={"command": [EVIL], EVIL: EVIL})
+    page = page_of(renamed, tmp_path)
     assert not any("alert" in content for content in page.scripts)
     assert page.text.count(EVIL) >= 4
     assert CLASSES[2] == "window & <sill>"
@@ -221,7 +221,7 @@ def model(name, once, recurrent, sweep=BASE):
     return record(voxels((ENOUGH, 1, once), (ENOUGH, 4, recurrent)), sweep, model=name)
 
 
-def test_the_order_of_the_models_may_change_where_voxels_recur_and_the_shared_taxonomy_decides():
+def test_models_may_change_order_where_voxels_recur_and_the_shared_taxonomy_decides():
     found = study(model("x", [1, 0, 0], [6, 4, 0]), model("y", [6, 4, 0], [8, 2, 0]))
     line = "VSS of all voxels misleads: in one taxonomy (abc) its order is x > y, and y > x for OP>=3."
     assert line in read(found)

@@ -59,11 +59,11 @@ def test_models_without_a_shown_difference_share_a_rank(result):
 
 def test_every_pair_is_compared_and_corrected(result):
     found = ranking(result[0])
-    assert [(each.other, each.model) for each in found.differences] == [
+    assert [(difference.other, difference.model) for difference in found.differences] == [
         ("twin", "nervous"), ("twin", "other-twin"), ("nervous", "other-twin"),
     ]  # fmt: skip
-    assert [each.shown for each in found.differences] == [True, False, True]
-    assert all(each.low <= each.value <= each.high for each in found.differences)
+    assert [difference.shown for difference in found.differences] == [True, False, True]
+    assert all(difference.low <= difference.value <= difference.high for difference in found.differences)
     assert found.differences[1].p_holm > 0.05
 
 
@@ -141,9 +141,7 @@ def test_measures_that_say_the_opposite_of_alpha_are_named_in_one_line(
         assert told[1][:45] in printed(found, tmp_path / "run")
 
 
-def test_a_model_that_owes_its_order_to_what_it_leaves_out_is_not_shown_to_be_more_stable(
-    result, tmp_path, monkeypatch
-):
+def test_a_model_that_leaves_out_its_errors_is_not_shown_to_be_more_stable(result, tmp_path, monkeypatch):
     """By common observations twin is the more stable one."""
     found = of_some(result, ["twin", "nervous"], tmp_path / "run")
     common = semstab.comparison.ranking._common
@@ -185,7 +183,7 @@ def test_a_gate_on_alpha_of_nearly_one_class_is_undecided(result):
     decided = gate(
         f"{result[1]}:constant", f"{result[1]}:twin", gate_config(rules=["alpha drop < 0.02", "alpha > 0.5"])
     )
-    assert [each.verdict for each in decided.judgements] == ["undecided", "undecided"]
+    assert [judgement.verdict for judgement in decided.judgements] == ["undecided", "undecided"]
     assert "nearly the whole map is one class" in decided.judgements[0].reason
 
 

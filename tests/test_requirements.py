@@ -41,7 +41,7 @@ def imports(folder: str) -> set[str]:
     for file in (SOURCE / folder).glob("**/*.py"):
         for node in ast.walk(ast.parse(file.read_text())):
             if isinstance(node, ast.Import):
-                found |= {each.name.partition(".")[0] for each in node.names}
+                found |= {alias.name.partition(".")[0] for alias in node.names}
             elif isinstance(node, ast.ImportFrom) and node.module and not node.level:
                 found.add(node.module.partition(".")[0])
     return found - sys.stdlib_module_names - {"semstab"}
@@ -50,12 +50,12 @@ def imports(folder: str) -> set[str]:
 def test_every_import_is_declared(declared) -> None:
     extras = dict(declared["options.extras_require"])
     del extras["dev"]
-    known = lines(declared["options"]["install_requires"]).union(*map(lines, extras.values()))
+    requirements = lines(declared["options"]["install_requires"]).union(*map(lines, extras.values()))
     used = set.union(*map(imports, PRODUCT))
     assert {"numpy", "torch", "laspy", "pytest"} <= used
     brought = {BROUGHT_BY.get(name, name.replace("_", "-")) for name in used}
-    known.add("laspy")
-    assert brought - known == set()
+    requirements.add("laspy")
+    assert brought - requirements == set()
 
 
 def test_what_is_required_always_is_imported(declared) -> None:
@@ -73,11 +73,15 @@ def test_each_extra_has_a_use(declared) -> None:
 
 
 def test_each_message_names_an_extra_that_there_is(declared) -> None:
-    named: set[str] = set()
+    named_extras: set[str] = set()
     for folder in PRODUCT:
         for file in (SOURCE / folder).glob("**/*.py"):
             said = re.findall(r"pip install ([^;,)\n]+)", file.read_text())
-            named |= {"".join(re.findall(r"semstab\[(\w+)\]", each)) or each.strip("\"' ") for each in said}
+            named_extras |= {
+                "".join(re.findall(r"semstab\[(\w+)\]", message)) or message.strip("\"' ") for message in said
+            }
     extras = set(declared["options.extras_require"]) - {"dev"}
-    assert {"geo", "torch", "cluster"} <= named
-    assert {name for name in named - extras if not name.startswith(("semstab", "opencv-python-headless<5"))} == set()
+    assert {"geo", "torch", "cluster"} <= named_extras
+    assert {
+        name for name in named_extras - extras if not name.startswith(("semstab", "opencv-python-headless<5"))
+    } == set()

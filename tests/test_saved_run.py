@@ -41,15 +41,15 @@ def test_the_summary_has_a_row_a_unit_and_a_unit_series_and_events(run):
 
 def test_the_summary_has_the_number_that_decides_with_its_interval_and_the_level(run):
     assert run.summary.equals(run.result.summary)
-    for (_, row), own in zip(run.summary.iterrows(), run.result.select(), strict=True):
-        statistics = own.statistics
+    for (_, row), unit_record in zip(run.summary.iterrows(), run.result.select(), strict=True):
+        statistics = unit_record.statistics
         alpha = statistics.headline.alpha
         assert row["verdict"] == statistics.verdict.level
         np.testing.assert_equal(
             [row[name] for name in ("probability", "alpha", "alpha_low", "alpha_high", "confidence")],
             [statistics.verdict.probability, alpha.value, alpha.low, alpha.high, alpha.level],
         )
-        assert row["compensated_flicker_percent"] == own.image_space.compensated_flicker_percent
+        assert row["compensated_flicker_percent"] == unit_record.image_space.compensated_flicker_percent
 
 
 def test_the_row_of_a_unit_has_the_level_of_all_pixels_with_its_probability(run):
@@ -68,19 +68,19 @@ def test_the_row_of_a_unit_has_the_level_of_all_pixels_with_its_probability(run)
 def test_a_run_at_a_prompt_is_a_few_lines(run):
     first, *rest = repr(run).splitlines()
     assert first.startswith(f"{run.folder}: <Result '")
-    verdicts = [own.statistics.verdict for own in run.result.select()]
+    verdicts = [unit_record.statistics.verdict for unit_record in run.result.select()]
     assert [line.split(", alpha")[0] for line in rest] == [
         f"  scene, {model}: {verdict}" for model, verdict in zip("ab", verdicts, strict=True)
     ]
 
 
 def test_the_parts_of_a_run_at_a_prompt_are_one_line_each(run):
-    own = run.result.record(model="a")
-    verdict = str(own.statistics)
+    of_model = run.result.record(model="a")
+    verdict = str(of_model.statistics)
     stated = verdict.removeprefix("<MapStatistics 'a': ").removesuffix(">")
-    assert stated.startswith(f"{own.statistics.verdict}, alpha ")
-    assert repr(own) == f"<Record scene, a: {stated}; numpy>"
-    assert repr(run.table(model="a")) == f"<VoxelTable: {own.map_summary.voxels:,} voxels of 0.25 m, 3 classes>"
+    assert stated.startswith(f"{of_model.statistics.verdict}, alpha ")
+    assert repr(of_model) == f"<Record scene, a: {stated}; numpy>"
+    assert repr(run.table(model="a")) == f"<VoxelTable: {of_model.map_summary.voxels:,} voxels of 0.25 m, 3 classes>"
     assert repr(run.events(model="a")).startswith("<Events: ")
 
 
@@ -117,25 +117,27 @@ def test_a_table_has_every_voxel_and_its_classes_by_name(run):
 
 
 def test_what_a_notebook_shows(run):
-    shown = run._repr_html_()
-    assert "<td>scene</td><td>a</td><td>numpy</td>" in shown
+    page = run._repr_html_()
+    assert "<td>scene</td><td>a</td><td>numpy</td>" in page
     statistics = run.result.records[0].statistics
-    assert f"{statistics.verdict}</td><td>{statistics.headline.alpha.text()}</td>" in shown
-    assert f'<td style="color: {KIND_COLORS["open"]}' in shown  # no verdict
-    assert shown == run.result._repr_html_()
+    assert f"{statistics.verdict}</td><td>{statistics.headline.alpha.text()}</td>" in page
+    assert f'<td style="color: {KIND_COLORS["open"]}' in page  # no verdict
+    assert page == run.result._repr_html_()
     table = run.table(model="a")
     assert f"{len(table)} voxels of 0.25 m, 3 classes" in table._repr_html_()
     assert f"<td>all</td><td>{len(table)}</td><td>{vss(table).mean():.3f}</td>" in table._repr_html_()
     assert table.image().shape[2] == 3
-    shown = study(record(voxels((1, 1, [1, 0, 0])), scene="<b>&"))._repr_html_()
-    assert "&lt;b&gt;&amp;" in shown
-    assert "<td>-</td>" in shown  # SBD of a voxel seen once
+    page = study(record(voxels((1, 1, [1, 0, 0])), scene="<b>&"))._repr_html_()
+    assert "&lt;b&gt;&amp;" in page
+    assert "<td>-</td>" in page  # SBD of a voxel seen once
 
 
 def test_what_is_missing_is_told(run, tmp_path, monkeypatch):
     fails(DataError, "summary.json: cannot be read", semstab.load, tmp_path)
-    kept = record(voxels((1, 1, [1, 0, 0])), voxels_file=tmp_path / "v/x.parquet", series=tmp_path / "s__m__numpy.csv")
-    bare = dataclasses.replace(run, result=study(kept))
+    with_files = record(
+        voxels((1, 1, [1, 0, 0])), voxels_file=tmp_path / "v/x.parquet", series=tmp_path / "s__m__numpy.csv"
+    )
+    bare = dataclasses.replace(run, result=study(with_files))
     fails(ConfigError, "with --events", bare.events)
     fails(DataError, "s__m__numpy.csv: cannot be read", bare.series)
     monkeypatch.setitem(sys.modules, "pandas", None)

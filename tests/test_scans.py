@@ -142,9 +142,9 @@ def test_points_land_where_the_poses_say(street, folder):
         frame = scene.frame(index, "gt")
         np.testing.assert_allclose(frame.T_wc, street.poses[index], atol=1e-6)
         np.testing.assert_array_equal(frame.points[0], street.scans[index])
-        named = {name: k for k, name in zip(scene.label_space("gt").ids, scene.label_space("gt").classes, strict=True)}
+        id_of = {name: k for k, name in zip(scene.label_space("gt").ids, scene.label_space("gt").classes, strict=True)}
         assert {*np.unique(frame.labels)} <= {*IDS, 65535}
-        assert named["car"] == 10
+        assert id_of["car"] == 10
 
 
 def test_the_folder_is_recognised_and_checked(folder, tmp_path):
@@ -227,8 +227,9 @@ def test_points_in_the_world_are_told_from_those_in_the_axes_of_the_sensor(stree
 
 def test_scans_without_points_are_passed_over(street, tmp_path):
     """Two of ten hold a point at the sensor alone: the others tell that the poses are right."""
-    lost = Street([own[:1] * 0 if k in (0, 4) else own for k, own in enumerate(street.scans)],
-                  [own[:1] if k in (0, 4) else own for k, own in enumerate(street.ids)], street.poses)  # fmt: skip
+    lost = Street([of_scan[:1] * 0 if k in (0, 4) else of_scan for k, of_scan in enumerate(street.scans)],
+                  [of_scan[:1] if k in (0, 4) else of_scan for k, of_scan in enumerate(street.ids)],
+                  street.poses)  # fmt: skip
     write_street(tmp_path / "00", lost)
     (checked,) = check(load_config({"dataset": {"name": "semantickitti", "options": {"root": str(tmp_path)}}}))
     assert checked.verdict.state == "sound"
@@ -320,11 +321,11 @@ def test_predictions_in_a_folder_of_their_own_are_called_by_scene_and_model(stre
 def test_moving_points_are_left_out_of_all_models_by_default(street, tmp_path):
     moving = street.with_ids(lambda ids, k: np.where(ids == 10, 252, ids))
     write_street(tmp_path / "00", moving)
-    kept, left = (
+    with_movers, left = (
         open_dataset("semantickitti", {"root": tmp_path, "moving": how}).scene("00").frame(0, "clean")
         for how in ("keep", "leave_out")
     )
-    assert kept.mask is None
+    assert with_movers.mask is None
     np.testing.assert_array_equal(left.mask[0], moving.ids[0] == 252)
 
 

@@ -63,22 +63,22 @@ def run(tmp_path_factory):
 
 
 @pytest.mark.parametrize("model", ["net", "net-scores"])
-def test_errors_at_a_border_that_last_show_by_the_border_and_by_scores_and_not_by_disagreement(run, model):
-    name, (own,) = signs.of_run(f"{run}:{model}", "net-scores")
+def test_lasting_errors_at_a_border_show_by_border_and_scores_not_by_disagreement(run, model):
+    name, (numbers,) = signs.of_run(f"{run}:{model}", "net-scores")
     assert name == model
-    assert own["wrong"] == pytest.approx(4 / (W - 2), abs=0.03)  # of the columns that three frames see
+    assert numbers["wrong"] == pytest.approx(4 / (W - 2), abs=0.03)  # of the columns that three frames see
     if model == "net":
-        assert own[signs.DISAGREE] == pytest.approx(0.5)
+        assert numbers[signs.DISAGREE] == pytest.approx(0.5)
     for sign in (signs.IN_MAP, f"{signs.NEAR}: one frame", f"{signs.NEAR}: all"):
-        assert own[sign] == pytest.approx(1 - 4 * 4 / 2 / (4 * (W - 6)), abs=0.03)  # as near on the other side
-    assert own[f"{signs.UNSURE}: one frame"] == pytest.approx(1.0)
-    assert own[f"{signs.UNSURE}: all"] == pytest.approx(1.0)
+        assert numbers[sign] == pytest.approx(1 - 4 * 4 / 2 / (4 * (W - 6)), abs=0.03)  # as near on the other side
+    assert numbers[f"{signs.UNSURE}: one frame"] == pytest.approx(1.0)
+    assert numbers[f"{signs.UNSURE}: all"] == pytest.approx(1.0)
 
 
 def test_labels_without_scores_have_no_number_for_them(run):
-    _, (own,) = signs.of_run(f"{run}:net", None)
-    assert math.isnan(own[f"{signs.UNSURE}: all"])
-    assert own[signs.IN_MAP] > 0.9
+    _, (numbers,) = signs.of_run(f"{run}:net", None)
+    assert math.isnan(numbers[f"{signs.UNSURE}: all"])
+    assert numbers[signs.IN_MAP] > 0.9
 
 
 def test_the_table_has_a_row_for_each_run(run, capsys):

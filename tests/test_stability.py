@@ -17,12 +17,12 @@ PAGE = SOURCE / "docs/stability.md"
 
 
 @pytest.fixture(scope="module")
-def known() -> dict[str, list[str]]:
+def promised() -> dict[str, list[str]]:
     return json.loads((SOURCE / "tests/golden/stable.json").read_text())
 
 
-def test_what_is_promised_stays(known) -> None:
-    found = complaints(known, stable_surface())
+def test_what_is_promised_stays(promised) -> None:
+    found = complaints(promised, stable_surface())
     assert not found, "\n".join(found)
 
 
@@ -35,23 +35,23 @@ def test_what_is_promised_stays(known) -> None:
     ("frames/*.csv", "flicker_percent"), ("gate.json", "exit_code"), ("protocol FusionBackend", "integrate"),
     ("protocol Scene", "frame"), ("protocol Observer", "frame_fused"),
 ])  # fmt: skip
-def test_each_surface_is_held(known, surface, name) -> None:
-    assert name in known[surface]
-    found = {**known, surface: [each for each in known[surface] if each != name]}
-    (line,) = complaints(known, found)
+def test_each_surface_is_held(promised, surface, name) -> None:
+    assert name in promised[surface]
+    found = {**promised, surface: [other for other in promised[surface] if other != name]}
+    (line,) = complaints(promised, found)
     assert line.startswith(f"{surface}: {name} is gone; keep the old name for a minor version")
 
 
-def test_a_new_name_is_promised_too(known) -> None:
-    (line,) = complaints(known, {**known, "commands": [*known["commands"], "frobnicate"]})
+def test_a_new_name_is_promised_too(promised) -> None:
+    (line,) = complaints(promised, {**promised, "commands": [*promised["commands"], "frobnicate"]})
     assert line.startswith(
         "commands: frobnicate is new, and will stay; say it in CHANGELOG.md, then run: python tests/"
     )
 
 
-def test_the_page_names_each_exit_code(known) -> None:
+def test_the_page_names_each_exit_code(promised) -> None:
     (row,) = (line for line in PAGE.read_text(encoding="utf-8").splitlines() if line.startswith("| exit codes"))
-    assert re.findall(r"\b\d+\b", row.split("|")[2]) == known["exit codes"]
+    assert re.findall(r"\b\d+\b", row.split("|")[2]) == promised["exit codes"]
 
 
 def test_the_version_is_one() -> None:

@@ -137,7 +137,7 @@ def test_kappa_and_alpha_of_soft_evidence_are_their_definitions():
         assert row.voxel_alpha_op2 == pytest.approx(1 - (1 - agree) / (1 - by_pairs(both.reshape(-1, 2))))
 
 
-def test_alpha_is_zero_for_chance_and_one_for_agreement_and_voxels_seen_once_count_nowhere():
+def test_alpha_is_zero_for_chance_one_for_agreement_without_voxels_seen_once():
     rng = np.random.default_rng(6)
     chance = log_of(rng.choice(3, size=(20_000, 4), p=[0.7, 0.2, 0.1])).table()
     assert krippendorff_alpha(chance) == pytest.approx(0, abs=0.02)
@@ -165,7 +165,7 @@ def test_agreement_beyond_chance_is_undefined_where_there_is_no_pair_or_one_clas
     assert math.isnan(krippendorff_alpha(table))
 
 
-def test_entropy_is_within_frames_or_between_them_as_the_generalised_jensen_shannon_divergence():
+def test_entropy_between_frames_is_the_generalised_jensen_shannon_divergence():
     """Unanimous frames of (1/2, 1/2): all within. One-hot frames that disagree: all between."""
     evidence = [[[0.5, 0.5], [0.5, 0.5]], [[1, 0], [0, 1]], [[1, 0], [1, 0]]]
     parts = decompose(log_of_evidence(evidence).table())

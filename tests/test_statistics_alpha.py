@@ -70,8 +70,8 @@ def test_a_spot_has_the_label_of_the_pixel_at_it_of_each_view_since_it_was_found
     """Of every view in which a pixel's centre is near the spot, to one side or the other."""
     frames = with_a_hole(list(flight(5, flicker=0.3)), said=said)
     spots = sampled(frames)
-    known = [len(sampled(frames[:n]).point) for n in range(1, 6)]
-    found = np.searchsorted(known, np.arange(len(spots.point)), side="right")
+    counts = [len(sampled(frames[:n]).point) for n in range(1, 6)]
+    found = np.searchsorted(counts, np.arange(len(spots.point)), side="right")
     np.testing.assert_allclose(spots.point[:, 2], 4.0 - Z, atol=1e-6)
     expected = {}
     for view, frame in enumerate(frames):
@@ -90,19 +90,21 @@ def test_the_second_and_the_third_answer_are_the_next_pixels_to_one_side():
     frames = with_a_hole(list(flight(3, flicker=0.3)), said=True)
     spots, alone = sampled(frames), 0
     for view, frame in enumerate(frames):
-        own = spots.only((spots.view == view) & (spots.label < K))
-        u, v, column, row, _ = (each[own.spot] for each in seen_by(frame, spots.point))
-        np.testing.assert_allclose(own.near, ((column - u) ** 2 + (row - v) ** 2) * (Z / F) ** 2, rtol=1e-3, atol=1e-8)
+        answers = spots.only((spots.view == view) & (spots.label < K))
+        u, v, column, row, _ = (values[answers.spot] for values in seen_by(frame, spots.point))
+        np.testing.assert_allclose(
+            answers.near, ((column - u) ** 2 + (row - v) ** 2) * (Z / F) ** 2, rtol=1e-3, atol=1e-8
+        )
         padded = np.pad(frame.labels, 2, constant_values=255)
-        possible, any_side = np.zeros(len(own), bool), np.zeros(len(own), bool)
+        possible, any_side = np.zeros(len(answers), bool), np.zeros(len(answers), bool)
         for down, right in SIDES:
             second, third = (padded[row + 2 + k * down, column + 2 + k * right] for k in (1, 2))
             there = (second < K) & (third < K)
             apart = ((column + right - u) ** 2 + (row + down - v) ** 2) * (Z / F) ** 2
-            same = (own.neighbour == second) & (own.beyond == third) & np.isclose(own.far, apart, rtol=1e-3)
+            same = (answers.neighbour == second) & (answers.beyond == third) & np.isclose(answers.far, apart, rtol=1e-3)
             possible, any_side = possible | there & same, any_side | there
         np.testing.assert_array_equal(possible, any_side)
-        rest = own.only(~any_side)
+        rest = answers.only(~any_side)
         assert (rest.neighbour == rest.label).all()
         assert (rest.far == rest.near).all()
         alone += len(rest)
@@ -112,12 +114,12 @@ def test_the_second_and_the_third_answer_are_the_next_pixels_to_one_side():
 def alpha_by_hand(spots, answers):
     """Krippendorff's alpha, nominal: spots are units, each weighted by its number of views, and views are raters."""
     counts = defaultdict(lambda: np.zeros(K))
-    for spot, view, label, own in zip(spots.spot, spots.view, spots.label, answers, strict=True):
+    for spot, view, label, share in zip(spots.spot, spots.view, spots.label, answers, strict=True):
         if label < K:
-            counts[spot, view][own] += 1
+            counts[spot, view][share] += 1
     units = defaultdict(list)
-    for (spot, _), own in counts.items():
-        units[spot].append(own / own.sum())
+    for (spot, _), share in counts.items():
+        units[spot].append(share / share.sum())
     units = [shares for shares in units.values() if len(shares) > 1]
     agreeing = [len(shares) * np.mean([a @ b for a, b in itertools.permutations(shares, 2)]) for shares in units]
     every = np.concatenate(units)
@@ -159,7 +161,7 @@ def test_a_worse_model_has_lower_alpha(patch):
     assert (np.diff(found) < -0.04).all()
 
 
-def test_disagreement_is_within_a_frame_and_between_frames_whatever_the_number_of_frames():
+def test_disagreement_within_and_between_frames_does_not_depend_on_their_number():
     rng = np.random.default_rng(3)
     parts = []
     for T in (2, 4, 30):
@@ -219,7 +221,7 @@ def test_alpha_is_about_the_same_where_only_every_second_or_third_pixel_is_taken
 def test_scores_have_the_alpha_and_the_level_of_their_likeliest_class():
     frames = list(flight(12, flicker=0.2, patch=5))
     unsure = [dataclasses.replace(f, labels=None, scores=0.2 + 0.4 * np.eye(K)[f.labels]) for f in frames]
-    by_labels, by_scores = (describe(fused(own, 0.3).table(), spots=sampled(own)) for own in (frames, unsure))
+    by_labels, by_scores = (describe(fused(series, 0.3).table(), spots=sampled(series)) for series in (frames, unsure))
     assert by_scores.headline.alpha == by_labels.headline.alpha
     assert by_scores.verdict.level == by_labels.verdict.level
     assert by_scores.agreement.voxel_alpha_op2.value < by_labels.agreement.voxel_alpha_op2.value - 0.1
@@ -258,7 +260,7 @@ def test_a_camera_that_moves_or_turns_by_less_than_a_pixel_has_one_view():
     moved = [len(sampled(flight(2, step=step, flicker=0.3)).views) for step in (0.07, 0.09)]
     (frame,) = flight(1)
     other = [turned(frame, angle) for angle in (0.018, 0.022)]
-    assert moved == [len(sampled([frame, own]).views) for own in other] == [1, 2]
+    assert moved == [len(sampled([frame, second]).views) for second in other] == [1, 2]
 
 
 def test_of_the_frames_of_one_view_all_labels_count():
@@ -266,8 +268,8 @@ def test_of_the_frames_of_one_view_all_labels_count():
     once, twice = sampled([first]), sampled([first, second])
     again = twice.only(twice.spot < len(once.point))
     assert (len(twice.views), len(again)) == (1, 2 * len(once))
-    (seen,) = np.unique(again.spot, return_counts=True)[1:]
-    assert set(seen.tolist()) == {2}
+    (times,) = np.unique(again.spot, return_counts=True)[1:]
+    assert set(times.tolist()) == {2}
     shares = again.observations().evidence.weight
     assert set(shares.tolist()) == {0.5, 1.0}  # one observation of each spot, of both labels
 
@@ -311,9 +313,9 @@ def test_a_class_that_flips_a_coin_is_unstable_though_it_is_rare():
     """Two of a hundred places flip between two rare classes: alpha hardly sees it."""
     rng = np.random.default_rng(5)
     n = 10404
-    own = rng.integers(0, 2, size=(n, 1))
+    usual = rng.integers(0, 2, size=(n, 1))
     rare = np.arange(n)[:, None] % 50 == 0
-    labels = np.where(rare, rng.integers(2, 4, size=(n, 4)), own)
+    labels = np.where(rare, rng.integers(2, 4, size=(n, 4)), usual)
     table, spots = log_of(labels, K=4, index=grid(102)).table(), spots_of(labels, K=4, index=grid(102))
     found = describe(table, spots=spots)
     assert found.headline.alpha.value > 0.95
@@ -322,8 +324,8 @@ def test_a_class_that_flips_a_coin_is_unstable_though_it_is_rare():
     assert (first.name, first.unstable > 0.99) == ("2", True)
     assert "probably unstable: 2 (100%)" in found.verdict.line
     assert {row.name: row.counts_for_verdict for row in found.spots.classes}["3"] is False  # 68 voxels
-    named = dataclasses.replace(table, classes=("road", "grass", "car", "person"))
-    critical = describe(named, spots=spots, critical=["person"])
+    renamed = dataclasses.replace(table, classes=("road", "grass", "car", "person"))
+    critical = describe(renamed, spots=spots, critical=["person"])
     assert [row.name for row in critical.spots.critical_classes] == ["person"]
 
 
@@ -331,8 +333,8 @@ def test_places_that_flip_between_two_common_classes_are_said_beside_the_verdict
     """No class is at fault, and each has an alpha of 0.96: only the places tell."""
     rng = np.random.default_rng(5)
     n = 10404
-    own, coin = np.arange(n)[:, None] % 3, np.arange(n)[:, None] % 50 == 0
-    labels = np.where(coin, rng.integers(0, 2, size=(n, 8)), own)
+    usual, coin = np.arange(n)[:, None] % 3, np.arange(n)[:, None] % 50 == 0
+    labels = np.where(coin, rng.integers(0, 2, size=(n, 8)), usual)
     found = describe(log_of(labels, index=grid(102)).table(), spots=spots_of(labels, index=grid(102)))
     assert found.flipping.share.low < 0.02 < found.flipping.share.high < 0.045
     assert (found.flipping.a, found.flipping.b) == ("0", "1")
@@ -340,7 +342,7 @@ def test_places_that_flip_between_two_common_classes_are_said_beside_the_verdict
     assert found.verdict.level == "stable"
     assert "1.9% of the locations of this map flip" in found.verdict.line
     assert "of them between 0 and 1" in found.verdict.line
-    labels = np.repeat(own, 2, axis=1)
+    labels = np.repeat(usual, 2, axis=1)
     twice = describe(log_of(labels, index=grid(102)).table(), spots=spots_of(labels, index=grid(102)))
     assert "seen too seldom to tell which of them flip" in twice.verdict.line
 
@@ -355,7 +357,7 @@ FIRST = "label", "near"
 def entries(spots, names=FIRST):
     """How often there is each answer: point, view, and the columns named."""
     columns = [spots.view, *(getattr(spots, name) for name in names)]
-    return Counter(zip(*spots.point[spots.spot].T.tolist(), *(each.tolist() for each in columns), strict=True))
+    return Counter(zip(*spots.point[spots.spot].T.tolist(), *(values.tolist() for values in columns), strict=True))
 
 
 def places(spots):
@@ -412,15 +414,15 @@ def test_all_models_are_asked_at_the_same_spots(budget):
         for f in frames for out in [rng.random(f.shape) < 0.5]
     ]  # fmt: skip
     without = [dataclasses.replace(frame, unlabelled=None) for frame in silent]
-    models = [sampled(own, budget) for own in (frames, flight(flicker=0.3, seed=1), silent, without)]
+    models = [sampled(model, budget) for model in (frames, flight(flicker=0.3, seed=1), silent, without)]
     first = models[0]
-    for own in models[1:]:
-        assert (own.share, own.spacing, len(own.views)) == (first.share, first.spacing, len(first.views))
-        np.testing.assert_array_equal(own.point, first.point)
-        np.testing.assert_array_equal(own.drawn, first.drawn)
-    for own in models[1:3]:
+    for model in models[1:]:
+        assert (model.share, model.spacing, len(model.views)) == (first.share, first.spacing, len(first.views))
+        np.testing.assert_array_equal(model.point, first.point)
+        np.testing.assert_array_equal(model.drawn, first.drawn)
+    for model in models[1:3]:
         for name in ("spot", "view", "near"):
-            np.testing.assert_array_equal(getattr(own, name), getattr(first, name))
+            np.testing.assert_array_equal(getattr(model, name), getattr(first, name))
     assert np.mean(models[2].label == K) == pytest.approx(0.5, abs=0.03)
     assert entries(models[3]) == entries(models[2].labelled())
     both = common_observations(models[:3])
@@ -440,8 +442,8 @@ def test_spots_are_one_in_a_coarse_cell_and_even_over_the_floor():
     spots = sampled(flight(1))
     assert len({*map(tuple, spots.cell.tolist())}) == len(spots.point)
     assert len({*map(tuple, spots.places(np.arange(len(spots.point))).tolist())}) == len(spots.point)
-    shown = 60 * 80 * (Z / F) ** 2 / spots.spacing**2
-    assert 0.75 < len(spots.point) / shown < 1.1
+    expected = 60 * 80 * (Z / F) ** 2 / spots.spacing**2
+    assert 0.75 < len(spots.point) / expected < 1.1
     assert len(spots.point) == len(sampled([next(flight(1, coin=True))]).point)
 
 
@@ -526,10 +528,10 @@ def _written(path, change=None, **about):
     spots = sampled(flight(2))
     spots.save(path)
     content = pq.ParquetFile(path).read()
-    known = json.loads(content.schema.metadata[b"semstab"]) | about
+    about_file = json.loads(content.schema.metadata[b"semstab"]) | about
     if change is not None:
         content = change(content)
-    pq.write_table(content.replace_schema_metadata({"semstab": json.dumps(known)}), path)
+    pq.write_table(content.replace_schema_metadata({"semstab": json.dumps(about_file)}), path)
 
 
 def _with(content, name, values):
@@ -541,7 +543,7 @@ def _set(name, value):
 
     def change(content):
         values = content.column(name).to_pylist()
-        first = next(k for k, own in enumerate(values) if own)
+        first = next(k for k, values_of_spot in enumerate(values) if values_of_spot)
         values[first] = [value, *values[first][1:]] if isinstance(values[first], list) else value
         return _with(content, name, pa.array(values, content.column(name).type))
 
@@ -550,7 +552,9 @@ def _set(name, value):
 
 def _shorter(content):
     values = content.column("label").to_pylist()
-    return _with(content, "label", pa.array([own[1:] for own in values], content.column("label").type))
+    return _with(
+        content, "label", pa.array([values_of_spot[1:] for values_of_spot in values], content.column("label").type)
+    )
 
 
 @pytest.mark.parametrize(("change", "about"), [
@@ -618,8 +622,8 @@ def test_samples_of_other_cells_meet_at_the_larger_ones():
     fine, large = sampled(frames), sampled([frame.every(2) for frame in frames])
     assert (fine.spacing, large.spacing) == (0.0625, 0.125)
     both = common_observations([fine, large])
-    assert [own.spacing for own in both.shared] == [0.125, 0.125]
-    logs = [own.observations() for own in both.shared]
+    assert [sample.spacing for sample in both.shared] == [0.125, 0.125]
+    logs = [sample.observations() for sample in both.shared]
     for name in ("ix", "iy", "iz", "voxel", "frame"):
         np.testing.assert_array_equal(*(getattr(log, name) for log in logs))
     assert len(logs[0]) > 1000
@@ -632,7 +636,7 @@ def test_a_less_dense_sample_meets_a_denser_one():
     both = common_observations([spots, thinned])
     assert both.missing == (0, 0)
     # Fails as long as the side of the second answers is drawn by the number of a spot in its sample, not by its cell
-    assert [entries(own) for own in both.shared] == [entries(thinned)] * 2
+    assert [entries(sample) for sample in both.shared] == [entries(thinned)] * 2
 
 
 def test_samples_that_begin_elsewhere_meet():
@@ -646,11 +650,11 @@ def test_samples_that_begin_elsewhere_meet():
     assert len(both.shared[0]) > 0.8 * len(spots)
 
 
-def test_samples_of_the_same_frames_in_another_order_have_about_the_same_alpha_on_common_observations():
+def test_samples_of_frames_in_another_order_have_about_the_same_alpha():
     """Frames find other points of the same cells."""
     frames = list(flight(12, flicker=0.2, step=0.37))
     both = common_observations([sampled(frames), sampled(frames[::-1])])
-    one, other = (value(sums_of_spots(own), "alpha") for own in both.shared)
+    one, other = (value(sums_of_spots(sample), "alpha") for sample in both.shared)
     assert one == pytest.approx(other, abs=0.03)
 
 

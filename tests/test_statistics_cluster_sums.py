@@ -46,12 +46,12 @@ def flight(side=12, F=9, K=3, soft_evidence=False, seed=0):
     """A floor of which each frame sees a strip, and the true class of each voxel."""
     rng = np.random.default_rng(seed)
     index = grid(side)
-    seen = np.abs(index[:, :1] - np.linspace(0, side, F)) <= 3
+    visible = np.abs(index[:, :1] - np.linspace(0, side, F)) <= 3
     truth = rng.integers(0, K, len(index))
-    labels = np.where(rng.random(seen.shape) < 0.3, rng.integers(0, K, seen.shape), truth[:, None])
+    labels = np.where(rng.random(visible.shape) < 0.3, rng.integers(0, K, visible.shape), truth[:, None])
     evidence = soft(rng, len(index), F, K) if soft_evidence else np.eye(K)[labels]
-    some = seen.any(axis=1)
-    log = log_of_evidence(evidence[some], seen[some], index=index[some])
+    some = visible.any(axis=1)
+    log = log_of_evidence(evidence[some], visible[some], index=index[some])
     return log.table(), log, truth[some]
 
 
@@ -73,12 +73,13 @@ def test_the_sums_give_every_number_back(soft_evidence):
     again, often = table.op >= 2, table.op >= 3
     right = dominant(table) == truth
     consistent = np.where(often, consistency_posterior(table), 0.0)
-    excess, known = sbd(table) - expected_sbd(table), correctness(table.evidence[again], truth[again])
+    excess, by_truth = sbd(table) - expected_sbd(table), correctness(table.evidence[again], truth[again])
     expected = {
         "psa": psa(table)[again].mean(), "voxel_alpha": krippendorff_alpha(table), "vss": vss(table)[often].mean(),
         "entropy": entropy(table)[again].mean(), "accuracy": right[again].mean(),
         "observation_accuracy": log.evidence[again[log.voxel], truth[log.voxel[again[log.voxel]]]].mean(),
-        "wrong_of_consistent": (consistent * ~right).sum() / consistent.sum(), "miou": known.miou, "ece": known.ece,
+        "wrong_of_consistent": (consistent * ~right).sum() / consistent.sum(), "miou": by_truth.miou,
+        "ece": by_truth.ece,
         "sbd_excess": np.nan if soft_evidence else np.nanmean(excess[again]),
     }  # fmt: skip
     for given in (log, None):
@@ -109,8 +110,8 @@ def lever_by_hand(spots):
     (first, near), (second, far), (third, _) = spots.logs()
     again = first.table().op[first.voxel] >= 2
     disagreement = [1 - psa(log.table())[log.voxel[again]].mean() for log in (first, second, third)]
-    own, one = near[again].mean(), far[again].mean()
-    distances = np.sqrt([own, one, own + 4 * (one - own)])
+    same_cell, one = near[again].mean(), far[again].mean()
+    distances = np.sqrt([same_cell, one, same_cell + 4 * (one - same_cell)])
     at_zero = np.polyfit(distances, disagreement, 2)[-1]
     return (disagreement[0] - at_zero) / (disagreement[1] - disagreement[0])
 
@@ -190,11 +191,11 @@ def test_a_file_holds_a_map_and_the_three_answers_of_its_spots(tmp_path):
     whole, spots = stripes()
     whole.save(tmp_path / "sums.parquet")
     back = ClusterSums.load(tmp_path / "sums.parquet")
-    for part, own in zip((back, *back.answers), (whole, *whole.answers), strict=True):
+    for part, written in zip((back, *back.answers), (whole, *whole.answers), strict=True):
         for name in ("cell", "frame", "columns"):
-            np.testing.assert_array_equal(getattr(part, name), getattr(own, name))
+            np.testing.assert_array_equal(getattr(part, name), getattr(written, name))
         for name in ("edge", "step", "voxel_size", "K", "classes", "truth", "fused"):
-            assert getattr(part, name) == getattr(own, name)
+            assert getattr(part, name) == getattr(written, name)
     assert [part.voxel_size for part in (back, *back.answers)] == [0.3, *[spots.spacing / PARTS] * 3]
     assert value(back, "alpha") == value(whole, "alpha")
 
@@ -275,10 +276,10 @@ def test_a_series_over_frames_and_how_much_of_a_map_is_covered():
     assert 0.9 < (found.high - found.low) / (2 * 1.99 * values.std() / np.sqrt(79)) < 1.6
     assert "too few frames" in mean_over_frames(np.arange(8), np.append(values[:7], np.nan)).undecided
     table, log, truth = flight(side=16)
-    kept = table.index[:, 0] < 12
+    left = table.index[:, 0] < 12
     whole = cluster_sums_of(table, log, truth)
-    part = cluster_sums_of(rows_of(table, np.flatnonzero(kept)))
-    assert coverage(part, whole).value == pytest.approx(kept[table.op >= 2].mean() - 1)
+    part = cluster_sums_of(rows_of(table, np.flatnonzero(left)))
+    assert coverage(part, whole).value == pytest.approx(left[table.op >= 2].mean() - 1)
     assert (coverage(whole, whole).low, coverage(whole, whole).high) == (0.0, 0.0)
     larger = whole.coarsened(2 * whole.edge, 0)
     for ours, theirs in ((part, larger), (larger, part)):  # on the larger cubes of the two
@@ -296,7 +297,7 @@ def test_a_series_over_frames_and_how_much_of_a_map_is_covered():
     assert difference_over_frames({f: v + 1 for f, v in series.items()}, series).value == pytest.approx(1)
 
 
-def test_a_map_of_which_nothing_was_seen_twice_has_no_numbers_and_a_large_one_few_cubes():
+def test_a_map_seen_once_has_no_numbers_and_a_large_one_few_cubes():
     table = (log := log_of(np.zeros((9, 1), dtype=int), index=grid(3))).table()
     for given in (log, None):
         sums = cluster_sums_of(table, given, np.zeros(9, dtype=np.int64), sbd_excess=np.full(9, np.nan))

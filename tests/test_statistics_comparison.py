@@ -23,12 +23,12 @@ from semstab.statistics import psa
 SIDE = 24
 
 
-def drawn(rng, F, error, side=SIDE, seen=None, K=3):
+def drawn(rng, F, error, side=SIDE, visible=None, K=3):
     """Labels of a floor seen by F frames, which err with that probability (a number, or one a voxel); side and K."""
-    own = rng.integers(0, K, size=(side * side, 1))
+    usual = rng.integers(0, K, size=(side * side, 1))
     wrong = rng.random((side * side, F)) < np.broadcast_to(error, (side * side,))[:, None]
-    labels = np.where(wrong, rng.integers(0, K, size=wrong.shape), own)
-    return labels if seen is None else np.where(seen, labels, -1), side, K
+    labels = np.where(wrong, rng.integers(0, K, size=wrong.shape), usual)
+    return labels if visible is None else np.where(visible, labels, -1), side, K
 
 
 def table_of(voxels, op=2):
@@ -81,8 +81,8 @@ def two_models(rng, gap, side=32, F=8):
         "a": drawn(rng, F, np.clip(error, 0, 1), side)[0],
         "b": drawn(rng, F, np.clip(error + gap + shift, 0, 1), side)[0],
     }
-    tables = {name: log_of(own, index=grid(side)).table() for name, own in labels.items()}
-    return tables, {name: spots_of(own, index=grid(side)) for name, own in labels.items()}
+    tables = {name: log_of(of_model, index=grid(side)).table() for name, of_model in labels.items()}
+    return tables, {name: spots_of(of_model, index=grid(side)) for name, of_model in labels.items()}
 
 
 def alpha_difference(rng, gap, **options):
@@ -96,8 +96,8 @@ def test_the_test_of_alpha_keeps_its_level():
     """Two models of the same quality, 15 times: the interval holds 0 twelve times or more."""
     rng = np.random.default_rng(1)
     found = [alpha_difference(rng, 0.0, side=24) for _ in range(15)]
-    assert sum(each.low <= 0 <= each.high for each in found) >= 12
-    assert sum(each.p_value <= 0.05 for each in found) <= 3
+    assert sum(contrast.low <= 0 <= contrast.high for contrast in found) >= 12
+    assert sum(contrast.p_value <= 0.05 for contrast in found) <= 3
 
 
 def test_a_worse_model_is_found():

@@ -31,7 +31,7 @@ def test_the_truth_of_a_voxel_is_what_most_of_its_ground_truth_says():
         join_truth(log_of([[0]]).table(), log_of([[0]], K=4).table())
 
 
-def test_accuracy_and_miou_are_those_of_scikit_learn_and_brier_of_the_normalised_evidence():
+def test_accuracy_and_miou_are_scikit_learns_and_brier_is_of_normalised_evidence():
     from sklearn.metrics import accuracy_score, jaccard_score
 
     belief, label = random_beliefs()

@@ -26,9 +26,9 @@ def flown(step, frames=8, height=10.0):
 
 def tied_to_the_view(rng, frames=8, lasts=2):
     """Each place's label is drawn anew every `lasts` frames, but half of the places are always right."""
-    own = rng.integers(0, 3, size=(SIDE**2, 1))
+    usual = rng.integers(0, 3, size=(SIDE**2, 1))
     drawn = np.repeat(rng.integers(0, 3, size=(SIDE**2, frames // lasts)), lasts, axis=1)
-    return np.where(rng.random((SIDE**2, 1)) < 0.5, drawn, own)
+    return np.where(rng.random((SIDE**2, 1)) < 0.5, drawn, usual)
 
 
 def test_alpha_of_two_frames_is_krippendorffs_and_distances_are_those_of_the_cameras():

@@ -24,14 +24,14 @@ from semstab.statistics.verdict import LIMITS, level_probabilities
 SIDE, F = 24, 8
 
 
-def said(flicker, seed, place=0.0, seen=0.8):
+def said(flicker, seed, place=0.0, share_seen=0.8):
     """Labels of a simulated model on a floor, which flicker, and places that are wrong in every frame."""
     rng = np.random.default_rng(seed)
     true = np.random.default_rng(99).integers(0, 3, size=(SIDE**2, 1))
     stuck = rng.random((SIDE**2, 1)) < place
     noise = rng.random((SIDE**2, F)) < flicker
     labels = np.where(noise, rng.integers(0, 3, size=noise.shape), (true + stuck) % 3)
-    labels[:, 1:][rng.random((SIDE**2, F - 1)) > seen] = -1
+    labels[:, 1:][rng.random((SIDE**2, F - 1)) > share_seen] = -1
     return labels
 
 
@@ -129,7 +129,7 @@ def test_the_order_is_known_where_a_quarter_of_the_locations_tell_of_it():
         replace(found, drift=replace(found.drift, voxels=n), repeated=replace(found.repeated, voxels=100))
         for n in (24, 25)
     ]
-    assert [each.order_known for each in of] == [False, True]
+    assert [drift.order_known for drift in of] == [False, True]
 
 
 def values(section):
@@ -188,12 +188,12 @@ def between(low, high):
 def judged(low, high, wrong=UNKNOWN, voxels=5000, **spots):
     """By alpha in that interval, of observations as these are unless said otherwise."""
     numbers = HeadlineStatistics(*[between(low, high)] * 5)
-    own = {
+    fields = {
         "spacing": 0.125, "spots": 800, "cubes": 40, "frames": 60, "views": 60, "chance": 0.4,
         "largest_class": "grass", "largest_share": 0.5, "labelled": 1.0, "classes": (),
     } | spots  # fmt: skip
     return verdict(
-        "net", headline=replace(numbers, wrong_of_consistent_op3=wrong), spots=SpotAgreement(**own), voxels=voxels,
+        "net", headline=replace(numbers, wrong_of_consistent_op3=wrong), spots=SpotAgreement(**fields), voxels=voxels,
         share=0.5,
     )  # fmt: skip
 
@@ -233,7 +233,7 @@ def test_few_locations_have_no_verdict():
     assert "too few locations to act on; use smaller voxels" in few.line
 
 
-def test_a_camera_that_stood_still_has_no_verdict_and_a_single_frame_needs_more_overlap():
+def test_a_camera_that_stood_still_has_no_verdict_and_one_frame_needs_more_overlap():
     assert (
         "no verdict, all frames show one view: the camera stood still, or moved by less"
         in judged(0.9, 0.95, views=1).line

@@ -57,13 +57,13 @@ def test_soft_observations_are_compared_with_turns_of_a_random_order(T):
         assert np.abs(null[:50, None] - by_order).min(axis=1).max() < 1e-9
 
 
-def test_the_null_is_undefined_where_a_frame_disagrees_with_itself_and_zero_where_all_agree():
+def test_the_null_is_undefined_where_a_frame_disagrees_with_itself_zero_if_all_agree():
     """Beyond 256 observations the table of drifts ends, and turns take over where there is a log."""
     events = log_of_evidence([[[1, 0], [0.5, 0.5]], [[1, 0], [1, 0]], [[1, 0], [0, 1]]])
     np.testing.assert_allclose(expected_sbd(events.table()), [np.nan, 0, 0.311278], atol=1e-6)
-    known = expected_sbd(events.table(), events)
-    np.testing.assert_allclose(known[1:], [0, 0.311278], atol=1e-6)
-    assert known[0] > 0
+    expected = expected_sbd(events.table(), events)
+    np.testing.assert_allclose(expected[1:], [0, 0.311278], atol=1e-6)
+    assert expected[0] > 0
     once = log_of([[0, -1]])
     assert math.isnan(expected_sbd(once.table(), once)[0])
     many = log_of(np.random.default_rng(2).integers(0, 2, size=(400, 300)))

@@ -92,7 +92,7 @@ def test_frames_are_taken_one_at_a_time():
     assert alive == [0]
 
 
-def test_voxels_in_one_map_only_or_seen_once_do_not_count_and_views_that_do_not_fit_are_refused():
+def test_voxels_of_one_map_or_seen_once_do_not_count_and_other_views_are_refused():
     model = fused([sight_line(t, [(0.1, t), (0.4, 0)]) for t in range(2)])
     limit = fused([sight_line(0, [(0.1, 0), (0.4, 0)]), sight_line(1, [(0.1, 0)])])
     found = losses(model, limit)

@@ -91,7 +91,7 @@ def test_the_order_of_a_model_and_itself_depends_on_nothing():
     assert (found.order, found.bounded, found.depends) == (("a", "b"), True, False)
 
 
-def test_scores_beside_labels_of_the_same_likeliest_class_make_no_difference_in_alpha():
+def test_scores_whose_likeliest_class_is_the_label_have_the_same_alpha():
     frames = list(flight(8, flicker=0.2, patch=10))
     unsure = [dataclasses.replace(f, labels=None, scores=0.2 + 0.4 * np.eye(K)[f.labels]) for f in frames]
     found = compared(labels=frames, scores=unsure)
@@ -149,7 +149,7 @@ def test_that_a_model_leaves_the_hardest_out_is_said(hardest):
     assert found.depends
 
 
-def test_common_observations_are_of_spots_to_which_all_models_gave_labels_at_the_same_pixels():
+def test_common_observations_are_of_spots_that_all_models_label_at_the_same_pixels():
     frames = list(flight(4, flicker=0.2))
     rng = np.random.default_rng(4)
     whole = sampled(frames)
@@ -161,9 +161,9 @@ def test_common_observations_are_of_spots_to_which_all_models_gave_labels_at_the
     np.testing.assert_array_equal(one.observations().evidence, other.observations().evidence)
     assert both.missing[0] == 0
     assert both.missing[1] == pytest.approx(0.5, abs=0.01)
-    assert [len(own) for own in both.ignoring] == [len(whole)] * 2
-    for own in both.ignoring:
-        assert own.K == K + 1
+    assert [len(spots) for spots in both.ignoring] == [len(whole)] * 2
+    for spots in both.ignoring:
+        assert spots.K == K + 1
     assert np.mean(both.ignoring[0].label == K) == 0
     assert np.mean(both.ignoring[1].label == K) == pytest.approx(both.missing[1])
 

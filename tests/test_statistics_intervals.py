@@ -123,7 +123,7 @@ def test_an_interval_says_its_level_and_what_follows_from_it_does_not_depend_on_
     assert mean_of([half, half]).level == 0.8
 
 
-def test_few_places_and_places_that_err_alike_leave_a_wide_interval_and_one_cube_none():
+def test_few_places_or_places_that_err_alike_leave_a_wide_interval_and_one_cube_none():
     labels = np.zeros((36 * 36, 3), dtype=int)
     labels[: 18 * 36] = 1
     labels[[5, 700, 1200], 0] ^= 1
@@ -144,7 +144,7 @@ def test_bad_frames_widen_the_interval_of_another_flight():
     assert (here.scope, again.scope, elsewhere.scope, again.frames) == (THESE_FRAMES, THIS_SCENE, OTHER_SCENES, 64)
 
 
-def test_the_interval_is_narrow_where_frames_are_alike_and_wide_where_their_quality_lasts():
+def test_the_interval_is_narrow_where_frames_are_alike_wide_where_quality_lasts():
     sums = simulated(frames=64, observations=64, side=32)
     here, again = estimate(sums, "alpha", scope=THESE_FRAMES), estimate(sums, "alpha")
     assert again.high - again.low < 0.2 * (here.high - here.low)

@@ -47,11 +47,11 @@ def frames(
     for k in range(FRAMES):
         x, y = 0.4 * k - 5.0, 0.0
         depth, labels = np.full((H, W), HEIGHT), np.full((H, W), FLOOR, np.uint8)
-        for own, (left, top) in ((PARKED, (-3.0, -5.0)), (DRIVING, place(k))):
+        for number, (left, top) in ((PARKED, (-3.0, -5.0)), (DRIVING, place(k))):
             top_of_box = HEIGHT - 3.0
             px, py = x + u * top_of_box, y + v * top_of_box
             inside = (left <= px) & (px < left + 4.0) & (top <= py) & (py < top + 4.0)
-            depth[inside], labels[inside] = top_of_box, own
+            depth[inside], labels[inside] = top_of_box, number
         pose = np.eye(4)
         pose[:3, 3] = x, y, shift * (k in shifted)
         noisy = depth * (1 + noise * rng.standard_normal((H, W)))
@@ -67,21 +67,21 @@ def sampled(some: Iterator[Frame], *, moving: bool = True) -> SpotObservations:
 
 def classes(spots: SpotObservations) -> np.ndarray:
     """The class of each spot, which is the same in all views; -1 for one without answers."""
-    own = np.full(len(spots.point), -1)
-    own[spots.spot] = spots.label
-    return own
+    class_of = np.full(len(spots.point), -1)
+    class_of[spots.spot] = spots.label
+    return class_of
 
 
 @pytest.mark.parametrize("noise", [0.0, 0.005])
 def test_what_drives_has_moved_and_what_stands_has_not(noise: float) -> None:
     spots = sampled(frames(noise=noise))
-    own, votes = classes(spots), spots.votes
+    class_of, votes = classes(spots), spots.votes
     assert votes is not None
-    assert votes.moved[own == DRIVING].mean() > 0.7
-    assert not votes.moved[own == PARKED].any()
-    assert votes.static[own == PARKED].mean() > 0.7
-    assert votes.moved[own == FLOOR].mean() < 0.005
-    assert votes.static[own == FLOOR].mean() > 0.7
+    assert votes.moved[class_of == DRIVING].mean() > 0.7
+    assert not votes.moved[class_of == PARKED].any()
+    assert votes.static[class_of == PARKED].mean() > 0.7
+    assert votes.moved[class_of == FLOOR].mean() < 0.005
+    assert votes.static[class_of == FLOOR].mean() > 0.7
     assert not (votes.moved & votes.static).any()
 
 
@@ -146,8 +146,8 @@ def test_votes_are_kept_in_files_and_go_with_their_spots(tmp_path) -> None:  # t
     read = SpotObservations.load(tmp_path / "spots.parquet")
     assert spots.votes is not None
     assert read.votes is not None
-    for name, own in vars(spots.votes).items():
-        np.testing.assert_array_equal(getattr(read.votes, name), own)
+    for name, values in vars(spots.votes).items():
+        np.testing.assert_array_equal(getattr(read.votes, name), values)
     half = spots.within(1 << 31)
     assert half.votes is not None
     assert 0 < len(half.point) < len(spots.point)
@@ -162,16 +162,18 @@ def test_of_long_flights_every_so_many_views_are_kept() -> None:
     for view in range(5 * MOST_KEPT):
         if memory.wants(view):
             memory.add(KeptDepth.of_image(view, np.eye(4), (1.0, 1.0, 0.0, 0.0), depth))
-    kept = [each.view for each in memory.kept]
-    assert MOST_KEPT / 2 < len(kept) <= MOST_KEPT
-    assert set(np.diff(kept)) == {8}
-    assert kept[0] == 0
+    views = [stored.view for stored in memory.kept]
+    assert MOST_KEPT / 2 < len(views) <= MOST_KEPT
+    assert set(np.diff(views)) == {8}
+    assert views[0] == 0
 
 
 def test_two_views_and_a_third_of_the_votes_decide() -> None:
-    seen, through = np.array([0, 0, 1, 3, 4, 9, 1], np.uint16), np.array([0, 2, 1, 2, 2, 1, 0], np.uint16)
+    visible, through = np.array([0, 0, 1, 3, 4, 9, 1], np.uint16), np.array([0, 2, 1, 2, 2, 1, 0], np.uint16)
     none = np.zeros(0)
-    votes = SpotVotes(seen, 0 * seen, through, 0 * seen, seen > 100, none, none > 0, np.array([1000, 3]), 0.01)
+    votes = SpotVotes(
+        visible, 0 * visible, through, 0 * visible, visible > 100, none, none > 0, np.array([1000, 3]), 0.01
+    )
     assert votes.moved.tolist() == [False, True, False, True, False, False, False]
     assert votes.static.tolist() == [False, False, False, False, True, True, False]
     # votes 2 of 2, 2 of 5, 3 of 6, and 4 of 10 or 3 of 10 at an end, with a rate of 3.5 in 1001
@@ -220,7 +222,7 @@ def test_an_unknown_spot_next_to_spots_that_moved_moved_too(around: str, spacing
     point = np.concatenate(
         [np.zeros((1, 3)), np.full((1, 3), 9.0), 1.2 * np.stack([np.cos(angle), np.sin(angle), 0 * angle], axis=1)]
     )
-    moved, static = (np.array([False, False, *(kind == each for each in around)]) for kind in "ms")
+    moved, static = (np.array([False, False, *(kind == letter for letter in around)]) for kind in "ms")
     assert next_to_moved(point, moved, static, spacing).tolist() == [told, *[False] * (len(around) + 1)]
 
 
@@ -247,16 +249,18 @@ def test_a_suspect_spot_is_confirmed_by_two_more_around_it(around: str, spacing:
     point = np.concatenate(
         [np.zeros((1, 3)), np.full((1, 3), 9.0), 1.2 * np.stack([np.cos(angle), np.sin(angle), 0 * angle], axis=1)]
     )
-    suspect, moved, static = (np.array([each == "?"] * 2 + [kind == each for kind in around]) for each in "?ms")
+    suspect, moved, static = (np.array([letter == "?"] * 2 + [kind == letter for kind in around]) for letter in "?ms")
     assert confirmed(point, suspect, moved, static, spacing)[:2].tolist() == [told, False]
     assert not confirmed(point, suspect, moved, static, spacing)[~suspect].any()
 
 
-def test_one_vote_of_four_makes_a_spot_suspect_and_with_others_it_has_moved_not_stayed() -> None:
+def test_one_vote_of_four_makes_a_spot_suspect_and_with_others_it_has_moved() -> None:
     """Spots in a row, 1 m apart: of the first three one view of four sees through, of a lone one, too."""
-    seen, through = np.array([3, 3, 3, 9, 9, 3], np.uint16), np.array([1, 1, 1, 0, 0, 1], np.uint16)
+    visible, through = np.array([3, 3, 3, 9, 9, 3], np.uint16), np.array([1, 1, 1, 0, 0, 1], np.uint16)
     point, none = np.arange(6.0)[:, None] * [1, 0, 0], np.zeros(0)
-    votes = SpotVotes(seen, 0 * seen, through, 0 * seen, seen > 100, none, none > 0, np.array([1000, 3]), 0.01)
+    votes = SpotVotes(
+        visible, 0 * visible, through, 0 * visible, visible > 100, none, none > 0, np.array([1000, 3]), 0.01
+    )
     assert votes.static.all()
     told = dataclasses.replace(votes, next_to=votes.by_neighbours(point, 2.0))
     assert told.moved.tolist() == [True] * 3 + [False] * 3
@@ -269,7 +273,7 @@ def test_one_vote_of_four_makes_a_spot_suspect_and_with_others_it_has_moved_not_
 @pytest.mark.parametrize(("ground", "beside", "kind"), [
     (10.2, 10.05, 3), (10.2, 10.01, 0), (10.05, 10.2, 0), (10.0, 10.2, 1), (9.0, 10.2, 2),
 ])  # fmt: skip
-def test_a_view_sees_through_a_spot_if_its_block_is_far_behind_and_those_around_are_not_its_surface(
+def test_a_view_sees_through_a_spot_if_its_block_and_those_around_are_far_behind(
     ground: float, beside: float, kind: int
 ) -> None:
     """A spot 10 m away; depth in its block, and in the block next to it."""
@@ -301,7 +305,7 @@ def spot_at(column: float, row: float, depth: float) -> np.ndarray:
     ({(8, 4): 10.0}, THROUGH), ({(row, 4): 0.0 for row in range(5)}, THROUGH),
     ({(row, column): 0.0 for row in range(5) for column in range(9)}, UNKNOWN),
 ])  # fmt: skip
-def test_a_view_sees_through_a_spot_if_farther_points_are_around_it_and_others_not_so_close(
+def test_a_view_sees_through_a_spot_with_farther_points_around_and_no_close_ones(
     near: dict[tuple[int, int], float], kind: int
 ) -> None:
     """A spot 10 m away, points 14 m away, and others in some directions."""
@@ -314,7 +318,7 @@ def test_a_view_sees_through_a_spot_if_farther_points_are_around_it_and_others_n
 @pytest.mark.parametrize(("left", "right", "kind"), [
     (9.7, 10.4, SEEN), (6.0, 16.0, UNKNOWN), (9.0, 9.5, HIDDEN), (10.2, 10.8, THROUGH), (10.1, 10.8, SEEN),
 ])  # fmt: skip
-def test_a_view_sees_a_spot_between_points_of_a_steep_surface_but_not_between_two_surfaces(
+def test_a_view_sees_a_spot_between_points_of_a_steep_surface_not_of_two_surfaces(
     left: float, right: float, kind: int
 ) -> None:
     depths = np.where(np.arange(9) < 4.5, left, right) * np.ones((9, 1))
@@ -335,10 +339,12 @@ def test_points_of_a_scan_close_a_circle() -> None:
     assert (view_of(depths, around=True).votes(spot, 0.001) & 3).tolist() == [THROUGH, THROUGH, UNKNOWN, UNKNOWN]
 
 
-@pytest.mark.parametrize(("depth", "shown"), [(10.0, True), (10.05, True), (10.2, False), (14.0, True), (12.0, False)])
-def test_a_spot_between_points_of_two_surfaces_lies_on_neither(depth: float, shown: bool) -> None:
+@pytest.mark.parametrize(
+    ("depth", "on_surface"), [(10.0, True), (10.05, True), (10.2, False), (14.0, True), (12.0, False)]
+)
+def test_a_spot_between_points_of_two_surfaces_lies_on_neither(depth: float, on_surface: bool) -> None:
     depths = np.where(np.arange(9) < 4.5, 10.0, 14.0) * np.ones((9, 1))
-    assert view_of(depths).at_points(spot_at(4.5, 4, depth), 0.001).tolist() == [shown]
+    assert view_of(depths).at_points(spot_at(4.5, 4, depth), 0.001).tolist() == [on_surface]
 
 
 def test_the_points_of_256_views_take_64_megabytes() -> None:
@@ -360,7 +366,7 @@ def test_a_spot_that_moved_is_lone_without_another_one_and_a_quarter_of_those_ar
     """Moved, static and unknown spots lie 2 m around a spot that moved, next to each other."""
     angle = 0.05 * np.arange(len(around))
     point = np.concatenate([np.zeros((1, 3)), 2.0 * np.stack([np.cos(angle), np.sin(angle), 0 * angle], axis=1)])
-    moved, static = (np.array([kind == each for each in "m" + around]) for kind in "ms")
+    moved, static = (np.array([kind == letter for letter in "m" + around]) for kind in "ms")
     assert lone(point, moved, static, spacing)[0] == is_lone
     assert not lone(point, moved, static, spacing)[~moved].any()
 

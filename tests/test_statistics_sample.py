@@ -19,9 +19,9 @@ SIDE, F, MOST = 40, 8, 400
 @pytest.fixture(scope="module")
 def log() -> Events:
     rng = np.random.default_rng(0)
-    seen = rng.random((SIDE**2, F)) < 0.7
-    seen[:, 0] = True
-    return log_of_evidence(soft(rng, SIDE**2, F), seen, index=grid(SIDE))
+    visible = rng.random((SIDE**2, F)) < 0.7
+    visible[:, 0] = True
+    return log_of_evidence(soft(rng, SIDE**2, F), visible, index=grid(SIDE))
 
 
 @pytest.fixture(scope="module")

@@ -130,9 +130,9 @@ def test_without_a_voxel_size_own_data_gets_what_check_suggests(wide, tmp_path) 
 def test_a_model_on_the_built_in_city_has_the_voxels_of_the_citys_own_models() -> None:
     city = {"name": "city", "options": {"width": 64, "height": 48, "frames": 8}}
     given = {"dataset": city, "check": None, "scenes": ["scene0"]}
-    own = resolve(load_config(given))
+    of_city = resolve(load_config(given))
     predicted = resolve(predicted_config([parse_predictor("colour-clusters")], None, given))
-    assert semstab.run(predicted, report=False).select()[0].map_summary.voxel_size == own.voxel_size
+    assert semstab.run(predicted, report=False).select()[0].map_summary.voxel_size == of_city.voxel_size
 
 
 def test_a_given_voxel_size_is_told_where_it_lies(wide) -> None:

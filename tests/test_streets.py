@@ -118,11 +118,11 @@ def test_the_rows_of_the_page_are_those_of_the_results(monkeypatch):
     tables = streets.tables(rows, classes)
     choices = [line.split(" | ")[:2] for line in tables.pop("choices")[2:]]
     assert len(said) == len(tables)
-    for (title, lines), shown in zip(tables.items(), said, strict=True):
+    for (title, lines), printed in zip(tables.items(), said, strict=True):
         expected = values("\n".join(lines)).splitlines()
-        assert shown[:2] == expected[:2], title
-        assert len(shown) >= 5, title
-        assert set(shown) <= set(expected), title
+        assert printed[:2] == expected[:2], title
+        assert len(printed) >= 5, title
+        assert set(printed) <= set(expected), title
     *others, (_, within_families) = [(name, alpha) for name, alpha in choices if alpha.strip()]
     values_of_alpha = sorted(alpha for _, alpha in others)
     assert f"over all streets is {values_of_alpha[0]} to {values_of_alpha[-1]};" in page

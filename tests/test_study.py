@@ -70,8 +70,8 @@ def test_every_unit_has_the_numbers_of_a_run_with_its_settings(root, tmp_path) -
     distinct = {record.key: (cell, record) for cell, record in reversed([*zip(cells, result.records, strict=True)])}
     for cell, record in distinct.values():
         (run,) = semstab.run(cell.config, out=tmp_path / "run" / record.key, report=False).runs
-        own = {"key": "", "variation": Variation(), "image_space": ImageSpace()}
-        expected, found = (to_json(dataclasses.replace(each.without_files(), **own)) for each in (run, record))
+        replaced = {"key": "", "variation": Variation(), "image_space": ImageSpace()}
+        expected, found = (to_json(dataclasses.replace(unit.without_files(), **replaced)) for unit in (run, record))
         for name in tiny_study.TIMES:
             expected.pop(name), found.pop(name)
         np.testing.assert_equal(found, expected)
@@ -346,8 +346,8 @@ def test_statistics_come_with_every_unit_and_all_of_them_where_they_are_wanted(r
 def psa_by_definition(events) -> float:
     """The mean over voxels of how often two of its observations agree."""
     voxels = [events.evidence[events.voxel == v] for v in range(len(events.ix))]
-    pairs = [[float(a @ b) for a, b in itertools.combinations(seen, 2)] for seen in voxels if len(seen) > 1]
-    return float(np.mean([np.mean(each) for each in pairs]))
+    pairs = [[float(a @ b) for a, b in itertools.combinations(vectors, 2)] for vectors in voxels if len(vectors) > 1]
+    return float(np.mean([np.mean(products) for products in pairs]))
 
 
 def test_units_fused_by_another_backend_are_checked_unless_they_differ_by_design(root, tmp_path) -> None:
@@ -406,7 +406,7 @@ def test_what_does_not_fit_together_is_refused_before_anything_is_read(root, tmp
     assert not (tmp_path / "out").exists()
 
 
-def test_a_worker_that_does_not_see_the_folder_sends_the_voxels_back_and_a_job_fails_as_a_whole(root, tmp_path) -> None:
+def test_a_worker_without_the_folder_sends_the_voxels_back_and_jobs_fail_as_a_whole(root, tmp_path) -> None:
     config = resolve(configure(root, sweeps={}, backends=["numpy"], models=["a"]))
     plan = make_plan(config)
     (cell,) = plan.units
@@ -428,9 +428,9 @@ def test_a_worker_that_does_not_see_the_folder_sends_the_voxels_back_and_a_job_f
     assert "scene 'hall' is not there" in errors[0]
 
 
-def works(model: str, identities: str, kept: str = "") -> list[Work]:
+def works(model: str, identities: str, stored: str = "") -> list[Work]:
     name, start = UnitName("s", model, "numpy"), Start("", Path())
-    units = [Unit(name, Variation(), Config(), None, each, stored=each in kept) for each in identities]
+    units = [Unit(name, Variation(), Config(), None, identity, stored=identity in stored) for identity in identities]
     return [Work(start, unit, range(1)) for unit in units]
 
 
@@ -446,4 +446,4 @@ def test_jobs_are_halved_until_every_worker_has_one_and_watched_works_stay_in_on
     assert "".join(names(job) for job in jobs_of(both, 5)) == "12345678"
     assert jobs_of([], 3) == []
     # Observers see all backends of a frame together
-    assert [names(job) for job in jobs_of(works("a", "123456", kept="15"), 9)] == ["15", "2", "3", "4", "6"]
+    assert [names(job) for job in jobs_of(works("a", "123456", stored="15"), 9)] == ["15", "2", "3", "4", "6"]

@@ -56,9 +56,9 @@ def test_a_study_interrupted_and_killed_at_random_moments_ends_with_the_same_sum
             assert len(errors.splitlines()) == 1
     assert workers
     wait_until(lambda: all(map(gone, workers)))
-    kept, counting = units(out), tiny_study.Counting()
+    finished, counting = units(out), tiny_study.Counting()
     run_study(tiny_study.configure(root, backends=["numpy"]), out, observers=[counting], report=False)
-    assert counting.kept == kept > 0
+    assert counting.kept == finished > 0
     run_study(tiny_study.configure(root, backends=["numpy"]), tmp_path / "whole", report=False)
     assert tiny_study.summary(out) == tiny_study.summary(tmp_path / "whole")
     assert not list(out.rglob(".*"))  # not even what was half-written when it was killed

@@ -51,7 +51,7 @@ def test_a_run_is_a_study_without_sweeps(tmp_path) -> None:
 def test_units_have_the_base_settings_as_a_run_of_their_own() -> None:
     settings = {"strata": [1, 3], "seed": 4, "perturbation": {"depth_noise": 0.01}, "models": ["sim-soft"]}
     plan = make_plan(resolve(load_study("paper", {**settings, "scene_frames": {"scene0": {"stop": 3}}})).only([]))
-    base, other, *_ = (each.config for each in plan.units)
+    base, other, *_ = (unit.config for unit in plan.units)
     assert (base.strata, base.scenes, base.check, base.models) == ([1, 3], ["scene0"], None, ["sim-soft"])
     assert (base.frames.stop, other.frames.stop) == (3, None)
     assert base.perturbation is not None

@@ -106,7 +106,10 @@ def test_a_job_that_kills_its_process_fails_and_the_others_finish(root, tmp_path
     (fine,) = [Work.of(cell, start) for cell in make_plan(config).units]
     deadly = Deadly(start, dataclasses.replace(fine.unit, identity="deadly"), range(1))
     jobs = iter([(deadly,), (fine,)])
-    done = {each.unit.identity: each for each in LocalProcesses(1).run(lambda: next(jobs, None), Observers([]))}
+    done = {
+        done_unit.unit.identity: done_unit
+        for done_unit in LocalProcesses(1).run(lambda: next(jobs, None), Observers([]))
+    }
     assert len(done) == 2
     assert done["deadly"].error.startswith("its process was killed, perhaps because memory ran out")
     assert done[fine.unit.identity].error is None

@@ -74,4 +74,4 @@ def test_from_images_to_numbers_by_the_documented_commands(data, models, tmp_pat
     classes = {(sweep, summary.map_summary.K) for (sweep, _), summary in units.items()}
     assert classes == {("base", 6), ("shared_taxonomy", 3)}
     assert all(summary.frames == 3 for summary in units.values())
-    assert [each.model for each in result.regions] == ["sam-raw"]
+    assert [region.model for region in result.regions] == ["sam-raw"]

@@ -55,9 +55,9 @@ class Mutant(NumpyReference):
         """Return the voxels (3, n) of points."""
         return np.floor(points / voxel_size).astype(np.int64)
 
-    def observed(self, seen, frame):
+    def observed(self, observations, frame):
         """Return what a frame observes."""
-        return seen
+        return observations
 
     def drift(self, drift, log):
         """Return the drift (m,) of each observation."""
@@ -145,48 +145,48 @@ class OpPlus2Above1000Pixels(Mutant):
 
 @found_by("pixels_1000")
 class AtMost1000PixelsOfAFrame(Mutant):
-    def observed(self, seen, frame):
-        return dataclasses.replace(seen, pixels=np.minimum(seen.pixels, 1000))
+    def observed(self, observations, frame):
+        return dataclasses.replace(observations, pixels=np.minimum(observations.pixels, 1000))
 
 
 @found_by("pixels_65536")
 class PixelsOfAFrameIn16Bits(Mutant):
-    def observed(self, seen, frame):
-        return dataclasses.replace(seen, pixels=seen.pixels % 65536)
+    def observed(self, observations, frame):
+        return dataclasses.replace(observations, pixels=observations.pixels % 65536)
 
 
 @found_by("pixels_65536")
 class CountsOfAClassSaturate(Mutant):
-    def observed(self, seen, frame):
-        count = np.minimum(seen.s_bar * seen.pixels[:, None], 21930)
-        return dataclasses.replace(seen, s_bar=count / count.sum(axis=1, keepdims=True))
+    def observed(self, observations, frame):
+        count = np.minimum(observations.s_bar * observations.pixels[:, None], 21930)
+        return dataclasses.replace(observations, s_bar=count / count.sum(axis=1, keepdims=True))
 
 
 # --- Many classes -----------------------------------------------------------------------------------------------------
 
 
 class KeepsSomeClasses(Mutant):
-    kept = 0
+    classes_kept = 0
 
     def finished(self, table):
         evidence = table.evidence[:].copy()
-        evidence[np.argsort(np.argsort(-evidence, axis=1, kind="stable"), axis=1) >= self.kept] = 0
+        evidence[np.argsort(np.argsort(-evidence, axis=1, kind="stable"), axis=1) >= self.classes_kept] = 0
         return replaced(table, evidence=evidence)
 
 
 @found_by("classes_41")
 class KeepsFiveClasses(KeepsSomeClasses):
-    kept = 5
+    classes_kept = 5
 
 
 @found_by("classes_41")
 class KeepsFortyClasses(KeepsSomeClasses):
-    kept = 40
+    classes_kept = 40
 
 
 @found_by("classes_300")
 class Keeps255Classes(KeepsSomeClasses):
-    kept = 255
+    classes_kept = 255
 
 
 @found_by("classes_300")
@@ -422,26 +422,26 @@ class ScoresInHalfPrecision(Mutant):
 
 @found_by("small_scores")
 class NoScoreIsBelowAMillionth(Mutant):
-    def observed(self, seen, frame):
-        return dataclasses.replace(seen, s_bar=np.where(seen.s_bar < 1e-6, 0, seen.s_bar))
+    def observed(self, observations, frame):
+        return dataclasses.replace(observations, s_bar=np.where(observations.s_bar < 1e-6, 0, observations.s_bar))
 
 
 @found_by("labels_then_scores")
 class ScoresAfterLabelsAreTheirLikeliestClass(Mutant):
-    def observed(self, seen, frame):
+    def observed(self, observations, frame):
         if frame.scores is None or not self._history:
-            return seen
-        return dataclasses.replace(seen, s_bar=np.eye(self.num_classes)[seen.s_bar.argmax(axis=1)])
+            return observations
+        return dataclasses.replace(observations, s_bar=np.eye(self.num_classes)[observations.s_bar.argmax(axis=1)])
 
 
 @found_by("labels_then_scores")
 class LabelsAfterScoresAreSmoothed(Mutant):
     soft = False
 
-    def observed(self, seen, frame):
+    def observed(self, observations, frame):
         self.soft |= frame.scores is not None
         smooth = 1e-3 if self.soft and frame.scores is None else 0
-        return dataclasses.replace(seen, s_bar=seen.s_bar * (1 - smooth) + smooth / self.num_classes)
+        return dataclasses.replace(observations, s_bar=observations.s_bar * (1 - smooth) + smooth / self.num_classes)
 
 
 @found_by("scores")
@@ -569,8 +569,8 @@ class PositionsInFloat32(Mutant):
 
 
 class CountsPixels(Mutant):
-    def observed(self, seen, frame):
-        return dataclasses.replace(seen, s_bar=seen.s_bar * seen.pixels[:, None])
+    def observed(self, observations, frame):
+        return dataclasses.replace(observations, s_bar=observations.s_bar * observations.pixels[:, None])
 
 
 class OpByPixel(Mutant):

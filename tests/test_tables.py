@@ -111,10 +111,10 @@ def voxels_of(walls, model):
 
 @pytest.mark.parametrize("model", MODELS)
 def test_the_strata_pool_the_voxels_of_all_scenes(walls, model):
-    seen, *measures = voxels_of(walls, model)
+    times, *measures = voxels_of(walls, model)
     inside = {
-        "OP=1": seen == 1, "OP=2": seen == 2, "3<=OP<=5": (seen >= 3) & (seen <= 5), "OP>5": seen > 5,
-        "OP>=3": seen >= 3,
+        "OP=1": times == 1, "OP=2": times == 2, "3<=OP<=5": (times >= 3) & (times <= 5), "OP>5": times > 5,
+        "OP>=3": times >= 3,
     }  # fmt: skip
     rows = [row for row in rows_of(walls, "persistence") if row["model"] == model]
     assert [row["persistence"] for row in rows] == list(inside)
@@ -147,11 +147,11 @@ def test_the_scenes_have_their_own_means_and_a_macro_mean(walls, model):
 @pytest.mark.parametrize("model", MODELS)
 def test_the_comparison_has_macro_and_pooled_means(walls, model):
     macro, every, recurrent = (row for row in rows_of(walls, "cross_model") if row["model"] == model)
-    seen, stability, drift, _ = voxels_of(walls, model)
+    times, stability, drift, _ = voxels_of(walls, model)
     assert every["vss"] == pytest.approx(stability.mean())
     assert every["sbd"] == pytest.approx(np.nanmean(drift))
-    assert recurrent["vss"] == pytest.approx(stability[seen >= 3].mean())
-    assert recurrent["share_percent"] == pytest.approx(100 * (seen >= 3).mean())
+    assert recurrent["vss"] == pytest.approx(stability[times >= 3].mean())
+    assert recurrent["share_percent"] == pytest.approx(100 * (times >= 3).mean())
     assert macro["vss"] == pytest.approx(statistics.mean(vss(r.table()).mean() for r in walls.select(model=model)))
     assert macro["vss"] != pytest.approx(every["vss"])
 
@@ -215,8 +215,8 @@ def test_levels_and_sweeps_pool_scenes_in_a_fixed_order():
     assert [level.repeats[0].voxels for level in levels(found, "depth_noise", "m")] == [ENOUGH + 5] * 2
     assert "together (x);" in table_of(found, "sensitivity_depth_noise").caption
     base = record(voxels((1, 1, SURE)))
-    named = [record(voxels((1, 1, SURE)), name, 1.0) for name in ("new_thing", "frame_count", "voxel_size")]
-    assert [sweep.name for sweep in swept(study(base, *named))] == ["voxel_size", "frame_count", "new_thing"]
+    variations = [record(voxels((1, 1, SURE)), name, 1.0) for name in ("new_thing", "frame_count", "voxel_size")]
+    assert [sweep.name for sweep in swept(study(base, *variations))] == ["voxel_size", "frame_count", "new_thing"]
     assert describe("new_thing").header == "New thing"
     small, large = record(voxels((1, 2, SPLIT, 0.2)), scene="x"), record(voxels((9, 1, SURE)), scene="y")
     together = pooled([small, large])
@@ -311,12 +311,12 @@ def test_latex_keeps_its_structure_whatever_the_names(name):
     plain = Table(
         "t", "x", "x", (Column("a", "x"), Column("b", "B", 0)), (Group("x", (("x", 1),)), Group("y", (("y", 2),)))
     )
-    named = Table(
+    renamed = Table(
         "t", name, name, (Column("a", name), Column("b", "B", 0)), (Group(name, ((name, 1),)), Group("y", (("y", 2),)))
     )
-    counts = [[len(re.findall(rf"(?<!\\){c}", to_latex(t))) for c in ("&", "%", "#")] for t in (plain, named)]
+    counts = [[len(re.findall(rf"(?<!\\){c}", to_latex(t))) for c in ("&", "%", "#")] for t in (plain, renamed)]
     assert counts[0] == counts[1]
-    unescaped = re.sub(r"\\[{}$]", "", to_latex(named))
+    unescaped = re.sub(r"\\[{}$]", "", to_latex(renamed))
     assert unescaped.count("{") == unescaped.count("}")
     assert unescaped.count("$") % 2 == 0
 

@@ -35,20 +35,20 @@ def frame(index: int = 0, dtype: str = "float32") -> semstab.Frame:
 @pytest.mark.parametrize("k", [1, 3, K, K + 1])
 def test_the_largest_are_kept_and_of_equal_ones_the_lowest(dtype, k) -> None:
     whole = frame(dtype=dtype)
-    kept = keep_largest(whole, k)
-    np.testing.assert_array_equal(kept.valid, whole.valid)
+    largest = keep_largest(whole, k)
+    np.testing.assert_array_equal(largest.valid, whole.valid)
     order = np.argsort(-whole.scores, axis=2, kind="stable")[..., :k]
     expected = np.zeros_like(whole.scores)
     np.put_along_axis(expected, order, np.take_along_axis(whole.scores, order, 2), 2)
-    np.testing.assert_array_equal(kept.scores[whole.valid], expected[whole.valid])
-    assert kept.scores.dtype == whole.scores.dtype
+    np.testing.assert_array_equal(largest.scores[whole.valid], expected[whole.valid])
+    assert largest.scores.dtype == whole.scores.dtype
     if k >= K:
-        assert kept.scores_left_out is None
+        assert largest.scores_left_out is None
         return
     some = np.isfinite(whole.scores).all(axis=2) & (whole.scores.sum(axis=2) > 0)
     lost = 1 - expected[some].sum(axis=1, dtype=float) / whole.scores[some].sum(axis=1, dtype=float)
-    assert kept.scores_left_out.mean == pytest.approx(lost.mean(), rel=1e-6)
-    assert kept.scores_left_out.most == pytest.approx(lost.max(), rel=1e-6)
+    assert largest.scores_left_out.mean == pytest.approx(lost.mean(), rel=1e-6)
+    assert largest.scores_left_out.most == pytest.approx(lost.max(), rel=1e-6)
 
 
 @pytest.mark.parametrize("k", [1, 2, 5])
@@ -61,9 +61,9 @@ def test_a_belief_changes_by_at_most_the_share_that_is_left_out(k) -> None:
         left_out = 1 - np.divide(cut.scores.sum(2), whole.scores.sum(2), where=whole.valid, out=np.zeros(whole.shape))
         share = np.stack([left_out, 1 - left_out], axis=2)  # fused like evidence, it is averaged like evidence
         share[~whole.valid] = 0
-        for map_, seen in zip(maps, (whole, cut, dataclasses.replace(whole, scores=share.clip(0, 1))), strict=True):
-            padded = np.concatenate([seen.scores, np.zeros((*seen.shape, K - seen.scores.shape[2]))], axis=2)
-            map_.integrate(dataclasses.replace(seen, scores=padded))
+        for map_, given in zip(maps, (whole, cut, dataclasses.replace(whole, scores=share.clip(0, 1))), strict=True):
+            padded = np.concatenate([given.scores, np.zeros((*given.shape, K - given.scores.shape[2]))], axis=2)
+            map_.integrate(dataclasses.replace(given, scores=padded))
     exact, cut_off, lost = (map_.table() for map_ in maps)
     bound = lost.evidence[:, 0] / lost.op
     beliefs = [table.evidence[:] / table.op[:, None] for table in (exact, cut_off)]

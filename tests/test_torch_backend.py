@@ -92,8 +92,8 @@ def survey(seed, camera=(4.5e5, 5.5e6, 80.0), shape=(90, 160)):
 def voxel_of_pixels(frame, dtype):
     """(H, W, 3) voxel indices from the map's origin, as the backend finds them."""
     origin = tuple(int(x) for x in np.floor(frame.T_wc[:3, 3] / 0.2))
-    seen = torch_operations.associate(DepthView(torch.tensor(frame.depth), frame), MapGrid(0.2, origin, dtype))
-    key = seen.keys[seen.voxel.to(torch.int64)].numpy()
+    association = torch_operations.associate(DepthView(torch.tensor(frame.depth), frame), MapGrid(0.2, origin, dtype))
+    key = association.keys[association.voxel.to(torch.int64)].numpy()
     return np.stack([key >> 42, (key >> 21) & (2**21 - 1), key & (2**21 - 1)], axis=-1) - 2**20 + origin
 
 
@@ -131,9 +131,11 @@ def test_the_numbers_do_not_depend_on_how_pixels_are_grouped(monkeypatch):
 
 def test_sums_of_scores_are_as_fine_as_they_say():
     """10^5 pixels of share 1/3 in one voxel, in units of 2^-45 (17 bits count the pixels), each rounded to nearest."""
-    seen = torch_operations.Association(torch.zeros(1, dtype=torch.int64), torch.zeros((100, 1000), dtype=torch.int32))
+    association = torch_operations.Association(
+        torch.zeros(1, dtype=torch.int64), torch.zeros((100, 1000), dtype=torch.int32)
+    )
     values = torch.tensor([[1.0], [2.0]]).expand(2, 10**5)
-    evidence = torch_operations.sum_scores(seen, torch_storage.Scores(values, softmax=False), 2)
+    evidence = torch_operations.sum_scores(association, torch_storage.Scores(values, softmax=False), 2)
     assert evidence.scale == 2.0**45
     s_bar = evidence.sums[:, 0].to(torch.float64) / (evidence.scale * evidence.pixels)
     assert s_bar.tolist() == pytest.approx([1 / 3, 2 / 3], abs=2.0**-46)
@@ -215,12 +217,12 @@ def test_inference_mode_leaves_the_map_as_usable_outside():
     with torch.inference_mode():
         inside = new_map(1.0, 3)
         logits = torch.nn.functional.one_hot(torch.tensor(frames[1].labels, dtype=torch.int64), 3) * 100.0
-        for each in (backend, inside):
-            each.integrate(frames[0])
-            fuse_tensors(each, frames[1], logits=logits.permute(2, 0, 1))
-    for each in (backend, inside):
-        each.integrate(frames[2])
-        assert_same_map(each.table(), fused(frames, voxel_size=1.0, num_classes=3), 1e-6)
+        for backend_map in (backend, inside):
+            backend_map.integrate(frames[0])
+            fuse_tensors(backend_map, frames[1], logits=logits.permute(2, 0, 1))
+    for backend_map in (backend, inside):
+        backend_map.integrate(frames[2])
+        assert_same_map(backend_map.table(), fused(frames, voxel_size=1.0, num_classes=3), 1e-6)
 
 
 def test_a_pose_may_be_a_tensor():

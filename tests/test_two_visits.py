@@ -88,7 +88,7 @@ def test_alpha_within_is_the_one_of_a_run_if_all_spots_are_common() -> None:
 def test_boxes_that_go_and_come_are_changes_of_the_surface_and_not_of_labels() -> None:
     spots = visited(flown([(-4, -6), (1, 2)]), flown([(-4, -6), (4, -4)], shift=0.3))
     point, change = spots.spots.point, spots.change
-    own = spots.dominant
+    class_of = spots.dominant
     on_box = point[:, 2] < HEIGHT - 1
     left, gone, new = (
         on_box & (np.abs(point[:, :2] - middle) < 2.2).all(axis=1) for middle in ((-2, -4), (3, 4), (6, -2))
@@ -98,18 +98,18 @@ def test_boxes_that_go_and_come_are_changes_of_the_surface_and_not_of_labels() -
     assert (change[left] == STAYED).mean() > 0.6
     assert not np.isin(change[left | ~on_box], (GONE, NEW)).any()
     told = two_visits(spots)
-    box = next(each for each in told.classes if each.name == "box")
+    box = next(row for row in told.classes if row.name == "box")
     assert box.gone == pytest.approx(0.5, abs=0.15)
     assert box.new == pytest.approx(0.5, abs=0.15)
     assert told.relabelled < 0.01
     assert told.alpha.across.value > 0.95
-    assert own[0][gone].max() == 1
+    assert class_of[0][gone].max() == 1
 
 
 def test_labels_that_change_are_told_by_class() -> None:
     told = two_visits(visited(flown([(0, 0)]), flown([(0, 0)], other=0.25, shift=0.3)))
     assert told.gone == told.new == 0
-    floor = next(each for each in told.classes if each.name == "floor")
+    floor = next(row for row in told.classes if row.name == "floor")
     assert floor.becomes == "wet"
     assert floor.relabelled == pytest.approx(0.25, abs=0.08)
     assert told.by_chance < 0.01
@@ -174,8 +174,8 @@ def runs(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def test_the_command_tells_agreement_across_and_writes_a_folder(runs: Path) -> None:
-    shown = bench("compare", "noon", "evening", "--same-place", "--out", "both", cwd=runs, columns=80).stdout
-    assert "alpha within noon" in shown
+    screen = bench("compare", "noon", "evening", "--same-place", "--out", "both", cwd=runs, columns=80).stdout
+    assert "alpha within noon" in screen
     content = json.loads((runs / "both/visits.json").read_text(encoding="utf-8"))
     (scene,) = content["scenes"]
     alpha = scene["visits"]["alpha"]

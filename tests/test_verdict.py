@@ -93,7 +93,7 @@ def test_the_share_of_pairs_is_that_of_views_that_both_label():
 def test_a_model_that_leaves_out_its_errors_is_no_better_of_all():
     """It leaves out 60 % of its errors: alpha rises, and what it left out is said."""
     frames, (silent, _) = list(flight(8, flicker=0.3, patch=10, seed=1)), errs_silently()
-    open_, closed = (describe(fused(own, 0.2).table(), spots=sampled(own)) for own in (frames, silent))
+    open_, closed = (describe(fused(series, 0.2).table(), spots=sampled(series)) for series in (frames, silent))
     assert open_.spots.pixels_labelled == open_.spots.pairs_labelled == 1
     assert closed.headline.alpha.value > open_.headline.alpha.value + 0.05
     of_all = closed.spots.pairs.of_all(closed.headline.alpha.value)

@@ -57,11 +57,11 @@ def test_each_clip_is_a_loop_over_pixels(video):
     labels, valid, truth, n = video
     with_truth, without = VideoConsistency(n), SelfConsistency(n)
     values = [with_truth.add(*frame) for frame in zip(labels, valid, truth, strict=True)]
-    own = [without.add(*frame) for frame in zip(labels, valid, strict=True)]
+    by_itself = [without.add(*frame) for frame in zip(labels, valid, strict=True)]
     expected = loop_over_clips(labels, valid, truth, n)
     expected_own = loop_over_clips(labels, valid, np.zeros_like(truth), n)
     assert values == close([math.nan] * min(n - 1, len(labels)) + expected)
-    assert own == close([math.nan] * min(n - 1, len(labels)) + expected_own)
+    assert by_itself == close([math.nan] * min(n - 1, len(labels)) + expected_own)
     assert with_truth.value == close(mean(expected))
     assert without.value == close(mean(expected_own))
 
@@ -126,10 +126,10 @@ def test_long_clips_do_not_overflow():
 def test_no_frame_is_kept():
     measured = VideoConsistency(16)
     labels = np.zeros((4, 4), np.uint8)
-    kept = weakref.ref(labels)
+    reference = weakref.ref(labels)
     measured.add(labels, np.ones((4, 4), bool), labels)
     del labels
-    assert kept() is None
+    assert reference() is None
 
 
 def test_a_map_that_the_caller_reuses_is_compared_as_it_was():

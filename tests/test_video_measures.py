@@ -60,7 +60,7 @@ def frames_of(name, source):
 
 def by_hand(flow, frames):
     """TC over all pixels that stay in the image, and over those that are not hidden, in the three forms."""
-    every, seen = ([TemporalConsistency(7, form) for form in FORMS] for _ in range(2))
+    of_all, of_visible = ([TemporalConsistency(7, form) for form in FORMS] for _ in range(2))
     for a, b in itertools.pairwise(frames):
         if flow == "depth":
             motion, visible = flow_by_depth(a, b, depth_tolerance=math.inf)[0], flow_by_depth(a, b)[1]
@@ -70,10 +70,10 @@ def by_hand(flow, frames):
         x, y = np.rint(np.arange(WIDTH) + motion[..., 0]), np.rint(np.arange(HEIGHT)[:, None] + motion[..., 1])
         inside = (x >= 0) & (x < WIDTH) & (y >= 0) & (y < HEIGHT)
         warped = warp_labels(b.predicted, motion)
-        for all_pixels, not_hidden in zip(every, seen, strict=True):
+        for all_pixels, not_hidden in zip(of_all, of_visible, strict=True):
             all_pixels.add(a.predicted, warped, inside)
             not_hidden.add(a.predicted, warped, inside & visible)
-    return [metric.value for metric in every], [metric.value for metric in seen]
+    return [metric.value for metric in of_all], [metric.value for metric in of_visible]
 
 
 def test_a_run_says_what_the_metrics_say_of_its_frames(run):
@@ -82,13 +82,13 @@ def test_a_run_says_what_the_metrics_say_of_its_frames(run):
     for record in records:
         name, found = record["scene"], record["video_measures"]
         frames, truths = frames_of(name, "sim-flicker"), frames_of(name, "gt")
-        published, own, alone = VideoConsistency(8), VideoConsistency(8), SelfConsistency(8)
+        published, of_truth, alone = VideoConsistency(8), VideoConsistency(8), SelfConsistency(8)
         for frame, truth in zip(frames, truths, strict=True):
             labelled = frame.predicted != 255
             published.add(frame.predicted, np.ones((HEIGHT, WIDTH), bool), truth.predicted)
-            own.add(frame.predicted, labelled & (truth.predicted != 255), truth.predicted)
+            of_truth.add(frame.predicted, labelled & (truth.predicted != 255), truth.predicted)
             alone.add(frame.predicted, labelled)
-        pairs = (("vc8_published", published.published), ("vc8", own.value), ("self_vc8", alone.value))
+        pairs = (("vc8_published", published.published), ("vc8", of_truth.value), ("self_vc8", alone.value))
         assert found["flow"] == flow
         assert {name: found[name]["value"] for name, _ in pairs} == pytest.approx(dict(pairs), abs=1e-12)
         assert (found["vc8_published"]["clips"], found["self_vc8"]["clips"]) == (len(frames) - 8, len(frames) - 7)
@@ -108,8 +108,8 @@ def test_the_table_has_each_scene_and_all_of_them_as_one_set_of_videos(run):
     if flow == "depth":
         for name in ("scene0", "scene3"):
             for a, b in itertools.pairwise(frames_of(name, "sim-flicker")):
-                motion, seen = flow_by_depth(a, b)
-                together.add(a.predicted, warp_labels(b.predicted, motion), seen)
+                motion, visible = flow_by_depth(a, b)
+                together.add(a.predicted, warp_labels(b.predicted, motion), visible)
         assert total["tc_seen_etc"] == pytest.approx(together.value)
         assert total["tc_seen_vspw"] == pytest.approx(together.of("vspw"))
     assert total["tc_ssp"] == pytest.approx((first["tc_ssp"] + second["tc_ssp"]) / 2)

@@ -47,13 +47,13 @@ def test_the_motion_is_removed(tmp_path) -> None:
 
 def test_flicker_is_the_share_of_what_changed(tmp_path) -> None:
     """A block of a static image has another class in every second frame."""
-    image, labels = (each[:, :W] for each in texture())
+    image, labels = (pixels[:, :W] for pixels in texture())
     for k in range(6):
         (tmp_path / "labels/net").mkdir(parents=True, exist_ok=True)
         cv2.imwrite(str(tmp_path / f"{k}.png"), image)
-        own = labels.copy()
-        own[:24] = k % 2
-        cv2.imwrite(str(tmp_path / f"labels/net/{k}.png"), own)
+        flickering = labels.copy()
+        flickering[:24] = k % 2
+        cv2.imwrite(str(tmp_path / f"labels/net/{k}.png"), flickering)
     (record,) = semstab.run(options(tmp_path), out=tmp_path / "out", report=False).records
     assert record.image_space.flicker_percent == pytest.approx(25)
     assert record.image_space.compensated_flicker_percent == pytest.approx(25)
@@ -66,7 +66,7 @@ def test_flicker_is_the_share_of_what_changed(tmp_path) -> None:
 def test_the_frames_that_are_wrong_stand_out_and_not_those_beside_them(tmp_path) -> None:
     result = semstab.run(options(write(tmp_path / "clip", wrong=(5, 12))), out=tmp_path / "out", report=False)
     flips, right = (result.record(model=name) for name in ("flips", "right"))
-    assert sorted(each.name for each in flips.outlying_frames.frames) == ["0005", "0012"]
+    assert sorted(outlier.name for outlier in flips.outlying_frames.frames) == ["0005", "0012"]
     assert right.outlying_frames.frames == ()
     assert [row["name"] for row in rows_of(flips.series) if row["outlying"] == "1"] == ["0005", "0012"]
     with np.load(tmp_path / "out/overview/clip__flips.npz") as pictures:
@@ -76,10 +76,10 @@ def test_the_frames_that_are_wrong_stand_out_and_not_those_beside_them(tmp_path)
 def test_a_pixel_stands_alone_where_both_neighbours_agree(tmp_path) -> None:
     first, middle, last = frames(write(tmp_path / "clip"))[:3]
     still = Correspondence(np.arange(H * W, dtype=np.int32).reshape(H, W))
-    own = lone_pixels(middle, [(first, still), (last, still)])
+    lone = lone_pixels(middle, [(first, still), (last, still)])
     a, b, c = first.labels, middle.labels, last.labels
-    assert own.pixels == H * W
-    assert own.share == pytest.approx(np.mean((a == c) & (a != b)))
+    assert lone.pixels == H * W
+    assert lone.share == pytest.approx(np.mean((a == c) & (a != b)))
 
 
 def test_a_change_of_the_size_begins_anew(tmp_path) -> None:
@@ -122,8 +122,8 @@ def test_runs_over_videos_are_shown_compared_and_gated(tmp_path) -> None:
     folder = write(tmp_path / "clip", wrong=(3, 5, 8, 12, 16))
     result = semstab.run(options(folder), out=tmp_path / "out", report=False)
     right, flips = (result.record(model=name) for name in ("right", "flips"))
-    shown = bench("show", "out", cwd=tmp_path).stdout
-    assert "least flicker first: 1. right, 2. flips" in shown
+    screen = bench("show", "out", cwd=tmp_path).stdout
+    assert "least flicker first: 1. right, 2. flips" in screen
     assert "0005" in bench("show", "out", "frames", cwd=tmp_path).stdout
     (scene,) = semstab.compare(tmp_path / "out:right", tmp_path / "out:flips").scenes
     ((row,),) = (against.contrasts for against in scene.against)
@@ -270,8 +270,8 @@ def _numbers(out):
 def test_truth_of_unknown_classes_is_left_out_and_named(tmp_path, caplog) -> None:
     folder = write(tmp_path / "clip")
     shutil.copytree(folder / "labels/right", folder / "labels/gt")
-    known = open_dataset("video", {"root": folder, "classes": CLASSES}).scene("clip")
-    assert known.ground_truth
+    with_classes = open_dataset("video", {"root": folder, "classes": CLASSES}).scene("clip")
+    assert with_classes.ground_truth
     assert not caplog.records
     unknown = open_dataset("video", {"root": folder}).scene("clip")
     assert not unknown.ground_truth

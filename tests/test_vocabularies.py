@@ -130,7 +130,7 @@ def test_other_numbers_of_names_do_not_change_alpha(tmp_path):
     vocabulary(tmp_path, "two", names=["room", {"name": "thing", "synonyms": ["a", "b", "c"]}], threshold=0.2)
     bench("room", "--voxel-size", "0.2", "-o", "run", "--vocabulary", "five.yaml", "--vocabulary", "two.yaml",
           "--no-truth", *UNCHECKED, cwd=tmp_path)  # fmt: skip
-    files = {each.unit.model: each.observations_file for each in semstab.load_result(tmp_path / "run").select()}
+    files = {record.unit.model: record.observations_file for record in semstab.load_result(tmp_path / "run").select()}
     names = over_one_model([*files])
     assert names == ("net@five", "net@two")
     samples = {name: SpotObservations.load(files[name]) for name in names}
@@ -189,21 +189,21 @@ def test_each_name_is_left_out_in_one_run(tmp_path):
     assert changed == pytest.approx(100 * np.mean(full.label == CLASSES.index("crate")))  # others keep their label
     assert most == "crate to room"
     assert share > 90
-    shown = bench("show", "run", "prompts", cwd=tmp_path).stdout
-    assert "without shelf" in shown
+    screen = bench("show", "run", "prompts", cwd=tmp_path).stdout
+    assert "without shelf" in screen
 
 
 def test_names_change_as_the_text_beside_the_file_says(tmp_path, monkeypatch):
     """Names are left out, added and renamed; a new name is encoded, the others are not encoded again."""
     from semstab.predict import vocabulary as module
 
-    known = {
+    vectors = {
         name: row.astype(np.float32)
         for name, row in zip((*CLASSES, "lamp", "rack"), [*EMBEDDINGS, *EMBEDDINGS[:2] + 1], strict=True)
     }
     asked = []
     monkeypatch.setattr(
-        module, "_encoded", lambda encoder, words, path: (asked.append(words), np.stack([known[w] for w in words]))[1]
+        module, "_encoded", lambda encoder, words, path: (asked.append(words), np.stack([vectors[w] for w in words]))[1]
     )
     path = tmp_path / "five.yaml"
     path.write_text(yaml.safe_dump({"names": [*CLASSES], "encoder": {"checkpoint": "clip"}}))
@@ -214,7 +214,7 @@ def test_names_change_as_the_text_beside_the_file_says(tmp_path, monkeypatch):
     assert renamed.space.classes == tuple("rack" if name == "shelf" else name for name in CLASSES)
     assert asked == [[*CLASSES], ["lamp"], ["rack"]]
     for words in (full, other, renamed):
-        expected = np.stack([known[name] / np.linalg.norm(known[name]) for name in words.space.classes])
+        expected = np.stack([vectors[name] / np.linalg.norm(vectors[name]) for name in words.space.classes])
         assert words.embeddings == pytest.approx(expected, abs=1e-6)
 
 

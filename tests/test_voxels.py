@@ -137,11 +137,11 @@ def tables(draw):
     columns |= {name: draw(hnp.arrays(np.int32, n, elements=int32)) for name in ("op", "first_frame", "last_frame")}
     columns |= {name: draw(hnp.arrays(np.float64, n)) for name in SUMS[1:]}
     columns |= {"pixels": draw(hnp.arrays(np.int64, n)), "evidence": draw(hnp.arrays(np.float64, (n, K)))}
-    named = tuple(draw(st.lists(st.text(min_size=1), min_size=K, max_size=K)))
+    names = tuple(draw(st.lists(st.text(min_size=1), min_size=K, max_size=K)))
     return VoxelTable(
         **columns,
         voxel_size=draw(st.floats(1e-3, 1e3)),
-        classes=draw(st.sampled_from([(), named])),
+        classes=draw(st.sampled_from([(), names])),
     )
 
 

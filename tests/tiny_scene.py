@@ -22,9 +22,9 @@ def write(root: Path, models: tuple[str, ...] = ("a", "b"), frames: int = FRAMES
         for model in models:
             wrong = rng.random(labels.shape) < noise
             sources[model].append(np.where(wrong, (labels + 1) % 3, labels).astype(np.uint8))
-    seen = {name: [frame(i, labels) for i, labels in enumerate(maps)] for name, maps in sources.items()}
+    views = {name: [frame(i, labels) for i, labels in enumerate(maps)] for name, maps in sources.items()}
     names = [f"{i:04d}" for i in range(frames)]
-    return write_posed(root, names, seen, classes=["wall", "door", "window"], up_axis="-y")
+    return write_posed(root, names, views, classes=["wall", "door", "window"], up_axis="-y")
 
 
 def frame(i: int, labels: np.ndarray) -> Frame:

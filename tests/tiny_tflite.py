@@ -27,24 +27,28 @@ def write(path: Path, size: tuple[int, int] = (32, 64), *, inputs: int = 1, quan
     kinds = schema.TensorType
 
     def tensor(name: str, shape: tuple[int, ...], values: np.ndarray | None = None, kind: int = kinds.FLOAT32) -> int:
-        each = schema.TensorT()
-        each.name, each.shape, each.type, each.buffer = name, list(shape), kind, 0
+        made_tensor = schema.TensorT()
+        made_tensor.name, made_tensor.shape, made_tensor.type, made_tensor.buffer = name, list(shape), kind, 0
         if values is not None:
             buffer = schema.BufferT()
             buffer.data = np.frombuffer(values.tobytes(), np.uint8)
             made.buffers.append(buffer)
-            each.buffer = len(made.buffers) - 1
-        graph.tensors.append(each)
+            made_tensor.buffer = len(made.buffers) - 1
+        graph.tensors.append(made_tensor)
         return len(graph.tensors) - 1
 
     def operator(code: int, version: int, inside: list[int], out: int) -> schema.OperatorT:
         kind = schema.OperatorCodeT()
         kind.builtinCode, kind.deprecatedBuiltinCode, kind.version = code, code, version
         made.operatorCodes.append(kind)
-        each = schema.OperatorT()
-        each.opcodeIndex, each.inputs, each.outputs = len(made.operatorCodes) - 1, inside, [out]
-        graph.operators.append(each)
-        return each
+        made_operator = schema.OperatorT()
+        made_operator.opcodeIndex, made_operator.inputs, made_operator.outputs = (
+            len(made.operatorCodes) - 1,
+            inside,
+            [out],
+        )
+        graph.operators.append(made_operator)
+        return made_operator
 
     made.operatorCodes = []
     height, width = size

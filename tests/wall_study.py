@@ -27,7 +27,7 @@ CLASSES = ["wall", "door_1", "window & <sill>", "ghost"]
 
 def write_wall(folder: Path, step: float) -> None:
     """A camera that looks along z at a wall 2.03 m away and moves to the right; blocks of 4 x 4 pixels err together."""
-    seen: dict[str, list[Frame]] = {"gt": [], **{model: [] for model in MODELS}}
+    views: dict[str, list[Frame]] = {"gt": [], **{model: [] for model in MODELS}}
     camera = Intrinsics(FOCAL, FOCAL, WIDTH / 2, HEIGHT / 2)
     depth = np.full((HEIGHT, WIDTH), 2.03, np.float32)
     for i in range(FRAMES):
@@ -36,12 +36,12 @@ def write_wall(folder: Path, step: float) -> None:
         pose = np.eye(4)
         pose[:3, 3] = [step * i + 0.003, 0.003, 0.0]
         color = np.repeat(truth[..., None] * 80, 3, axis=2).astype(np.uint8)
-        seen["gt"].append(Frame(i, depth, camera, pose, labels=truth, color=color))
+        views["gt"].append(Frame(i, depth, camera, pose, labels=truth, color=color))
         for k, (model, share) in enumerate(MODELS.items()):
             wrong = np.random.default_rng([k, i]).random((HEIGHT // 4, WIDTH // 4)) < share
             labels = np.where(np.kron(wrong, np.ones((4, 4), bool)), (truth + 1) % 3, truth).astype(np.uint8)
-            seen[model].append(Frame(i, depth, camera, pose, labels=labels, color=color))
-    write_posed(folder, [f"{i:04d}" for i in range(FRAMES)], seen, classes=CLASSES, up_axis="-y")
+            views[model].append(Frame(i, depth, camera, pose, labels=labels, color=color))
+    write_posed(folder, [f"{i:04d}" for i in range(FRAMES)], views, classes=CLASSES, up_axis="-y")
 
 
 @functools.cache

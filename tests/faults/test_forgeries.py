@@ -11,7 +11,7 @@ from corners import combination
 RESULTS = Path(__file__).parents[2] / "results"
 
 
-@pytest.mark.parametrize(("named", "model", "one_in"), [
+@pytest.mark.parametrize(("name", "model", "one_in"), [
     ("apc_shelf@1", "fcn-scores", 1), ("livingroom@1", "dicenet-0.2", 6),
     pytest.param("livingroom@1", "espnetv2-1.0", 1, marks=combination),
     pytest.param("city@1", "trick-world-locked", 6, marks=combination),
