@@ -13,7 +13,7 @@ from collections.abc import Mapping
 from functools import partial
 from typing import Any, Protocol, cast
 
-from semstab.core.registry import BY_RULE, Entry, Registry
+from semstab.core.registry import BY_RULE, Registration, Registry
 from semstab.data.events import Events
 from semstab.data.frames import Frame
 from semstab.data.results import Changes, FrameReport
@@ -30,28 +30,28 @@ WITH_OPEN3D = f"pip install semstab, and on Debian or Ubuntu: apt-get install {O
 REGISTRY = Registry(
     "backend",
     {
-        "numpy": Entry(
+        "numpy": Registration(
             "semstab.backends.numpy_reference:NumpyReference",
             "the reference: each metric from its definition",
         ),
-        "numba": Entry(
+        "numba": Registration(
             "semstab.backends.numba_hash:NumbaHash",
             "the fastest on a CPU: a hash map in compiled code",
             install="pip install semstab",
         ),
-        "open3d": Entry(
+        "open3d": Registration(
             "semstab.backends.open3d_blocks:Open3DBlocks",
             "Open3D's VoxelBlockGrid with semantics; CPU or CUDA",
             install=WITH_OPEN3D,
             needs=("open3d",),
         ),
-        "torch": Entry(
+        "torch": Registration(
             "semstab.backends.torch_map:TorchMap",
             "the fastest on a CUDA device: a hash map of tensors",
             install="pip install 'semstab[torch]'",
             needs=("torch",),
         ),
-        "open3d-projective": Entry(
+        "open3d-projective": Registration(
             "semstab.backends.open3d_projective:Open3DProjective",
             "voxels look up their pixel, as Open3D's integration",
             install=WITH_OPEN3D,

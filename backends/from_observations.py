@@ -62,7 +62,7 @@ class FromObservations(ABC):
     ) -> None:
         self.check_options(voxel_size, num_classes, rule, rule_options)
         self.voxel_size, self.num_classes = voxel_size, num_classes
-        self._rule = Rule.of(rule, rule_options)
+        self._rule = Rule.from_name(rule, rule_options)
         self._row: defaultdict[bytes, int] = defaultdict(itertools.count().__next__)  # voxel, as bytes -> its row
         self._state = np.zeros((0, num_classes))  # row by row, like the columns with room for more rows
         self._columns: dict[str, npt.NDArray[Any]] = {name: np.zeros(0, kind) for name, kind in COLUMNS.items()}
@@ -75,7 +75,7 @@ class FromObservations(ABC):
     ) -> None:
         """Raise ConfigError for settings that no map can have."""
         check_settings(voxel_size, num_classes)
-        Rule.of(rule, rule_options)
+        Rule.from_name(rule, rule_options)
 
     @staticmethod
     def expected_bytes(voxels: int, observations: int, num_classes: int) -> int:

@@ -215,7 +215,7 @@ class NumbaHash:
             )  # fmt: skip
         vss, entropy, _, recurrent = sums.sum(axis=0)
         drift = sums[:, 2].sum()
-        return Change.of((observations.pixels.sum(), n, new, drift, vss, entropy, recurrent)), row
+        return Change.from_sums((observations.pixels.sum(), n, new, drift, vss, entropy, recurrent)), row
 
     def changes(self) -> Changes | None:
         """Return the changes by the last frame."""

@@ -42,7 +42,7 @@ ODD = np.array([-0x61C8864680B583EB, -0x3D4D51C2D82B14B1, 0x165667B19E3779F9])
 """The factors, one an axis, that mix an index's bits (odd numbers of Steele and Vigna's splitmix and of xxHash)."""
 
 
-class _Seen(NamedTuple):
+class _FrameEntry(NamedTuple):
     """The evidence of a frame for voxels, by their rows (n,): mean evidence, of which most is 0, and pixels (n,)."""
 
     rows: Int32
@@ -60,7 +60,7 @@ class NumpyHistory:
         self.num_classes = num_classes
         self.within = within
         self._row: defaultdict[bytes, int] = defaultdict(itertools.count().__next__)  # voxel q, as bytes -> its row
-        self._history: list[_Seen] = []  # frame after frame
+        self._history: list[_FrameEntry] = []  # frame after frame
 
     check_options = staticmethod(check_settings)
 
@@ -71,7 +71,7 @@ class NumpyHistory:
         observations = self._observe(frame)
         rows = self._rows(observations)
         self._history.append(
-            _Seen(rows.astype(np.int32), frame.index, Evidence.of(observations.s_bar), observations.pixels)
+            _FrameEntry(rows.astype(np.int32), frame.index, Evidence.from_rows(observations.s_bar), observations.pixels)
         )
         return rows, observations
 
@@ -90,7 +90,7 @@ class NumpyHistory:
         frame = np.concatenate([nothing, *(np.full(len(stored.rows), stored.frame) for stored in self._history)])
         pixels = np.concatenate([nothing, *(stored.pixels for stored in self._history)])
         s_bar = Evidence.joined(
-            [Evidence.of(np.zeros((0, self.num_classes))), *(stored.s_bar for stored in self._history)]
+            [Evidence.from_rows(np.zeros((0, self.num_classes))), *(stored.s_bar for stored in self._history)]
         )
         by_voxel = np.argsort(voxel, kind="stable")  # stable: keeps the order of integration within a voxel
         return Events(

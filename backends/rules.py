@@ -142,7 +142,7 @@ class Rule:
     reads: Callable[[Float64], Float64]
 
     @classmethod
-    def of(cls, name: str, options: Mapping[str, Any] | None = None) -> Rule:
+    def from_name(cls, name: str, options: Mapping[str, Any] | None = None) -> Rule:
         """Return the rule of that name, or of FILE.py:NAME.
 
         Raises:

@@ -128,7 +128,7 @@ class TorchMaps:
             ConfigError: For an unknown name.
         """
         started = time.perf_counter()
-        view = DepthView.of(depth, intrinsics, T_wc, index, self.device)
+        view = DepthView.from_depth(depth, intrinsics, T_wc, index, self.device)
         predicted = {
             name: evidence_of(of_name, view, self._columns_of(name).num_classes, _where(view, of_name.kind, name))
             for name, of_name in predictions.items()
@@ -156,7 +156,7 @@ class TorchMaps:
         self._keys = association.keys
         sums = torch.stack([of_name.sums for of_name in self._updates.values()]).tolist() if evidence else []
         return {
-            name: self._totals[name].add(view.camera.index, Change.of(of_name), started, associated)
+            name: self._totals[name].add(view.camera.index, Change.from_sums(of_name), started, associated)
             for name, of_name in zip(predicted, sums, strict=True)
         }
 

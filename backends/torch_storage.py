@@ -275,7 +275,7 @@ class DepthView:
     points: torch.Tensor | None = None
 
     @classmethod
-    def of(
+    def from_depth(
         cls, depth: Image, intrinsics: Intrinsics, T_wc: npt.ArrayLike, index: int, device: torch.device
     ) -> DepthView:
         """Return a view of a depth image on any device, copied if the image is on another device.

@@ -16,7 +16,7 @@ from semstab.conformance.files import read_case, write_rows
 def fuse(backend: str, case: Path, out: Path) -> None:
     """Fuse the frames of a case and write the table."""
     voxel_size, classes, frames = read_case(case)
-    made = create(BackendConfig.of(backend).name, voxel_size=voxel_size, num_classes=classes)
+    made = create(BackendConfig.parse(backend).name, voxel_size=voxel_size, num_classes=classes)
     for frame in frames:
         made.integrate(frame)
     write_rows(out, made.table())

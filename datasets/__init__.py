@@ -16,7 +16,7 @@ from typing import Any
 from pydantic import BaseModel
 
 from semstab.config import DatasetConfig, validated
-from semstab.core.registry import Entry, Registry
+from semstab.core.registry import Registration, Registry
 from semstab.data.records import is_run
 from semstab.datasets.scene import GROUND_TRUTH, Dataset, Filtering, Scene
 from semstab.errors import ConfigError, DataError
@@ -37,99 +37,107 @@ __all__ = [
 REGISTRY = Registry(
     "dataset",
     {
-        "predicted": Entry(
+        "predicted": Registration(
             "semstab.predict.dataset:PredictedDataset",
             "used by --predict: labels that a model makes",
         ),
-        "vocabularies": Entry(
+        "vocabularies": Registration(
             "semstab.predict.vocabulary_dataset:VocabularyDataset",
             "used by --vocabulary: labels from a model's features",
         ),
-        "frames": Entry("semstab.online.frames:Frames", "frames from a Python program, by semstab.fuse"),
-        "city": Entry(
+        "frames": Registration("semstab.online.frames:Frames", "frames from a Python program, by semstab.fuse"),
+        "city": Registration(
             "semstab.datasets.city:City",
             "built in: simulated drone flights over a made city",
         ),
-        "posed_folder": Entry(
+        "posed_folder": Registration(
             "semstab.datasets.posed_folder:PosedFolder",
             "a folder of frames: depth/, pose/, labels/MODEL/",
         ),
-        "uavid3d": Entry(
+        "uavid3d": Registration(
             "semstab.datasets.uavid3d:Uavid3d",
             "UAVid-3D-Scenes: drone scenes with metric depth",
         ),
-        "scannet": Entry("semstab.datasets.scannet:ScanNet", "ScanNet as its SensReader exports it"),
-        "replica": Entry("semstab.datasets.replica:Replica", "Replica as NICE-SLAM or Semantic-NeRF export it"),
-        "tum": Entry("semstab.datasets.tum:Tum", "TUM RGB-D: rgb.txt, depth.txt, groundtruth.txt"),
-        "seven_scenes": Entry("semstab.datasets.seven_scenes:SevenScenes", "7-Scenes: frame-NNNNNN.depth.png, ..."),
-        "transforms_json": Entry(
+        "scannet": Registration("semstab.datasets.scannet:ScanNet", "ScanNet as its SensReader exports it"),
+        "replica": Registration("semstab.datasets.replica:Replica", "Replica as NICE-SLAM or Semantic-NeRF export it"),
+        "tum": Registration("semstab.datasets.tum:Tum", "TUM RGB-D: rgb.txt, depth.txt, groundtruth.txt"),
+        "seven_scenes": Registration(
+            "semstab.datasets.seven_scenes:SevenScenes", "7-Scenes: frame-NNNNNN.depth.png, ..."
+        ),
+        "transforms_json": Registration(
             "semstab.datasets.transforms_json:TransformsJson",
             "transforms.json of nerfstudio or instant-ngp, depth",
         ),
-        "colmap": Entry("semstab.datasets.colmap:Colmap", "COLMAP models, text or binary, with depth maps"),
-        "odm": Entry("semstab.datasets.odm:Odm", "OpenDroneMap and OpenSfM projects, with mesh or DSM"),
-        "metashape": Entry("semstab.datasets.metashape:Metashape", "Agisoft Metashape cameras (XML), with mesh or DEM"),
-        "pix4d": Entry("semstab.datasets.pix4d:Pix4d", "Pix4Dmapper cameras (params), with mesh or DSM"),
-        "realitycapture": Entry(
+        "colmap": Registration("semstab.datasets.colmap:Colmap", "COLMAP models, text or binary, with depth maps"),
+        "odm": Registration("semstab.datasets.odm:Odm", "OpenDroneMap and OpenSfM projects, with mesh or DSM"),
+        "metashape": Registration(
+            "semstab.datasets.metashape:Metashape", "Agisoft Metashape cameras (XML), with mesh or DEM"
+        ),
+        "pix4d": Registration("semstab.datasets.pix4d:Pix4d", "Pix4Dmapper cameras (params), with mesh or DSM"),
+        "realitycapture": Registration(
             "semstab.datasets.realitycapture:RealityCapture",
             "RealityCapture, RealityScan cameras (CSV), with mesh",
         ),
-        "uavscenes": Entry("semstab.datasets.uavscenes:UavScenes", "UAVScenes: drone flights over four places"),
-        "bag": Entry(
+        "uavscenes": Registration("semstab.datasets.uavscenes:UavScenes", "UAVScenes: drone flights over four places"),
+        "bag": Registration(
             "semstab.datasets.bag:Bag",
             "ROS bags with colour, depth, camera info and poses",
             "pip install 'semstab[bags]'",
             ("rosbags",),
         ),
-        "bag_scans": Entry(
+        "bag_scans": Registration(
             "semstab.datasets.bag.scans:BagScans",
             "ROS bags with LiDAR clouds (PointCloud2) and poses",
             "pip install 'semstab[bags]'",
             ("rosbags",),
         ),
-        "stray_scanner": Entry("semstab.datasets.stray_scanner:StrayScanner", "recordings of the app Stray Scanner"),
-        "polycam": Entry("semstab.datasets.polycam:Polycam", "raw data of the app Polycam: keyframes/"),
-        "record3d": Entry("semstab.datasets.record3d:Record3D", "EXR and JPG sequences of the app Record3D"),
-        "arkitscenes": Entry("semstab.datasets.arkitscenes:ArkitScenes", "ARKitScenes raw data"),
-        "tartanair": Entry("semstab.datasets.tartanair:TartanAir", "TartanAir: simulated flights, NED poses"),
-        "syndrone": Entry("semstab.datasets.syndrone:Syndrone", "Syndrone: flights simulated by CARLA"),
-        "carla": Entry("semstab.datasets.carla:Carla", "CARLA camera images as it saves them, KITTI-CARLA"),
-        "airsim": Entry("semstab.datasets.airsim:AirSim", "AirSim recordings: airsim_rec.txt and images/"),
-        "hypersim": Entry(
+        "stray_scanner": Registration(
+            "semstab.datasets.stray_scanner:StrayScanner", "recordings of the app Stray Scanner"
+        ),
+        "polycam": Registration("semstab.datasets.polycam:Polycam", "raw data of the app Polycam: keyframes/"),
+        "record3d": Registration("semstab.datasets.record3d:Record3D", "EXR and JPG sequences of the app Record3D"),
+        "arkitscenes": Registration("semstab.datasets.arkitscenes:ArkitScenes", "ARKitScenes raw data"),
+        "tartanair": Registration("semstab.datasets.tartanair:TartanAir", "TartanAir: simulated flights, NED poses"),
+        "syndrone": Registration("semstab.datasets.syndrone:Syndrone", "Syndrone: flights simulated by CARLA"),
+        "carla": Registration("semstab.datasets.carla:Carla", "CARLA camera images as it saves them, KITTI-CARLA"),
+        "airsim": Registration("semstab.datasets.airsim:AirSim", "AirSim recordings: airsim_rec.txt and images/"),
+        "hypersim": Registration(
             "semstab.datasets.hypersim:Hypersim",
             "Hypersim: rendered rooms, classes of NYU40",
             "pip install 'semstab[midair]'",
             ("h5py",),
         ),
-        "habitat": Entry("semstab.datasets.habitat:Habitat", "walks that Habitat rendered, with GT_Pose.txt"),
-        "virtual_kitti": Entry(
+        "habitat": Registration("semstab.datasets.habitat:Habitat", "walks that Habitat rendered, with GT_Pose.txt"),
+        "virtual_kitti": Registration(
             "semstab.datasets.virtual_kitti:VirtualKitti", "Virtual KITTI 2: KITTI's sequences, rendered"
         ),
-        "midair": Entry(
+        "midair": Registration(
             "semstab.datasets.midair:MidAir",
             "Mid-Air: flights simulated low over land",
             "pip install 'semstab[midair]'",
             ("h5py",),
         ),
-        "semantickitti": Entry(
+        "semantickitti": Registration(
             "semstab.datasets.semantickitti:SemanticKitti", "SemanticKITTI: LiDAR scans with a class per point"
         ),
-        "semantickitti_images": Entry(
+        "semantickitti_images": Registration(
             "semstab.datasets.semantickitti_images:SemanticKittiImages",
             "SemanticKITTI: images, depth and classes by LiDAR",
         ),
-        "nuscenes": Entry("semstab.datasets.nuscenes:NuScenes", "nuScenes lidarseg: LiDAR key frames"),
-        "kitti360": Entry("semstab.datasets.kitti360:Kitti360", "KITTI-360: velodyne scans of the raw data"),
-        "kitti360_images": Entry(
+        "nuscenes": Registration("semstab.datasets.nuscenes:NuScenes", "nuScenes lidarseg: LiDAR key frames"),
+        "kitti360": Registration("semstab.datasets.kitti360:Kitti360", "KITTI-360: velodyne scans of the raw data"),
+        "kitti360_images": Registration(
             "semstab.datasets.kitti360_images:Kitti360Images",
             "KITTI-360: rectified images, depth of LiDAR points",
         ),
-        "points_folder": Entry(
+        "points_folder": Registration(
             "semstab.datasets.points_folder:PointsFolder",
             "a folder of scans: points/, pose/, labels/MODEL/",
         ),
-        "hololens": Entry("semstab.datasets.hololens:HoloLens", "DeepVideoMVS and HoloLens: poses.txt and K.txt"),
-        "video": Entry("semstab.datasets.video:Video", "images without depth and poses: a video or a folder"),
+        "hololens": Registration(
+            "semstab.datasets.hololens:HoloLens", "DeepVideoMVS and HoloLens: poses.txt and K.txt"
+        ),
+        "video": Registration("semstab.datasets.video:Video", "images without depth and poses: a video or a folder"),
     },
 )
 

@@ -53,7 +53,7 @@ class AirSimOptions(FileOptions):
 
 
 @dataclass(frozen=True)
-class Row:
+class RecordingRow:
     """A row of the recording: the vehicle, seconds, seven numbers of its pose, and its camera's files by type."""
 
     line: int
@@ -123,7 +123,7 @@ class AirSim(FileDataset[AirSimOptions]):
                 aliases=tuple(aliases),
             )
 
-    def _rows(self, folder: Path) -> list[Row]:
+    def _rows(self, folder: Path) -> list[RecordingRow]:
         """Return the rows of the vehicle."""
         path = folder / RECORDING
         rows = read_recording(path)
@@ -133,7 +133,7 @@ class AirSim(FileDataset[AirSimOptions]):
             raise DataError(f"{path}: holds rows of {', '.join(vehicles[:9])}; set vehicle to one of them")
         return [row for row in rows if row.vehicle == vehicle]
 
-    def _camera(self, folder: Path, rows: list[Row]) -> tuple[str, str]:
+    def _camera(self, folder: Path, rows: list[RecordingRow]) -> tuple[str, str]:
         """Return the camera that is asked for, or the first with depth, and the type of its depth images."""
         with_depth = [key for key in rows[0].files if key[1] in DEPTH]
         camera_name = self.options.camera
@@ -157,13 +157,13 @@ class AirSim(FileDataset[AirSimOptions]):
         return seen_across(self.options.fov, size, str(folder / "images"))
 
 
-def read_recording(path: Path) -> list[Row]:
+def read_recording(path: Path) -> list[RecordingRow]:
     """Return the rows of an airsim_rec.txt, by the names of its columns, which differ by vehicle.
 
     Raises:
         DataError: For a column that is missing, or a row that does not fit them; the message names the line.
     """
-    rows: list[Row] = []
+    rows: list[RecordingRow] = []
     columns: dict[str, int] = {}
     for line, text in records(path):
         words = [word.strip() for word in text.split("\t")]
@@ -184,7 +184,7 @@ def read_recording(path: Path) -> list[Row]:
                 raise DataError(f"{path}: line {line}: {name[:60]!r} is no image as img_CAMERA_TYPE_TIME.png or .pfm")
             files[match["camera"], match["kind"]] = name
         time = to_number(by_name["TimeStamp"], path, line) / 1000
-        rows.append(Row(line, by_name.get("VehicleName", ""), time, pose, files))
+        rows.append(RecordingRow(line, by_name.get("VehicleName", ""), time, pose, files))
     if not rows:
         raise DataError(f"{path}: holds no row; record a flight first")
     return rows

@@ -275,4 +275,4 @@ def from_geocentric(poses: Float64, crs: str, wanted: str | None, where: str) ->
         ends = projected(pose[:3, 3] + STEP / 2 * np.concatenate([np.eye(3), -np.eye(3)]))
         u, _, v = np.linalg.svd((ends[:3] - ends[3:]).T / STEP)  # the nearest rotation to the projection's derivative
         result[k, :3, :3] = u @ v @ pose[:3, :3]
-    return result, Georeference.of(wanted, tuple(offset.tolist()), where)
+    return result, Georeference.from_crs(wanted, tuple(offset.tolist()), where)

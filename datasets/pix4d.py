@@ -55,7 +55,7 @@ class Pix4d(Photographs[Pix4dOptions]):
             if len(numbers) != 3:
                 raise DataError(f"{shift}: expected three numbers, got {len(numbers)}; export the parameters again")
             offset = (numbers[0], numbers[1], numbers[2])
-        return Reconstruction(path, shots, Georeference.of(words, offset, str(projection)))
+        return Reconstruction(path, shots, Georeference.from_crs(words, offset, str(projection)))
 
 
 def read_cameras(path: Path) -> list[Shot]:

@@ -222,7 +222,7 @@ def _affine(crs: str, T: Float64, path: Path) -> Georeference:
     a, b, c, d, e, f, g, h, i = T[:3, :3].ravel().tolist()
     linear: Linear = ((a, b, c), (d, e, f), (g, h, i))
     east, north, up = T[:3, 3].tolist()
-    return Georeference.of(crs, (east, north, up), str(path), linear)
+    return Georeference.from_crs(crs, (east, north, up), str(path), linear)
 
 
 def _linearised(crs: str, path: Path) -> Georeference:
@@ -256,7 +256,7 @@ def _mercator(opensfm: Path) -> _Candidate | None:
         return None
     latitude, longitude, altitude = _reference(path)
     crs = f"+proj=tmerc +lat_0={latitude!r} +lon_0={longitude!r} +k=1 +datum=WGS84 +units=m +no_defs +type=crs"
-    georeference = Georeference.of(crs, (0.0, 0.0, altitude), str(path))
+    georeference = Georeference.from_crs(crs, (0.0, 0.0, altitude), str(path))
     return _Candidate(
         georeference, f"poses topocentric about {REFERENCE}, in a transverse Mercator projection about it"
     )

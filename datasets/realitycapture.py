@@ -87,7 +87,7 @@ class RealityCapture(Photographs[RealityCaptureOptions]):
         for shot in shots:
             shot.pose[:3, 3] -= offset
         east, north, up = offset.tolist()
-        georeference = Georeference.of(self.options.crs, (east, north, up), "option crs")
+        georeference = Georeference.from_crs(self.options.crs, (east, north, up), "option crs")
         return Reconstruction(path, shots, georeference, (0.0, 0.0, 0.0))
 
 

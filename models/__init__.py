@@ -23,7 +23,7 @@ from pydantic import BaseModel
 
 from semstab.config import validated
 from semstab.core.process import printing_aside
-from semstab.core.registry import Entry, Registry
+from semstab.core.registry import Registration, Registry
 from semstab.core.types import Float32, UInt8, UInt16
 from semstab.data.frames import Frame
 from semstab.data.labels import IGNORE_8BIT, LabelSpace
@@ -35,43 +35,45 @@ WITH_SEGFORMER, WITH_SAM = "pip install 'semstab[segformer]'", "pip install 'sem
 REGISTRY = Registry(
     "model",
     {
-        "colour-clusters": Entry(
+        "colour-clusters": Registration(
             "semstab.models.colour_clusters:ColourClusters",
             "baseline without weights: k-means of colour, texture",
         ),
-        "transformers": Entry(
+        "transformers": Registration(
             SEGMENTER,
             "any segmentation checkpoint of transformers",
             install=WITH_SEGFORMER,
             needs=NETWORKS,
         ),
-        "segformer": Entry(SEGMENTER, "the same as transformers", install=WITH_SEGFORMER, needs=NETWORKS),
-        "sam-raw": Entry(SAM + "SamRaw", "Segment Anything; regions without classes", install=WITH_SAM, needs=NETWORKS),
-        "sam-heuristic": Entry(
+        "segformer": Registration(SEGMENTER, "the same as transformers", install=WITH_SEGFORMER, needs=NETWORKS),
+        "sam-raw": Registration(
+            SAM + "SamRaw", "Segment Anything; regions without classes", install=WITH_SAM, needs=NETWORKS
+        ),
+        "sam-heuristic": Registration(
             SAM + "SamHeuristic",
             "Segment Anything; classes by rules on colour, size",
             install=WITH_SAM,
             needs=NETWORKS,
         ),
-        "sam-vote": Entry(
+        "sam-vote": Registration(
             SAM + "SamVote",
             "another model's labels, by majority in SAM's regions",
             install=WITH_SAM,
             needs=NETWORKS,
         ),
-        "segearth-ov": Entry(
+        "segearth-ov": Registration(
             "semstab.models.segearth_ov:SegEarthOV",
             "SegEarth-OV: open-vocabulary CLIP for aerial views",
             install="pip install 'semstab[segearth]'",
             needs=NETWORKS,
         ),
-        "smp": Entry(
+        "smp": Registration(
             "semstab.models.smp:SmpNetwork",
             "networks of segmentation_models_pytorch, by name",
             install="pip install 'semstab[smp]'",
             needs=("torch", "segmentation_models_pytorch"),
         ),
-        "stored": Entry("semstab.predict.predictor:Stored", "labels that the scene has already, for --filter"),
+        "stored": Registration("semstab.predict.predictor:Stored", "labels that the scene has already, for --filter"),
     },
 )
 

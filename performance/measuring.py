@@ -196,7 +196,7 @@ def same(one: Path, other: Path) -> bool:
 # --- tables -----------------------------------------------------------------------------------------------------------
 
 
-class Table:
+class MarkdownTable:
     """A table in Markdown, printed a row at a time; `rows` has all that was added, for --json."""
 
     def __init__(self, **formats: str) -> None:

@@ -28,7 +28,7 @@ OBLIQUE = 15.0, 35.0
 
 
 @dataclasses.dataclass(frozen=True)
-class Scene:
+class SceneSettings:
     """Random settings of a scene, in metres and degrees. `far` is the largest depth, `step` the way between frames.
 
     Attributes:
@@ -53,14 +53,14 @@ class Scene:
     seed: int
 
 
-def drawn(seed: int, sizes: tuple[tuple[int, int], ...] = SIZES) -> Scene:
+def drawn(seed: int, sizes: tuple[tuple[int, int], ...] = SIZES) -> SceneSettings:
     """The scene of that number."""
     rng = np.random.default_rng([seed, 1])
     kind = str(rng.choice(KINDS))
     width, height = sizes[rng.integers(len(sizes))]
     inside = kind == "walls"
     altitude = _log_uniform(rng, 1.0, 8.0) if inside else _log_uniform(rng, 2.0, 120.0)
-    return Scene(
+    return SceneSettings(
         kind=kind,
         width=width,
         height=height,
@@ -82,7 +82,7 @@ def _log_uniform(rng: np.random.Generator, low: float, high: float) -> float:
     return float(np.exp(rng.uniform(np.log(low), np.log(high))))
 
 
-def views(scene: Scene, frames: int) -> tuple[list[semstab.Frame], float, float]:
+def views(scene: SceneSettings, frames: int) -> tuple[list[semstab.Frame], float, float]:
     """The frames of a scene, without any error; the size of its voxels, and its median depth, in metres."""
     caster, made = _caster(scene), []
     for index in range(frames):
@@ -92,7 +92,7 @@ def views(scene: Scene, frames: int) -> tuple[list[semstab.Frame], float, float]
     return made, float(f"{scene.pixels_a_voxel * middle / made[0].intrinsics.fx:.2g}"), middle
 
 
-def spoilt(scene: Scene, frame: semstab.Frame, noise: float) -> semstab.Frame:
+def spoilt(scene: SceneSettings, frame: semstab.Frame, noise: float) -> semstab.Frame:
     """The frame with errors of its labels, and of its depth: `noise` is their standard deviation, a share of depth."""
     rng = np.random.default_rng([scene.seed, 2, frame.index])
     (height, width), labels = frame.shape, frame.labels
@@ -105,7 +105,7 @@ def spoilt(scene: Scene, frame: semstab.Frame, noise: float) -> semstab.Frame:
     return dataclasses.replace(frame, depth=np.maximum(depth, 0), labels=labels)
 
 
-def _caster(scene: Scene) -> Any:
+def _caster(scene: SceneSettings) -> Any:
     """The surfaces, round a camera at (0, 0, altitude) that looks along y; each mesh has a number of its own."""
     rng, caster, a = np.random.default_rng([scene.seed, 3]), o3d.t.geometry.RaycastingScene(), scene.altitude
     boxes = []
@@ -149,7 +149,7 @@ def _box(low: np.ndarray, high: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return np.asarray(mesh.vertices) + low, np.asarray(mesh.triangles)
 
 
-def _view(scene: Scene, caster: Any, index: int) -> semstab.Frame:
+def _view(scene: SceneSettings, caster: Any, index: int) -> semstab.Frame:
     """A frame, its labels by surface and by place."""
     f = scene.width / (2 * np.tan(np.radians(scene.field_of_view / 2)))
     camera = semstab.Intrinsics(f, f, scene.width / 2, scene.height / 2)

@@ -27,7 +27,7 @@ found: dict[str, dict[str, float]] = {}
 inside = ["beside"]
 
 
-def of(stage: str) -> dict[str, float]:
+def entry_of(stage: str) -> dict[str, float]:
     """Return the entry of a stage, which begins with zeros."""
     return found.setdefault(stage, {"own_s": 0.0, "all_s": 0.0, "peak_gb": 0.0})
 
@@ -44,14 +44,14 @@ def watched(self: Stopwatch, stage: str) -> Iterator[Any]:
     finally:
         inside.pop()
         note(stage)
-        now = of(stage)
+        now = entry_of(stage)
         now["own_s"] += time.thread_time() - thread_began
         now["all_s"] += time.process_time() - everything
 
 
 def note(stage: str) -> None:
     """The memory that the process has now, in that stage."""
-    now = of(stage)
+    now = entry_of(stage)
     now["peak_gb"] = max(now["peak_gb"], resident_bytes() / 1e9)
 
 
@@ -75,5 +75,5 @@ if __name__ == "__main__":
         (most_resident,) = re.findall(
             r"VmHWM:\s+(\d+) kB", Path("/proc/self/status").read_text()
         )  # ru_maxrss has the parent's
-        of("all")["peak_gb"] = max(most, int(most_resident) * 1024) / 1e9
+        entry_of("all")["peak_gb"] = max(most, int(most_resident) * 1024) / 1e9
         file.write_text(json.dumps(found))

@@ -53,7 +53,7 @@ FOLDERS = (*EXACT, "sums", "columns")
 
 
 @dataclass
-class Comparison:
+class FolderComparison:
     """Differences between the two folders of a case, new outputs, and the verdicts."""
 
     differences: list[str] = field(default_factory=list)

@@ -38,7 +38,7 @@ from typing import Any
 import numpy as np
 from outcome import StudyError, exit_code
 from streets import write_rows
-from streets_analysis import Array, Grid, head, load, plain, row, signed, with_interval
+from streets_analysis import Array, StreetGrid, head, load, plain, row, signed, with_interval
 
 import semstab
 from semstab.data.records import Record
@@ -160,7 +160,7 @@ def tables(rows: Rows, accuracy: Mapping[tuple[str, str], Mapping[str, Any]]) ->
         for numbers in rows
         if numbers["data"] == "streets"
     ]
-    grid = Grid(of_streets)
+    grid = StreetGrid(of_streets)
     return {
         "room": room_table(room),
         "streets, means": streets_table(grid),
@@ -187,22 +187,22 @@ def _with_ends(numbers: Mapping[str, Any], name: str) -> str:
     return f"{plain(numbers[name])} ({plain(numbers[f'{name}_low'])} to {plain(numbers[f'{name}_high'])})"
 
 
-def streets_table(grid: Grid) -> list[str]:
+def streets_table(grid: StreetGrid) -> list[str]:
     """Return the networks by accuracy, with means over streets."""
     lines = head(["network", "accuracy", *COLUMNS.values()])
-    means = {name: np.nanmean(grid.of(name), axis=1) for name in ("accuracy", *COLUMNS)}
+    means = {name: np.nanmean(grid.column(name), axis=1) for name in ("accuracy", *COLUMNS)}
     for k in np.argsort(-means["accuracy"]):
         lines.append(row([grid.networks[k], *(plain(mean[k]) for mean in means.values())]))
     return lines
 
 
-def differences_table(grid: Grid) -> list[str]:
+def differences_table(grid: StreetGrid) -> list[str]:
     """Return by how much alpha of features, by meaning and of groups exceeds alpha of labels."""
-    lines, labels = head(["minus alpha of labels", "mean", "share of networks and streets"]), grid.of("alpha")
+    lines, labels = head(["minus alpha of labels", "mean", "share of networks and streets"]), grid.column("alpha")
     for name, title in COLUMNS.items():
         if name != "alpha":
-            share = float((grid.of(name) > labels).mean())
-            mean = with_interval(grid, grid.of(name), lambda x, y: float(np.nanmean(x - y)), labels)
+            share = float((grid.column(name) > labels).mean())
+            mean = with_interval(grid, grid.column(name), lambda x, y: float(np.nanmean(x - y)), labels)
             lines.append(row([title, _text(mean), f"{100 * share:.0f} %"]))
     return lines
 
@@ -210,7 +210,7 @@ def differences_table(grid: Grid) -> list[str]:
 Statistic = Callable[[Array, Array], float]
 
 
-def correlations_table(grid: Grid) -> list[str]:
+def correlations_table(grid: StreetGrid) -> list[str]:
     """Return what each number tells of networks and of streets."""
     from streets_analysis import between_networks, streets, streets_of_a_network
 
@@ -221,7 +221,7 @@ def correlations_table(grid: Grid) -> list[str]:
     lines = head(["number", "against", *asked])
     pairs = [(name, against) for against in ("accuracy", "miou") for name in COLUMNS] + [("feature_alpha", "alpha")]
     for name, against in pairs:
-        found = [with_interval(grid, grid.of(name), of, grid.of(against)) for of in asked.values()]
+        found = [with_interval(grid, grid.column(name), of, grid.column(against)) for of in asked.values()]
         lines.append(row([COLUMNS[name], COLUMNS.get(against, against), *map(_text, found)]))
     return lines
 

@@ -26,7 +26,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from differences import Comparison, listing, of_parquet
+from differences import FolderComparison, listing, of_parquet
 
 HERE = Path(__file__).resolve().parents[1]
 SHOWN = 10
@@ -225,7 +225,7 @@ def write_inputs(root: Path, tree: Path, inputs: Path) -> None:
 
 def compare_case(case: Case, reference: Path, out: Path) -> tuple[bool, str]:
     """Return whether the outputs are equal, and the line of the case with the differences."""
-    comparison = Comparison()
+    comparison = FolderComparison()
     comparison.folders(reference, out)
     if case.same:
         first, second = (listing(out / run) for run in case.same)

@@ -45,7 +45,7 @@ BEGIN, LONG = "a docstring begins with What, Of, Whether, Which, Those, That", f
 
 
 @dataclass(frozen=True, order=True)
-class Finding:
+class Offence:
     """A sentence that a rule meets."""
 
     file: str
@@ -125,20 +125,20 @@ TEXTS = {".py": python_texts, ".md": page_texts, ".ipynb": notebook_texts}
 """What is read of a file, by its suffix."""
 
 
-def findings(file: str, source: str) -> Iterator[Finding]:
+def findings(file: str, source: str) -> Iterator[Offence]:
     """Yield what the rules meet in a file."""
     for text in TEXTS.get(Path(file).suffix, page_texts)(source):
         content = re.sub(r"(?m)`[^`]*`|^ *(?:>>>|\.\.\.).*", "X", text.content)
         if text.docstring and BEGINS.match(content):
-            yield Finding(file, text.line, BEGIN, content.split("\n")[0][:80])
+            yield Offence(file, text.line, BEGIN, content.split("\n")[0][:80])
         for rule, pattern in RULES.items():
             for found in re.finditer(pattern, content):
                 around = content[max(0, found.start() - 40) : found.end() + 30].replace("\n", " ")
-                yield Finding(file, text.line + content.count("\n", 0, found.start()), rule, around)
+                yield Offence(file, text.line + content.count("\n", 0, found.start()), rule, around)
         for sentence in re.split(r"(?<=[.!?:;])\s+|\n\s*\n|\n\s*[-*] |\n +\w+: ", content):
             if len(sentence.split()) > MOST_WORDS:
                 line = text.line + content.count("\n", 0, content.index(sentence))
-                yield Finding(file, line, LONG, " ".join(sentence.split()[:10]))
+                yield Offence(file, line, LONG, " ".join(sentence.split()[:10]))
 
 
 def files() -> list[str]:

@@ -111,9 +111,9 @@ def distances(modules: Iterable[str]) -> dict[str, int]:
 def selected(files: set[Path], cost: Callable[[Path], float] = lambda test: 0.0) -> list[Path]:
     """Return the test files to run, the nearest first, of equally near ones the cheapest, then the core."""
     tests = sorted(path.relative_to(ROOT) for path in (ROOT / "tests").rglob("test_*.py"))
-    named = {file.stem for file in files if module_of(file) is not None}
+    stems = {file.stem for file in files if module_of(file) is not None}
     far = distances([module for file in files if (module := module_of(file)) is not None])
-    far |= {str(test): 0 for test in tests if test in files or named & set(test.stem.split("_"))}
+    far |= {str(test): 0 for test in tests if test in files or stems & set(test.stem.split("_"))}
     near = sorted(
         (test for test in tests if far.get(str(test), FAR) < FAR), key=lambda test: (far[str(test)], cost(test))
     )

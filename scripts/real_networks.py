@@ -96,7 +96,7 @@ USABLE = LIMITS.usable
 
 
 @dataclass(frozen=True)
-class Condition:
+class NetworkCondition:
     """A sequence, the networks over it, and how their labels are fused."""
 
     scene: str
@@ -112,10 +112,10 @@ class Condition:
 
 
 CONDITIONS = (
-    *(Condition("livingroom", "voc", stride, size) for stride in (20, 10, 5) for size in (0.02, 0.04)),
-    Condition("livingroom", "voc", 10, 0.02, "scores"),
-    Condition("hololens", "voc", 5, 0.02),
-    Condition("brighton", "city", 1, 0.2),
+    *(NetworkCondition("livingroom", "voc", stride, size) for stride in (20, 10, 5) for size in (0.02, 0.04)),
+    NetworkCondition("livingroom", "voc", 10, 0.02, "scores"),
+    NetworkCondition("hololens", "voc", 5, 0.02),
+    NetworkCondition("brighton", "city", 1, 0.2),
 )
 MAIN = "livingroom-labels-5-0.02"
 """The condition of the figure."""
@@ -124,7 +124,7 @@ DENSEST = {scene: min(c.stride for c in CONDITIONS if c.scene == scene) for scen
 
 
 @dataclass(frozen=True)
-class Network:
+class Weights:
     """A file of weights, and the published mIoU in percent, or NaN without a published mIoU."""
 
     family: str
@@ -144,7 +144,7 @@ class Network:
 
 
 @dataclass(frozen=True)
-class Row:
+class NetworkRow:
     """One network in one condition; the module says what each number is."""
 
     condition: str
@@ -187,7 +187,7 @@ PARTS = ("within", "between")
 TITLES = {"alpha": "alpha", "vss": "VSS", "agree": "two frames agree", "flicker": "flicker"}
 
 
-def networks(folder: Path, trained_on: str) -> list[Network]:
+def networks(folder: Path, trained_on: str) -> list[Weights]:
     """Return the networks whose weights are in a clone of EdgeNets, the narrowest of each family first.
 
     Raises:
@@ -200,7 +200,7 @@ def networks(folder: Path, trained_on: str) -> list[Network]:
     for file in (folder / ZOO).glob(f"*/*_s_*_{WEIGHTS[trained_on]}.pth"):
         family, _, rest = file.stem.partition("_s_")
         scale = rest.partition("_")[0]
-        found.append(Network(family, scale, trained_on, file, mious.get(file.name, math.nan)))
+        found.append(Weights(family, scale, trained_on, file, mious.get(file.name, math.nan)))
     if not found:
         raise StudyError(f"{folder / ZOO}: no weights *_{WEIGHTS[trained_on]}.pth; clone github.com/sacmehta/EdgeNets")
     return sorted(found, key=lambda network: (network.family, float(network.scale)))
@@ -216,7 +216,7 @@ def published(folder: Path) -> dict[str, float]:
 # --- Run --------------------------------------------------------------------------------------------------------------
 
 
-def predict_command(network: Network, scene: str, folders: Folders) -> list[str]:
+def predict_command(network: Weights, scene: str, folders: StudyFolders) -> list[str]:
     """Return the command that stores a network's label maps of a sequence."""
     return [
         "predict", "--model", network.model(folders.networks), "--set", f"scale={network.scale}",
@@ -225,7 +225,7 @@ def predict_command(network: Network, scene: str, folders: Folders) -> list[str]
     ]  # fmt: skip
 
 
-def run_command(condition: Condition, nets: Sequence[Network], folders: Folders) -> list[str]:
+def run_command(condition: NetworkCondition, nets: Sequence[Weights], folders: StudyFolders) -> list[str]:
     """Return the command that fuses the labels, or predicts scores and fuses them."""
     words = ["run", "--data", str(folders.data / condition.scene)]
     if condition.kind == "labels":
@@ -243,7 +243,7 @@ def run_command(condition: Condition, nets: Sequence[Network], folders: Folders)
 
 
 @dataclass(frozen=True)
-class Folders:
+class StudyFolders:
     """Where networks, sequences, and what is computed from them lie."""
 
     networks: Path
@@ -262,7 +262,7 @@ class Folders:
         return line
 
 
-def run(folders: Folders, results: Path, only: Sequence[str]) -> None:
+def run(folders: StudyFolders, results: Path, only: Sequence[str]) -> None:
     """Predict, fuse and measure each condition, and add it to the results as soon as it is there.
 
     Raises:
@@ -293,7 +293,7 @@ def run(folders: Folders, results: Path, only: Sequence[str]) -> None:
         print(f"{condition.name}: {len(rows)} networks", flush=True)
 
 
-def predict_once(network: Network, scene: str, words: Sequence[str], folders: Folders) -> None:
+def predict_once(network: Weights, scene: str, words: Sequence[str], folders: StudyFolders) -> None:
     """Store a network's label maps, unless the same command did so with the same network and images.
 
     semstab-bench would find out, too, but loads the network before.
@@ -316,18 +316,18 @@ def bench(words: Sequence[str]) -> None:
         raise StudyError(f"exit code {done.returncode} of semstab-bench {shlex.join(words)}")
 
 
-def rows_of(condition: Condition, nets: Sequence[Network], folder: Path) -> list[Row]:
+def rows_of(condition: NetworkCondition, nets: Sequence[Weights], folder: Path) -> list[NetworkRow]:
     """Return the rows of a finished run, in the order of the networks."""
     records = {record.unit.model.removesuffix("-scores"): record for record in semstab.load_result(folder).select()}
     return [_row(condition, network, records[network.name]) for network in nets]
 
 
-def _row(condition: Condition, network: Network, record: Record) -> Row:
+def _row(condition: NetworkCondition, network: Weights, record: Record) -> NetworkRow:
     statistics, of_map = record.statistics, record.map_summary
     assert statistics is not None
     assert statistics.spots is not None
     headline, spots = statistics.headline, statistics.spots
-    return Row(
+    return NetworkRow(
         condition=condition.name, scene=condition.scene, kind=condition.kind, stride=condition.stride,
         voxel_size=condition.voxel_size, frames=record.frames,
         network=network.name, trained_on=network.trained_on, published_miou=network.miou,
@@ -348,8 +348,8 @@ def _row(condition: Condition, network: Network, record: Record) -> Row:
 
 
 def keep(
-    condition: Condition, rows: Sequence[Row], nets: Sequence[Network], commands: Sequence[str], folders: Folders,
-    results: Path,
+    condition: NetworkCondition, rows: Sequence[NetworkRow], nets: Sequence[Weights], commands: Sequence[str],
+    folders: StudyFolders, results: Path,
 ) -> None:  # fmt: skip
     """Put a condition into both files of results, instead of what they had of it."""
     *predictions, command = commands
@@ -357,7 +357,7 @@ def keep(
     there = [row for row in load(results) if row.condition != condition.name] if (results / CSV).exists() else []
     table = sorted([*there, *rows], key=lambda row: order[row.condition])
     with atomic_path(results / CSV) as path, path.open("w", newline="", encoding="utf-8") as file:
-        writer = csv.DictWriter(file, list(Row.__annotations__), lineterminator="\n")
+        writer = csv.DictWriter(file, list(NetworkRow.__annotations__), lineterminator="\n")
         writer.writeheader()
         writer.writerows({key: _text(value) for key, value in asdict(row).items()} for row in table)
     content: dict[str, Any] = json.loads((results / JSON).read_text()) if (results / JSON).exists() else {"schema": 1}
@@ -382,12 +382,12 @@ def keep(
         path.write_text(json.dumps(content, indent=1) + "\n", encoding="utf-8")
 
 
-def load(results: Path) -> list[Row]:
+def load(results: Path) -> list[NetworkRow]:
     """Return the rows of real-networks.csv; what is empty is NaN."""
     kinds: dict[str, Callable[[str], Any]] = {"int": int, "float": lambda text: float(text or "nan"), "str": str}
     with (results / CSV).open(newline="", encoding="utf-8") as file:
         return [
-            Row(**{key: kinds[str(Row.__annotations__[key])](text) for key, text in line.items()})
+            NetworkRow(**{key: kinds[str(NetworkRow.__annotations__[key])](text) for key, text in line.items()})
             for line in csv.DictReader(file)
         ]
 
@@ -404,7 +404,7 @@ def digest(path: Path) -> str:
     return hashlib.sha256(path.read_bytes()).hexdigest()
 
 
-def correlations(rows: Sequence[Row]) -> list[dict[str, Any]]:
+def correlations(rows: Sequence[NetworkRow]) -> list[dict[str, Any]]:
     """Return Spearman's correlation of each measure with published mIoU and with effective classes, in each condition.
 
     `of` is 'all' networks for which both numbers are defined, or the 'informative' ones among them, whose verdict is
@@ -423,13 +423,13 @@ def correlations(rows: Sequence[Row]) -> list[dict[str, Any]]:
     return found
 
 
-def _pairs(rows: Sequence[Row], measure: str, against: str) -> tuple[list[float], list[float]]:
+def _pairs(rows: Sequence[NetworkRow], measure: str, against: str) -> tuple[list[float], list[float]]:
     pairs = [(getattr(row, against), getattr(row, measure)) for row in rows]
     pairs = [pair for pair in pairs if not any(map(math.isnan, pair))]
     return [x for x, _ in pairs], [y for _, y in pairs]
 
 
-def with_miou(rows: Sequence[Row]) -> dict[str, dict[str, Any]]:
+def with_miou(rows: Sequence[NetworkRow]) -> dict[str, dict[str, Any]]:
     """Return the correlation of each measure with published mIoU, over all networks of one condition."""
     return {measure: spearman(*_pairs(rows, measure, "published_miou")) for measure in MEASURES}
 
@@ -473,7 +473,7 @@ def signed(number: float | None) -> str:
     return "-" if number is None else f"{number:+.2f}".replace("0.", ".", 1)
 
 
-def condition_table(rows: Sequence[Row]) -> list[str]:
+def condition_table(rows: Sequence[NetworkRow]) -> list[str]:
     """Return the table of correlations, a Markdown row for each condition."""
     lines = [
         "| sequence | voxels, m | frames | networks | " + " | ".join(TITLES[measure] for measure in MEASURES) + " |",
@@ -498,7 +498,7 @@ def condition_table(rows: Sequence[Row]) -> list[str]:
     return lines
 
 
-def network_table(rows: Sequence[Row], condition: str) -> list[str]:
+def network_table(rows: Sequence[NetworkRow], condition: str) -> list[str]:
     """Return the networks of a condition, by published mIoU."""
     lines = [
         f"{condition}",
@@ -518,7 +518,7 @@ FAMILIES = {"espnetv2": ("#0072B2", "o", -0.3, "ESPNetv2"), "dicenet": ("#D55E00
 """Colours of Okabe and Ito, told apart by any colour vision, markers, and a shift so that equal mIoUs stay apart."""
 
 
-def draw(rows: Sequence[Row], file: Path, condition: str = MAIN) -> None:
+def draw(rows: Sequence[NetworkRow], file: Path, condition: str = MAIN) -> None:
     """Draw VSS and alpha against published mIoU, with their intervals; hollow where the verdict is 'uninformative'."""
     import matplotlib as mpl
     from matplotlib.figure import Figure
@@ -549,7 +549,7 @@ def draw(rows: Sequence[Row], file: Path, condition: str = MAIN) -> None:
             figure.savefig(path, format="png", dpi=150, metadata={"Software": None})
 
 
-def _panel(axes: Axes, rows: Sequence[Row], measure: str) -> None:
+def _panel(axes: Axes, rows: Sequence[NetworkRow], measure: str) -> None:
     """Draw a measure with its intervals; a network without it is a cross on the axis."""
     for row in rows:
         color, marker, shift, _ = FAMILIES.get(row.network.rpartition("-")[0], ("#000000", "^", 0, ""))
@@ -641,7 +641,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         if asked.command == "sequence":
             sequence(asked.clone, asked.data)
         elif asked.command == "run":
-            folders = Folders(*(path.absolute() for path in (asked.networks, asked.data, asked.work)))
+            folders = StudyFolders(*(path.absolute() for path in (asked.networks, asked.data, asked.work)))
             run(folders, asked.results, asked.only)
         else:
             show(asked.results, asked.figure)

@@ -35,7 +35,7 @@ CLASSES = 20
 
 
 @dataclass(frozen=True)
-class Network:
+class StreetNetwork:
     """A network, or a variant of one.
 
     Attributes:
@@ -55,11 +55,11 @@ class Network:
     spoil: Callable[[Image], Image] | None = None
 
 
-def networks(edgenets: Path, espnet: Path, coral: Path) -> list[Network]:
+def networks(edgenets: Path, espnet: Path, coral: Path) -> list[StreetNetwork]:
     """Return all networks, then the variants, from the folders of three repositories."""
     zoo = edgenets / "model/segmentation/model_zoo"
     found = [
-        Network(
+        StreetNetwork(
             f"{family}-{scale}", family, zoo / family / f"{family}_s_{scale}_city_512x256.pth",
             partial(_edgenet, edgenets, f"{family}_city", scale),
         )
@@ -68,15 +68,15 @@ def networks(edgenets: Path, espnet: Path, coral: Path) -> list[Network]:
     ]  # fmt: skip
     for q in (3, 5, 8):
         weights = espnet / f"pretrained/decoder/espnet_p_2_q_{q}.pth"
-        found.append(Network(f"espnet-{q}", "espnet", weights, partial(_espnet, espnet, q, weights)))
+        found.append(StreetNetwork(f"espnet-{q}", "espnet", weights, partial(_espnet, espnet, q, weights)))
     weights = coral / "deeplab_mobilenet_edgetpu_slim_cityscapes_quant.tflite"
-    found.append(Network("deeplab", "deeplab", weights, partial(_deeplab, weights)))
+    found.append(StreetNetwork("deeplab", "deeplab", weights, partial(_deeplab, weights)))
     by_name = {network.name: network for network in found}
     for base in (by_name["espnetv2-2.0"], by_name["dicenet-1.0"]):
         for name, spoil in SPOILS.items():
-            found.append(Network(f"{base.name}/{name}", base.family, base.weights, base.load, base.name, spoil))
+            found.append(StreetNetwork(f"{base.name}/{name}", base.family, base.weights, base.load, base.name, spoil))
         coarse = partial(_edgenet, edgenets, f"{base.family}_city", float(base.name.rpartition("-")[2]), bits=BITS)
-        found.append(Network(f"{base.name}/weights", base.family, base.weights, coarse, base.name))
+        found.append(StreetNetwork(f"{base.name}/weights", base.family, base.weights, coarse, base.name))
     return found
 
 

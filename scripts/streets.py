@@ -330,10 +330,10 @@ def _against_truth(out: Path, records: Sequence[Record], work: Path) -> Measured
 
 def _pixels(task: Any, table: VoxelTable, work: Path) -> tuple[Any, Any, Any]:
     """Return the confusion (K, K) of single frames, true classes first, signs (4, n) and whether n pixels are wrong."""
-    from signs import Rows, to_border
+    from signs import VoxelRows, to_border
 
     K = len(task.mapping.target.classes)
-    rows, of_voxel = Rows(table), np.stack([1 - np.nan_to_num(psa(table), nan=1.0), entropy(table)])
+    rows, of_voxel = VoxelRows(table), np.stack([1 - np.nan_to_num(psa(table), nan=1.0), entropy(table)])
     of_truth = truth_task(task)
     confusion, signs, wrongs = np.zeros((K, K), np.int64), [], []
     for index in task.indices:
@@ -341,7 +341,7 @@ def _pixels(task: Any, table: VoxelTable, work: Path) -> tuple[Any, Any, Any]:
         label, true = frame.labels, truth.labels
         both = frame.valid & (true < K)
         confusion += np.bincount(true[both].astype(int) * K + label[both], minlength=K * K).reshape(K, K)
-        voxel = rows.of(voxel_index(back_project(frame), table.voxel_size, frame).T)
+        voxel = rows.find(voxel_index(back_project(frame), table.voxel_size, frame).T)
         again, here = table.op[voxel] >= 2, np.full(frame.shape, -1)
         here[frame.valid] = np.where(again, voxel, -1)
         both &= here >= 0
@@ -436,7 +436,7 @@ def show(results: Path, figures: Path) -> None:
     for title, lines in tables(rows, classes).items():
         print(f"{title}\n", *lines, "", sep="\n")
     main_rows = [row for row in rows if row["condition"] == "main" and not row["of"]]
-    streets_figures.draw(analysis.Grid(main_rows), figures)
+    streets_figures.draw(analysis.StreetGrid(main_rows), figures)
 
 
 def tables(rows: Sequence[dict[str, Any]], classes: Sequence[dict[str, Any]]) -> dict[str, list[str]]:
@@ -445,7 +445,7 @@ def tables(rows: Sequence[dict[str, Any]], classes: Sequence[dict[str, Any]]) ->
 
     main_rows = [row for row in rows if row["condition"] == "main"]
     networks = [row for row in main_rows if not row["of"]]
-    grid = analysis.Grid(networks)
+    grid = analysis.StreetGrid(networks)
     by_class, correlation = analysis.classes_table(classes, grid.networks)
     return {
         "networks": analysis.networks_table(grid),

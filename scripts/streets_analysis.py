@@ -49,7 +49,7 @@ def _number(key: str, text: str) -> Any:
     return float(text or "nan")
 
 
-class Grid:
+class StreetGrid:
     """Numbers of networks on streets: arrays (networks, streets)."""
 
     def __init__(self, rows: Sequence[Mapping[str, Any]]) -> None:
@@ -58,7 +58,7 @@ class Grid:
         self.family = [next(row["family"] for row in rows if row["network"] == name) for name in self.networks]
         self._cell = {(row["network"], row["street"]): row for row in rows}
 
-    def of(self, name: str) -> Array:
+    def column(self, name: str) -> Array:
         """Return a column (networks, streets), turned so that more is better."""
         sign = -1.0 if name in LESS else 1.0
         return np.array([[sign * self._cell[n, s][name] for s in self.streets] for n in self.networks], np.float64)
@@ -153,7 +153,9 @@ def _nanmean(values: Sequence[float] | Array) -> float:
     return float(np.mean(numbers)) if numbers else math.nan
 
 
-def with_interval(grid: Grid, measure: Array, statistic: Statistic, accuracy: Array) -> tuple[float, float, float]:
+def with_interval(
+    grid: StreetGrid, measure: Array, statistic: Statistic, accuracy: Array
+) -> tuple[float, float, float]:
     """Return a statistic and the ends of its interval."""
     drawn = [statistic(measure[np.ix_(*some)], accuracy[np.ix_(*some)]) for some in grid.samples()]
     numbers = [value for value in drawn if not math.isnan(value)]
@@ -184,26 +186,26 @@ def head(cells: Sequence[str]) -> list[str]:
     return [row(cells), "|" + "---|" * len(cells)]
 
 
-def networks_table(grid: Grid) -> list[str]:
+def networks_table(grid: StreetGrid) -> list[str]:
     """Return the networks by accuracy, with means over streets."""
     names = ("accuracy", "miou", "alpha", "meaning", "vss", "agree", "flicker", "softmax")
     lines = head(["network", "accuracy", "mIoU", "alpha", "by meaning", "VSS", "agree", "flicker, %", "softmax"])
-    means = {name: grid.of(name).mean(axis=1) for name in names}
+    means = {name: grid.column(name).mean(axis=1) for name in names}
     for k in np.argsort(-means["accuracy"]):
         cells = [plain(means[name][k]) if name != "flicker" else f"{-means[name][k]:.1f}" for name in names]
         lines.append(row([grid.networks[k], *cells]))
     return lines
 
 
-def questions_table(grid: Grid, against: str = "accuracy") -> list[str]:
+def questions_table(grid: StreetGrid, against: str = "accuracy") -> list[str]:
     """Return each measure's answer to each question, with intervals."""
     lines = head(["measure", *QUESTIONS])
-    accuracy = grid.of(against)
+    accuracy = grid.column(against)
     for name, title in MEASURES.items():
         cells = []
         for question, statistic in QUESTIONS.items():
             form = plain if question.startswith("pairs") else signed
-            value, low, high = with_interval(grid, grid.of(name), statistic, accuracy)
+            value, low, high = with_interval(grid, grid.column(name), statistic, accuracy)
             cells.append("-" if math.isnan(value) else f"{form(value)} ({form(low)} to {form(high)})")
         lines.append(row([title, *cells]))
     return lines
@@ -240,17 +242,17 @@ def verdicts_table(rows: Sequence[Mapping[str, Any]]) -> list[str]:
     return lines
 
 
-def places_table(grid: Grid) -> list[str]:
+def places_table(grid: StreetGrid) -> list[str]:
     """Return the AUROC of each sign for wrong pixels, mean over networks and streets with its interval."""
     titles = {
         "auroc_disagreement": "frames disagree (1 - PSA)", "auroc_entropy": "entropy of the voxel",
         "auroc_border": "border of its own labels near", "auroc_softmax": "softmax of the frame low",
         "auroc_all": "all four together",
     }  # fmt: skip
-    scored = [k for k, some in enumerate(np.isfinite(grid.of("auroc_softmax")).all(axis=1)) if some]
+    scored = [k for k, some in enumerate(np.isfinite(grid.column("auroc_softmax")).all(axis=1)) if some]
     lines = head(["sign", "AUROC", "least street", "most"])
     for name, title in titles.items():
-        area = grid.of(name)[scored]
+        area = grid.column(name)[scored]
         drawn = []
         for networks, columns in grid.samples():
             rows = [scored.index(k) for k in networks if k in scored]
@@ -295,15 +297,15 @@ def _by_class(rows: Sequence[Mapping[str, Any]]) -> dict[str, tuple[float, float
     return found
 
 
-def beyond_softmax(grid: Grid) -> list[str]:
+def beyond_softmax(grid: StreetGrid) -> list[str]:
     """Return what a measure adds to the mean softmax: the error of accuracy predicted for a street left out."""
     lines = head(["accuracy predicted from", "mean error, points", "partial correlation given softmax"])
-    scored = np.isfinite(grid.of("softmax")).all(axis=1)
-    accuracy, softmax = grid.of("accuracy")[scored], grid.of("softmax")[scored]
+    scored = np.isfinite(grid.column("softmax")).all(axis=1)
+    accuracy, softmax = grid.column("accuracy")[scored], grid.column("softmax")[scored]
     lines.append(row(["nothing (the mean of other streets)", f"{100 * _left_out(accuracy, []):.1f}", ""]))
     lines.append(row(["mean softmax", f"{100 * _left_out(accuracy, [softmax]):.1f}", ""]))
     for name in ("alpha", "meaning", "vss", "agree", "compensated", "flip"):
-        measure = grid.of(name)[scored]
+        measure = grid.column(name)[scored]
         error = _left_out(accuracy, [softmax, measure])
         ranks = [rankdata(values.ravel()) for values in (measure, accuracy, softmax)]
         lines.append(row([f"softmax and {MEASURES[name]}", f"{100 * error:.1f}", signed(_partial(*ranks))]))
@@ -333,22 +335,22 @@ def choices_table(rows: Sequence[Mapping[str, Any]]) -> list[str]:
     """Return the correlations of alpha and of VSS in each condition."""
     questions = ("which network, over all streets", "which network, on one street", "which street, mean of networks")
     lines = head(["condition", *(f"{m}: {q}" for m in ("alpha", "VSS") for q in questions)])
-    main = Grid([r for r in rows if r["condition"] == "main" and not r["of"]])
+    main = StreetGrid([r for r in rows if r["condition"] == "main" and not r["of"]])
     for condition in dict.fromkeys(r["condition"] for r in rows):
-        grid = Grid([r for r in rows if r["condition"] == condition and not r["of"]])
+        grid = StreetGrid([r for r in rows if r["condition"] == condition and not r["of"]])
         cells = []
         for name in ("alpha", "vss"):
-            measure = grid.of(name)
-            cells += [signed(QUESTIONS[q](measure, main.of("accuracy"))) for q in questions]
+            measure = grid.column(name)
+            cells += [signed(QUESTIONS[q](measure, main.column("accuracy"))) for q in questions]
         lines.append(row([condition, *cells]))
     of_main = [r for r in rows if r["condition"] == "main" and not r["of"]]
-    some = Grid([r for r in of_main if r["family"] in ("espnetv2", "dicenet")])
+    some = StreetGrid([r for r in of_main if r["family"] in ("espnetv2", "dicenet")])
     for title, grid, names in (
         ("VSS of OP >= 2", main, ("", "vss2")),
         ("ESPNetv2 and DiCENet", some, ("alpha", "vss")),
     ):
         values = [
-            signed(QUESTIONS[q](grid.of(name), grid.of("accuracy"))) if name else ""
+            signed(QUESTIONS[q](grid.column(name), grid.column("accuracy"))) if name else ""
             for name in names
             for q in questions
         ]

@@ -9,7 +9,7 @@ import matplotlib as mpl
 import numpy as np
 import streets_analysis as analysis
 from matplotlib.figure import Figure
-from streets_analysis import MEASURES, QUESTIONS, Grid, with_interval
+from streets_analysis import MEASURES, QUESTIONS, StreetGrid, with_interval
 
 from semstab.core.files import atomic_path
 
@@ -20,7 +20,7 @@ FAMILIES = {
 STYLE = {"font.size": 10, "axes.spines.top": False, "axes.spines.right": False}
 
 
-def draw(grid: Grid, folder: Path) -> None:
+def draw(grid: StreetGrid, folder: Path) -> None:
     """Write streets-measures.png, streets-accuracy.png and streets-places.png."""
     with mpl.rc_context(STYLE):
         for name, of in (("measures", _measures), ("accuracy", _accuracy), ("places", _places)):
@@ -28,14 +28,14 @@ def draw(grid: Grid, folder: Path) -> None:
                 of(grid).savefig(path, format="png", dpi=150, metadata={"Software": None})
 
 
-def _measures(grid: Grid) -> Figure:
+def _measures(grid: StreetGrid) -> Figure:
     """Return the correlations of each measure with accuracy, over networks and over streets, with intervals."""
     figure = Figure(figsize=(7, 3.6), layout="constrained")
     asked = {"networks: which is better?": "which network, over all streets",
              "streets: which is harder?": "which street, for one network"}  # fmt: skip
     for axes, (title, question) in zip(figure.subplots(1, 2, sharey=True), asked.items(), strict=True):
         for k, name in enumerate(MEASURES):
-            value, low, high = with_interval(grid, grid.of(name), QUESTIONS[question], grid.of("accuracy"))
+            value, low, high = with_interval(grid, grid.column(name), QUESTIONS[question], grid.column("accuracy"))
             if np.isnan(value):
                 continue
             color = "#D55E00" if name == "alpha" else "#0072B2"
@@ -52,12 +52,12 @@ def _measures(grid: Grid) -> Figure:
     return figure
 
 
-def _accuracy(grid: Grid) -> Figure:
+def _accuracy(grid: StreetGrid) -> Figure:
     """Return alpha and VSS against accuracy: each network (mean of the streets), each street (mean of the networks)."""
     figure = Figure(figsize=(7, 5.6), layout="constrained")
-    accuracy = 100 * grid.of("accuracy")
+    accuracy = 100 * grid.column("accuracy")
     for column, name in enumerate(("alpha", "vss")):
-        measure = grid.of(name)
+        measure = grid.column(name)
         of_networks, of_streets = (figure.add_subplot(2, 2, 1 + 2 * row + column) for row in (0, 1))
         for family, (color, marker, title) in FAMILIES.items():
             networks = [k for k, of_network in enumerate(grid.family) if of_network == family]
@@ -82,14 +82,14 @@ def _accuracy(grid: Grid) -> Figure:
     return figure
 
 
-def _places(grid: Grid) -> Figure:
+def _places(grid: StreetGrid) -> Figure:
     """Return the AUROC of each sign for wrong pixels: a point for each street, and the mean."""
     figure = Figure(figsize=(7, 2.9), layout="constrained")
     axes: Any = figure.add_subplot()
     signs = {"disagreement": "frames disagree", "entropy": "entropy of the voxel", "border": "border near",
              "softmax": "softmax low", "all": "all four"}  # fmt: skip
     for k, name in enumerate(signs):
-        areas = np.nanmean(grid.of(f"auroc_{name}"), axis=0)
+        areas = np.nanmean(grid.column(f"auroc_{name}"), axis=0)
         axes.plot(areas, np.full(len(areas), k), "o", color="#56B4E9", markersize=5, alpha=0.8)
         axes.plot(areas.mean(), k, "|", color="black", markersize=16, markeredgewidth=2)
     axes.set_yticks(range(len(signs)), list(signs.values()))

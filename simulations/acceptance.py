@@ -15,7 +15,7 @@ from typing import Literal
 
 import cases
 import numpy as np
-from flights import Flight, World, fly, log_of, table_of, world
+from flights import SimulatedFlight, World, fly, log_of, table_of, world
 
 from semstab.comparison.opening import open_run
 from semstab.data.measures import dominant
@@ -27,16 +27,16 @@ from semstab.statistics.correctness import Truth, join_truth
 CLASSES = ("a", "b")
 
 
-def conditions() -> list[tuple[str, Flight]]:
+def conditions() -> list[tuple[str, SimulatedFlight]]:
     """Errors that reach half a voxel to six, on floors of 1,024 and 4,096 voxels."""
     return [
-        (f"{side} x {side}, errors reach {reach:g} voxels", Flight(side, reach, 0.6, 6, 6, "uneven"))
+        (f"{side} x {side}, errors reach {reach:g} voxels", SimulatedFlight(side, reach, 0.6, 6, 6, "uneven"))
         for side in (32, 64)
         for reach in (0.5, 2.0, 6.0)
     ]
 
 
-def scene(flight: Flight, rng: np.random.Generator) -> tuple[VoxelTable, Truth]:
+def scene(flight: SimulatedFlight, rng: np.random.Generator) -> tuple[VoxelTable, Truth]:
     """The map of a flight over a scene, and what is right."""
     over: World = world(flight, rng)
     log = log_of(fly(flight, over, rng), over, flight)
@@ -49,7 +49,7 @@ def scene(flight: Flight, rng: np.random.Generator) -> tuple[VoxelTable, Truth]:
     return table, Truth(over.truth >= 0, over.truth.astype(np.int64))
 
 
-def simulated(flight: Flight, trials: int, seed: int, precision: float) -> list[str]:
+def simulated(flight: SimulatedFlight, trials: int, seed: int, precision: float) -> list[str]:
     """How often a threshold is found, what share is left, and how often it promises too much."""
     scenes = [scene(flight, np.random.default_rng([seed, trial])) for trial in range(trials)]
     label = np.stack([dominant(table) for table, _ in scenes])

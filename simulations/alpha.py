@@ -16,7 +16,7 @@ from typing import Literal
 
 import numpy as np
 from levels import level_of, stated
-from orbit_views import KINDS, K, Views, field, frames, predicted, scene
+from orbit_views import KINDS, K, OrbitViews, field, frames, predicted, scene
 
 from semstab.statistics import Sampler
 from semstab.statistics.accumulate import sums_of_spots
@@ -31,7 +31,7 @@ RATES = {
 """Rates of errors, from a model that is stable to one that is not."""
 
 
-def sums(views: Views, labels: np.ndarray, stride: int = 1) -> ClusterSums:
+def sums(views: OrbitViews, labels: np.ndarray, stride: int = 1) -> ClusterSums:
     """Return the sums of a flight."""
     sampler = Sampler(K)
     for frame in frames(views, labels, stride):
@@ -57,7 +57,7 @@ SHARES = (0.9, 0.95, 0.96, 0.97, 0.98, 0.99, 0.995, 0.999)
 """Shares of the largest class."""
 
 
-def of_share(views: Views, share: float, rng: np.random.Generator) -> Views:
+def of_share(views: OrbitViews, share: float, rng: np.random.Generator) -> OrbitViews:
     """Return the views with two classes: patches about 3 m wide, and all around them a class of that share."""
     rough = field(views.points, rng, 3.0)
     return replace(views, labels=(rough > np.quantile(rough[views.there], share)).astype(np.int64))

@@ -36,7 +36,7 @@ NOISE, WRONG = 0.005, 0.05
 Frames = list[Frame]
 
 
-class Made(Scene):
+class FramesInMemory(Scene):
     """Frames in memory."""
 
     models = ("net",)
@@ -203,7 +203,7 @@ def resized(labels: np.ndarray) -> np.ndarray:
 
 
 @dataclass(frozen=True)
-class Mistake:
+class Planted:
     """A planted mistake, and a part of the line that names it."""
 
     name: str
@@ -212,40 +212,40 @@ class Mistake:
 
 
 MISTAKES = (
-    Mistake("labels of the next frame", labels_of(1), "are one frame early"),
-    Mistake("labels of the frame before", labels_of(-1), "are one frame late"),
-    Mistake("labels mirrored left to right", relabelled(lambda L: L[:, ::-1]), "are mirrored"),
-    Mistake("labels upside down", relabelled(lambda L: L[::-1]), "are upside down"),
-    Mistake("labels turned by 180 degrees", relabelled(lambda L: L[::-1, ::-1]), "are turned by 180"),
-    Mistake("labels transposed", relabelled(lambda L: cv2.resize(L.T, (W, H), interpolation=0)), "are transposed"),
-    Mistake("labels of the middle, enlarged twice", relabelled(lambda L: L[H // 4 : -H // 4, W // 4 : -W // 4]
+    Planted("labels of the next frame", labels_of(1), "are one frame early"),
+    Planted("labels of the frame before", labels_of(-1), "are one frame late"),
+    Planted("labels mirrored left to right", relabelled(lambda L: L[:, ::-1]), "are mirrored"),
+    Planted("labels upside down", relabelled(lambda L: L[::-1]), "are upside down"),
+    Planted("labels turned by 180 degrees", relabelled(lambda L: L[::-1, ::-1]), "are turned by 180"),
+    Planted("labels transposed", relabelled(lambda L: cv2.resize(L.T, (W, H), interpolation=0)), "are transposed"),
+    Planted("labels of the middle, enlarged twice", relabelled(lambda L: L[H // 4 : -H // 4, W // 4 : -W // 4]
             .repeat(2, axis=0).repeat(2, axis=1)), "are twice too large"),
-    Mistake("labels of one map in all frames", lambda fs: [replace(f, labels=fs[0].labels) for f in fs], "same map"),
-    Mistake("ids from 1, 6 of 7 classes used", relabelled(lambda L: L + 1), "never have the first id"),
-    Mistake("one class everywhere", relabelled(lambda L: L * 0), "have one class"),
-    Mistake("labels resized with interpolation", relabelled(resized), "thin bands of ids"),
-    Mistake("poses of the next frame", poses_of(1), "poses are one frame early"),
-    Mistake("poses of the frame before", poses_of(-1), "poses are one frame late"),
-    Mistake("focal length 20 % too small", camera(0.8), "focal length is"),
-    Mistake("focal length 10 % too small", camera(0.9), "focal length is"),
-    Mistake("focal length 10 % too large", camera(1.1), "focal length is"),
-    Mistake("cx 10 % of the width too large", camera(right=W / 10), "cx is"),
-    Mistake("poses jump by 0.3 m in the middle", jump, f"poses jump at frame {FRAMES // 2}:"),
-    Mistake("depth of one frame times 5", one(lambda f: replace(f, depth=f.depth * np.float32(5))),
+    Planted("labels of one map in all frames", lambda fs: [replace(f, labels=fs[0].labels) for f in fs], "same map"),
+    Planted("ids from 1, 6 of 7 classes used", relabelled(lambda L: L + 1), "never have the first id"),
+    Planted("one class everywhere", relabelled(lambda L: L * 0), "have one class"),
+    Planted("labels resized with interpolation", relabelled(resized), "thin bands of ids"),
+    Planted("poses of the next frame", poses_of(1), "poses are one frame early"),
+    Planted("poses of the frame before", poses_of(-1), "poses are one frame late"),
+    Planted("focal length 20 % too small", camera(0.8), "focal length is"),
+    Planted("focal length 10 % too small", camera(0.9), "focal length is"),
+    Planted("focal length 10 % too large", camera(1.1), "focal length is"),
+    Planted("cx 10 % of the width too large", camera(right=W / 10), "cx is"),
+    Planted("poses jump by 0.3 m in the middle", jump, f"poses jump at frame {FRAMES // 2}:"),
+    Planted("depth of one frame times 5", one(lambda f: replace(f, depth=f.depth * np.float32(5))),
             "frame 11 does not fit"),
-    Mistake("pose of one frame off by 0.4 m", one(lambda f: replace(f, T_wc=moved(f.T_wc, (0.3, 0.0, 0.3)))),
+    Planted("pose of one frame off by 0.4 m", one(lambda f: replace(f, T_wc=moved(f.T_wc, (0.3, 0.0, 0.3)))),
             "frame 11 does not fit"),
-    Mistake("labels of one frame upside down", one(lambda f: replace(f, labels=f.labels[::-1].copy())),
+    Planted("labels of one frame upside down", one(lambda f: replace(f, labels=f.labels[::-1].copy())),
             "the map of frame 11 "),
-    Mistake("depth mirrored left to right", depth(lambda d: d[:, ::-1]), "depth images mirrored left to right"),
-    Mistake("depth upside down", depth(lambda d: d[::-1]), "depth images upside down"),
-    Mistake("depth turned by 180 degrees", depth(lambda d: d[::-1, ::-1]), "depth images turned by 180"),
-    Mistake("rotations transposed", rotation(lambda R: R.T), "transposed rotations"),
-    Mistake("quaternions w x y z read as x y z w", rotation(lambda R: reordered(R, (3, 0, 1, 2))), "w x y z that are"),
-    Mistake("quaternions x y z w read as w x y z", rotation(lambda R: reordered(R, (1, 2, 3, 0))), "x y z w that are"),
-    Mistake("cx and cy exchanged", lambda fs: [replace(f, intrinsics=SWAPPED) for f in fs], "cx and cy exchanged"),
-    Mistake("intrinsics divided by the size", lambda fs: [replace(f, intrinsics=SHARES) for f in fs], "as shares of"),
-    Mistake("none", lambda frames: frames, "nothing"),
+    Planted("depth mirrored left to right", depth(lambda d: d[:, ::-1]), "depth images mirrored left to right"),
+    Planted("depth upside down", depth(lambda d: d[::-1]), "depth images upside down"),
+    Planted("depth turned by 180 degrees", depth(lambda d: d[::-1, ::-1]), "depth images turned by 180"),
+    Planted("rotations transposed", rotation(lambda R: R.T), "transposed rotations"),
+    Planted("quaternions w x y z read as x y z w", rotation(lambda R: reordered(R, (3, 0, 1, 2))), "w x y z that are"),
+    Planted("quaternions x y z w read as w x y z", rotation(lambda R: reordered(R, (1, 2, 3, 0))), "x y z w that are"),
+    Planted("cx and cy exchanged", lambda fs: [replace(f, intrinsics=SWAPPED) for f in fs], "cx and cy exchanged"),
+    Planted("intrinsics divided by the size", lambda fs: [replace(f, intrinsics=SHARES) for f in fs], "as shares of"),
+    Planted("none", lambda frames: frames, "nothing"),
 )  # fmt: skip
 
 
@@ -284,7 +284,7 @@ def with_fy(factor: float) -> Callable[[Frames], Frames]:
 
 
 @dataclass(frozen=True)
-class Situation(Mistake):
+class Situation(Planted):
     """A situation, and how the line names its frames.
 
     Attributes:
@@ -360,7 +360,7 @@ SITUATIONS = (
 
 def said(frames: Frames, *, run: bool = False) -> Iterator[str]:
     """Yield the findings, as `check` says them, or a run."""
-    made, indices = Made(frames), range(len(frames))
+    made, indices = FramesInMemory(frames), range(len(frames))
     if run:
         verdict, _, chained = quick_sample(made, indices, {}, "net")
     else:

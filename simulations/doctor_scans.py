@@ -17,8 +17,8 @@ from dataclasses import dataclass, replace
 
 import cases
 import numpy as np
-from doctor import Made, poses_of
-from moving import CLASSES, Street
+from doctor import FramesInMemory, poses_of
+from moving import CLASSES, MadeStreet
 from scipy.spatial.transform import Rotation
 
 from semstab.check.reprojection import clusters
@@ -43,7 +43,7 @@ SPACE = LabelSpace("made", ("ground", "building", "parked", "moving"))
 Scans = list[Frame]
 
 
-class Drive(Made):
+class Drive(FramesInMemory):
     """Scans in memory."""
 
     of_scans = True
@@ -79,7 +79,7 @@ def rays() -> np.ndarray:
     return np.stack([np.cos(up) * np.cos(at), np.cos(up) * np.sin(at), np.sin(up)], axis=-1).reshape(-1, 3)
 
 
-def cast(street: Street, origins: np.ndarray, directions: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def cast(street: MadeStreet, origins: np.ndarray, directions: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return the distances (N,) of what rays (N, 3) meet, inf without anything, and its number: 0 for the ground."""
     with np.errstate(divide="ignore"):
         inverse = 1 / directions
@@ -101,7 +101,7 @@ def drive(seed: int, *, swept: bool = False) -> Scans:
 @functools.lru_cache(maxsize=64)
 def _drive(seed: int, swept: bool) -> tuple[Frame, ...]:
     rng = np.random.default_rng(seed)
-    street, poses, directions = Street.drawn(rng, movers=0), way(rng), rays()
+    street, poses, directions = MadeStreet.drawn(rng, movers=0), way(rng), rays()
     shares = share_of_sweep(directions, SWEEP) if swept else np.zeros(len(directions))
     scans = []
     for k, pose in enumerate(poses):
@@ -161,7 +161,7 @@ TURN, JUMP = transform((0, 0, 2), (0, 0, 0)), transform((0, 0, 0), (0.3, 0.3, 0)
 
 
 @dataclass(frozen=True)
-class Mistake:
+class ScanMistake:
     """A mistake, how to plant it, and parts of a line of `check` that name it."""
 
     name: str
@@ -171,32 +171,32 @@ class Mistake:
 
 
 MISTAKES = (
-    Mistake("inverse poses", posed(np.linalg.inv), ("with inverse poses",)),
-    Mistake("poses of the camera", posed(lambda T: TR @ T @ np.linalg.inv(TR)), ("with poses of a camera",)),
-    Mistake("poses without the sensor's mounting", posed(lambda T: T @ np.linalg.inv(MOUNTED)),
+    ScanMistake("inverse poses", posed(np.linalg.inv), ("with inverse poses",)),
+    ScanMistake("poses of the camera", posed(lambda T: TR @ T @ np.linalg.inv(TR)), ("with poses of a camera",)),
+    ScanMistake("poses without the sensor's mounting", posed(lambda T: T @ np.linalg.inv(MOUNTED)),
             ("with poses of another body",)),
-    Mistake("positions in millimetres", posed(scaled(1000)), ("with poses in millimetres",)),
-    Mistake("positions in kilometres", posed(scaled(0.001)), ("with poses in kilometres",)),
-    Mistake("points in millimetres", pointed(1000 * np.eye(3)), ("with points in millimetres",)),
-    Mistake("points with y mirrored", pointed(np.diag((1, -1, 1))), ("with y mirrored",)),
-    Mistake("points with z mirrored", pointed(np.diag((1, 1, -1))), ("z mirrored", "z of the points was mirrored")),
-    Mistake("points with x and y exchanged", pointed([[0, 1, 0], [1, 0, 0], [0, 0, 1]]), ("with x and y exchanged",)),
-    Mistake("points of a sensor whose z is down", pointed(np.diag((1, -1, -1))), ("with z down",)),
-    Mistake("poses of the scan before", poses_of(-1), ("poses are one scan late",)),
-    Mistake("poses of the next scan", poses_of(1), ("poses are one scan early",)),
-    Mistake("labels of the scan before", labelled(lambda scans, s: scans[max(s.index - 1, 0)].labels),
+    ScanMistake("positions in millimetres", posed(scaled(1000)), ("with poses in millimetres",)),
+    ScanMistake("positions in kilometres", posed(scaled(0.001)), ("with poses in kilometres",)),
+    ScanMistake("points in millimetres", pointed(1000 * np.eye(3)), ("with points in millimetres",)),
+    ScanMistake("points with y mirrored", pointed(np.diag((1, -1, 1))), ("with y mirrored",)),
+    ScanMistake("points with z mirrored", pointed(np.diag((1, 1, -1))), ("z mirrored", "z of the points was mirrored")),
+    ScanMistake("points with x and y exchanged", pointed(np.eye(3)[[1, 0, 2]]), ("with x and y exchanged",)),
+    ScanMistake("points of a sensor whose z is down", pointed(np.diag((1, -1, -1))), ("with z down",)),
+    ScanMistake("poses of the scan before", poses_of(-1), ("poses are one scan late",)),
+    ScanMistake("poses of the next scan", poses_of(1), ("poses are one scan early",)),
+    ScanMistake("labels of the scan before", labelled(lambda scans, s: scans[max(s.index - 1, 0)].labels),
             ("are one scan late",)),
-    Mistake("labels of the points in reversed order", labelled(lambda scans, s: s.labels[..., ::-1]),
+    ScanMistake("labels of the points in reversed order", labelled(lambda scans, s: s.labels[..., ::-1]),
             ("in reversed order",)),
-    Mistake("poses turned by 2 degrees from a scan on", posed(lambda T: TURN @ T, FROM),
+    ScanMistake("poses turned by 2 degrees from a scan on", posed(lambda T: TURN @ T, FROM),
             (f"poses jump at scan {FROM}:",)),
-    Mistake("poses moved by 0.42 m from a scan on", posed(lambda T: JUMP @ T, FROM),
+    ScanMistake("poses moved by 0.42 m from a scan on", posed(lambda T: JUMP @ T, FROM),
             (f"poses jump at scan {FROM}:",)),
-    Mistake("pose of one scan off by 0.42 m",
+    ScanMistake("pose of one scan off by 0.42 m",
             lambda scans: [replace(s, T_wc=JUMP @ s.T_wc) if s.index == FROM else s for s in scans],
             (f"scan {FROM} does not fit",)),
-    Mistake("motion in the sweep not removed", lambda scans: scans, ("not deskewed",), swept=True),
-    Mistake("none", lambda scans: scans, ("nothing",)),
+    ScanMistake("motion in the sweep not removed", lambda scans: scans, ("not deskewed",), swept=True),
+    ScanMistake("none", lambda scans: scans, ("nothing",)),
 )  # fmt: skip
 
 

@@ -32,7 +32,7 @@ import numpy as np
 import numpy.typing as npt
 from exact_errors import ERRORS, IGNORED, Labeller, unlabelled
 from exact_scenes import Array, Ints, yard
-from exact_views import PATHS, Flight, ImagePoints, Pinhole, flight
+from exact_views import PATHS, ExactFlight, ImagePoints, Pinhole, flight
 
 from semstab.data.frames import Frame
 from semstab.data.statistics import Interval
@@ -153,7 +153,7 @@ def alpha_of(unit: Ints, label: Ints) -> Exact:
     return Exact(float(1 - observed / expected), error, len(times), n / len(times))
 
 
-def exact(flown: Flight, labeller: Labeller, points: int, rng: np.random.Generator) -> Exact:
+def exact(flown: ExactFlight, labeller: Labeller, points: int, rng: np.random.Generator) -> Exact:
     """Return alpha of the surface: draw until `points` points have two labels."""
     units, labels, drawn, twice, n = [], [], 0, 0, points
     for _ in range(DRAWS):
@@ -176,7 +176,7 @@ def exact(flown: Flight, labeller: Labeller, points: int, rng: np.random.Generat
 # --- What the tool sees, and says -------------------------------------------------------------------------------------
 
 
-def frames(flown: Flight, labeller: Labeller, condition: Condition, rng: np.random.Generator) -> Iterator[Frame]:
+def frames(flown: ExactFlight, labeller: Labeller, condition: Condition, rng: np.random.Generator) -> Iterator[Frame]:
     """Yield what the tool sees."""
     H, W = flown.sensor.height, flown.sensor.width
     for view, T_wc in zip(flown.images, flown.poses, strict=True):

@@ -30,8 +30,8 @@ from typing import Any, TextIO
 import numpy as np
 from exact import Condition, exact, frames, said
 from exact_errors import ERRORS, unlabelled
-from exact_scenes import Array, Scene
-from exact_views import PATHS, Flight, Pinhole
+from exact_scenes import Array, ExactScene
+from exact_views import PATHS, ExactFlight, Pinhole
 from levels import level_of, stated
 
 STRENGTH = 0.2, 1.2
@@ -82,12 +82,12 @@ def conditions() -> list[Condition]:
 # --- Flights ----------------------------------------------------------------------------------------------------------
 
 
-def again(condition: Condition, scene: Scene, rng: np.random.Generator) -> Flight:
+def again(condition: Condition, scene: ExactScene, rng: np.random.Generator) -> ExactFlight:
     """Return a flight over a scene, along a course of its own."""
     poses = PATHS[condition.path][1](condition.frames, rng)
     if condition.path in CIRCLES:
         poses = _about_the_vertical(rng.uniform(0, 2 * np.pi)) @ poses
-    return Flight(scene, Pinhole(SIZE[1], SIZE[0]), poses)
+    return ExactFlight(scene, Pinhole(SIZE[1], SIZE[0]), poses)
 
 
 def _about_the_vertical(angle: float) -> Array:

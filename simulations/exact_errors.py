@@ -7,7 +7,7 @@ from typing import Protocol
 
 import numpy as np
 from exact_scenes import Array, Ints
-from exact_views import Flight, ImagePoints
+from exact_views import ExactFlight, ImagePoints
 from scipy import ndimage
 from scipy.stats import norm
 
@@ -20,7 +20,7 @@ Number = Callable[[ImagePoints], Array]
 class Errors(Protocol):
     """A way to err."""
 
-    def __call__(self, flight: Flight, K: int, rng: np.random.Generator, strength: float = 1.0) -> Labeller:
+    def __call__(self, flight: ExactFlight, K: int, rng: np.random.Generator, strength: float = 1.0) -> Labeller:
         """Return the labels of a flight; strength: 1 where errors are as frequent, or as large, as described."""
         ...
 
@@ -33,7 +33,7 @@ BLOB, BLOCK, METRES, SHIFT, LASTS = 4.0, 8, 3.0, 2.0, 4
 """Blur of blobs in pixels, edge of blocks in pixels, width of errors of a place, most pixels of a border, frames."""
 
 
-def smooth(flight: Flight, blur: float, rng: np.random.Generator) -> Number:
+def smooth(flight: ExactFlight, blur: float, rng: np.random.Generator) -> Number:
     """Return a smooth random field of each frame, of variance 1."""
     shape = flight.sensor.height + 2 * PAD, flight.sensor.width + 2 * PAD
     fields = []
@@ -49,7 +49,7 @@ def smooth(flight: Flight, blur: float, rng: np.random.Generator) -> Number:
     return at
 
 
-def squares(flight: Flight, edge: int, rng: np.random.Generator) -> Number:
+def squares(flight: ExactFlight, edge: int, rng: np.random.Generator) -> Number:
     """Return a uniform number that is the same all over a square of pixels, and independent in each frame."""
     shape = len(flight.poses), -(-flight.sensor.height // edge), -(-flight.sensor.width // edge)
     drawn = rng.random(shape)
@@ -72,7 +72,7 @@ def other(truth: Ints, by: Array, K: int) -> Ints:
     return (truth + 1 + np.minimum((by * (K - 1)).astype(int), K - 2)) % K
 
 
-def in_blobs(share: Number, flight: Flight, K: int, rng: np.random.Generator) -> Labeller:
+def in_blobs(share: Number, flight: ExactFlight, K: int, rng: np.random.Generator) -> Labeller:
     """Return errors in blobs, of which `share` says how frequent they are; three classes at most stand in."""
     error, by = smooth(flight, BLOB, rng), smooth(flight, 2 * BLOB, rng)
 
@@ -83,45 +83,45 @@ def in_blobs(share: Number, flight: Flight, K: int, rng: np.random.Generator) ->
     return label
 
 
-def in_squares(share: float, edge: int, flight: Flight, K: int, rng: np.random.Generator) -> Labeller:
+def in_squares(share: float, edge: int, flight: ExactFlight, K: int, rng: np.random.Generator) -> Labeller:
     """Return errors of whole squares of pixels."""
     error, by = squares(flight, edge, rng), squares(flight, edge, rng)
     return lambda image: np.where(error(image) < share, other(image.truth, by(image), K), image.truth)
 
 
-def none(flight: Flight, K: int, rng: np.random.Generator, strength: float = 1.0) -> Labeller:
+def none(flight: ExactFlight, K: int, rng: np.random.Generator, strength: float = 1.0) -> Labeller:
     """Return the truth."""
     return lambda image: image.truth
 
 
-def pixels(flight: Flight, K: int, rng: np.random.Generator, strength: float = 1.0) -> Labeller:
+def pixels(flight: ExactFlight, K: int, rng: np.random.Generator, strength: float = 1.0) -> Labeller:
     """Return errors of 15 % of the pixels, each by itself."""
     return in_squares(0.15 * strength, 1, flight, K, rng)
 
 
-def blobs(flight: Flight, K: int, rng: np.random.Generator, strength: float = 1.0) -> Labeller:
+def blobs(flight: ExactFlight, K: int, rng: np.random.Generator, strength: float = 1.0) -> Labeller:
     """Return errors of blobs, 20 % of each image."""
     return in_blobs(lambda image: np.full(len(image.u), 0.2 * strength), flight, K, rng)
 
 
-def blocks(flight: Flight, K: int, rng: np.random.Generator, strength: float = 1.0) -> Labeller:
+def blocks(flight: ExactFlight, K: int, rng: np.random.Generator, strength: float = 1.0) -> Labeller:
     """Return errors of 20 % of the blocks of 8 x 8 pixels."""
     return in_squares(0.2 * strength, BLOCK, flight, K, rng)
 
 
-def place(flight: Flight, K: int, rng: np.random.Generator, strength: float = 1.0) -> Labeller:
+def place(flight: ExactFlight, K: int, rng: np.random.Generator, strength: float = 1.0) -> Labeller:
     """Return errors that stay at their place."""
     field = of_place(METRES, rng)
     return lambda image: np.where(field(image) > norm.isf(0.3 * strength), (image.truth + 1) % K, image.truth)
 
 
-def view(flight: Flight, K: int, rng: np.random.Generator, strength: float = 1.0) -> Labeller:
+def view(flight: ExactFlight, K: int, rng: np.random.Generator, strength: float = 1.0) -> Labeller:
     """Return frames of different quality: errors of up to 60 % of the image."""
     share = strength * rng.uniform(0, 0.6, len(flight.poses))
     return in_blobs(lambda image: np.full(len(image.u), share[image.frame]), flight, K, rng)
 
 
-def classes(flight: Flight, K: int, rng: np.random.Generator, strength: float = 1.0) -> Labeller:
+def classes(flight: ExactFlight, K: int, rng: np.random.Generator, strength: float = 1.0) -> Labeller:
     """Return errors of every third class: half of its blocks are taken for the next one."""
     error = squares(flight, BLOCK, rng)
 
@@ -132,7 +132,7 @@ def classes(flight: Flight, K: int, rng: np.random.Generator, strength: float = 
     return label
 
 
-def border(flight: Flight, K: int, rng: np.random.Generator, strength: float = 1.0) -> Labeller:
+def border(flight: ExactFlight, K: int, rng: np.random.Generator, strength: float = 1.0) -> Labeller:
     """Return borders in the wrong place: the class of where another ray goes, up to 2 pixels away."""
     right, down = smooth(flight, BLOB, rng), smooth(flight, BLOB, rng)
 
@@ -144,7 +144,7 @@ def border(flight: Flight, K: int, rng: np.random.Generator, strength: float = 1
     return label
 
 
-def burst(flight: Flight, K: int, rng: np.random.Generator, strength: float = 1.0) -> Labeller:
+def burst(flight: ExactFlight, K: int, rng: np.random.Generator, strength: float = 1.0) -> Labeller:
     """Return errors of 60 % in every fourth frame, one after another, and of 5 % in the others."""
     F = len(flight.poses)
     bad = max(1, F // 4)
@@ -153,7 +153,7 @@ def burst(flight: Flight, K: int, rng: np.random.Generator, strength: float = 1.
     return in_blobs(lambda image: np.full(len(image.u), share[image.frame]), flight, K, rng)
 
 
-def lasting(flight: Flight, K: int, rng: np.random.Generator, strength: float = 1.0) -> Labeller:
+def lasting(flight: ExactFlight, K: int, rng: np.random.Generator, strength: float = 1.0) -> Labeller:
     """Return errors that stay at their place for 4 frames."""
     fields = [of_place(METRES, rng) for _ in range(len(flight.poses) // LASTS + 1)]
     least = norm.isf(0.25 * strength)
@@ -163,7 +163,7 @@ def lasting(flight: Flight, K: int, rng: np.random.Generator, strength: float = 
 def with_range(most: float) -> Errors:
     """Return errors that grow with range, from none to `most`, between the 5 and 95 % quantiles over the pixels."""
 
-    def errors(flight: Flight, K: int, rng: np.random.Generator, strength: float = 1.0) -> Labeller:
+    def errors(flight: ExactFlight, K: int, rng: np.random.Generator, strength: float = 1.0) -> Labeller:
         distance = np.concatenate([image.distance[image.face >= 0] for image in flight.images])
         low, high = np.quantile(distance, (0.05, 0.95))
         far = strength * most / (high - low)
@@ -172,12 +172,12 @@ def with_range(most: float) -> Errors:
     return errors
 
 
-def grazing(flight: Flight, K: int, rng: np.random.Generator, strength: float = 1.0) -> Labeller:
+def grazing(flight: ExactFlight, K: int, rng: np.random.Generator, strength: float = 1.0) -> Labeller:
     """Return errors that grow from 30 degrees off the surface's normal to 70 % at 90."""
     return in_blobs(lambda image: 0.7 * strength * np.clip((image.angle - 30) / 60, 0, 1), flight, K, rng)
 
 
-def corners(flight: Flight, K: int, rng: np.random.Generator, strength: float = 1.0) -> Labeller:
+def corners(flight: ExactFlight, K: int, rng: np.random.Generator, strength: float = 1.0) -> Labeller:
     """Return errors that grow with the square of the image radius, to 60 % in the corners."""
     H, W = flight.sensor.height, flight.sensor.width
 
@@ -195,7 +195,7 @@ ERRORS: dict[str, Errors] = {
 }  # fmt: skip
 
 
-def unlabelled(labeller: Labeller, share: float, flight: Flight, rng: np.random.Generator) -> Labeller:
+def unlabelled(labeller: Labeller, share: float, flight: ExactFlight, rng: np.random.Generator) -> Labeller:
     """Return the labeller without labels in blobs, a share of each image, and at pixels without a surface."""
     field = smooth(flight, BLOB, rng)
 

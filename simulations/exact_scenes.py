@@ -91,7 +91,7 @@ def disc(middle: Sequence[float] | Array, radius: float, sides: int = 8) -> Arra
     return np.asarray(middle) + radius * np.stack([np.cos(angle), np.sin(angle)], axis=1)
 
 
-class Scene:
+class ExactScene:
     """Solids, the first of which is the ground; the faces of all are counted through.
 
     Args:
@@ -187,7 +187,7 @@ YARD = 25.0
 """Half the edge of the ground, metres."""
 
 
-def yard(K: int, rng: np.random.Generator) -> Scene:
+def yard(K: int, rng: np.random.Generator) -> ExactScene:
     """Return ground with patches and stripes, 9 boxes, 3 slopes and 6 poles, all within 12 m of its middle."""
     ground = rectangle((-YARD, -YARD), (YARD, YARD))
     solids = [Solid.prism(ground, 0.0, 0, 0, bottom=-1.0, textures={4: patches(YARD, K, rng)})]
@@ -203,7 +203,7 @@ def yard(K: int, rng: np.random.Generator) -> Scene:
     for _ in range(6):
         outline, of = disc(_within(11, rng), rng.uniform(0.08, 0.2)), int(rng.integers(0, K))
         solids.append(Solid.prism(outline, rng.uniform(3, 6), of, of))
-    return Scene(solids)
+    return ExactScene(solids)
 
 
 def _within(radius: float, rng: np.random.Generator) -> Array:
@@ -215,7 +215,7 @@ ROAD, LENGTH = 4.0, (-15.0, 85.0)
 """Half the width of a road, and where a street begins and ends along x, metres."""
 
 
-def street(K: int, rng: np.random.Generator) -> Scene:
+def street(K: int, rng: np.random.Generator) -> ExactScene:
     """Return a street along x: road with marks, pavements, facades with windows, poles and parked cars.
 
     Its classes are of 8 things, modulo K with fewer classes.
@@ -251,4 +251,4 @@ def street(K: int, rng: np.random.Generator) -> Scene:
                 start = x + rng.uniform(0, 3)
                 y = sorted((side * 2.6, side * (ROAD - 0.2)))
                 solids.append(Solid.prism(rectangle((start, y[0]), (start + 4.2, y[1])), 1.5, car, car))
-    return Scene(solids)
+    return ExactScene(solids)

@@ -8,7 +8,7 @@ from functools import cached_property
 from typing import Protocol
 
 import numpy as np
-from exact_scenes import Array, Ints, Scene, street, yard
+from exact_scenes import Array, ExactScene, Ints, street, yard
 
 from semstab.data.frames import Intrinsics
 
@@ -115,10 +115,10 @@ class ImagePoints:
 
 
 @dataclass(frozen=True)
-class Flight:
+class ExactFlight:
     """A sensor at poses (F, 4, 4) in a scene."""
 
-    scene: Scene
+    scene: ExactScene
     sensor: Sensor
     poses: Array
 
@@ -218,7 +218,9 @@ def scanning(frames: int, rng: np.random.Generator) -> Array:
     return poses
 
 
-PATHS: dict[str, tuple[Callable[[int, np.random.Generator], Scene], Callable[[int, np.random.Generator], Array]]] = {
+PATHS: dict[
+    str, tuple[Callable[[int, np.random.Generator], ExactScene], Callable[[int, np.random.Generator], Array]]
+] = {
     "orbit": (yard, orbit),
     "strips": (yard, strips),
     "oblique": (yard, oblique),
@@ -229,8 +231,8 @@ PATHS: dict[str, tuple[Callable[[int, np.random.Generator], Scene], Callable[[in
 """The scene and the path of each."""
 
 
-def flight(path: str, frames: int, K: int, size: tuple[int, int], rng: np.random.Generator) -> Flight:
+def flight(path: str, frames: int, K: int, size: tuple[int, int], rng: np.random.Generator) -> ExactFlight:
     """Return a new scene, and a flight over it; size: (height, width) of a camera's images."""
     scene, course = PATHS[path]
     sensor: Sensor = Spinning() if path == "scan" else Pinhole(size[1], size[0])
-    return Flight(scene(K, rng), sensor, course(frames, rng))
+    return ExactFlight(scene(K, rng), sensor, course(frames, rng))

@@ -22,7 +22,7 @@ VOXEL, PIXELS = 0.125, 16
 
 
 @dataclass(frozen=True)
-class Flight:
+class SimulatedFlight:
     """How a model errs on a scene, and how it is flown over.
 
     Attributes:
@@ -63,7 +63,7 @@ def field(side: int, reach: float, rng: np.random.Generator) -> np.ndarray:
     return np.fft.ifft2(noise * gain).real[:side, :side] / np.sqrt((gain**2).mean())
 
 
-def qualities(flight: Flight, rng: np.random.Generator) -> np.ndarray:
+def qualities(flight: SimulatedFlight, rng: np.random.Generator) -> np.ndarray:
     """Return how much worse each frame is than usual (F,)."""
     steps = rng.standard_normal(flight.frames)
     if flight.quality == "bad":
@@ -81,7 +81,7 @@ def qualities(flight: Flight, rng: np.random.Generator) -> np.ndarray:
     return np.zeros(flight.frames)
 
 
-def places(flight: Flight) -> np.ndarray:
+def places(flight: SimulatedFlight) -> np.ndarray:
     """Return voxel indices (n, 3).
 
     A floor, or blocks of houses 12 voxels wide and up to 8 high, with streets of 8 between.
@@ -113,7 +113,7 @@ class World:
     mixed: np.ndarray
 
 
-def world(flight: Flight, rng: np.random.Generator) -> World:
+def world(flight: SimulatedFlight, rng: np.random.Generator) -> World:
     """Return a scene of the kind that the flight says."""
     index = places(flight)
     x, y, z = index.T
@@ -131,7 +131,7 @@ def _largest(classes: np.ndarray) -> np.ndarray:
     return np.where(classes.max(axis=0) > 0, classes.argmax(axis=0), len(classes))
 
 
-def fly(flight: Flight, over: World, rng: np.random.Generator, ease: float | None = None) -> np.ndarray:
+def fly(flight: SimulatedFlight, over: World, rng: np.random.Generator, ease: float | None = None) -> np.ndarray:
     """Return labels (n, F) of a flight over a scene; -1 where a frame does not see a place."""
     n, F = len(over.index), flight.frames
     off = over.index[:, :1] - (np.arange(F) + 0.5) / F * flight.side
@@ -162,7 +162,7 @@ def _by_object(over: World, frames: int, rng: np.random.Generator) -> np.ndarray
     return drawn[of.ravel()]
 
 
-def log_of(labels: np.ndarray, over: World, flight: Flight, voxel_size: float = VOXEL) -> Events:
+def log_of(labels: np.ndarray, over: World, flight: SimulatedFlight, voxel_size: float = VOXEL) -> Events:
     """Return the log of labels (n, F), or of scores for them."""
     some = (labels >= 0).any(axis=1)
     voxel, frame = np.nonzero(labels[some] >= 0)
@@ -185,7 +185,7 @@ def table_of(log: Events) -> VoxelTable:
 
 
 def sums_of(
-    labels: np.ndarray, over: World, flight: Flight = Flight(), rng: np.random.Generator | None = None
+    labels: np.ndarray, over: World, flight: SimulatedFlight = SimulatedFlight(), rng: np.random.Generator | None = None
 ) -> ClusterSums:
     """Return the sums of a flight, with the truth, and with the cells that alpha is of; see `sample_of`."""
     log = log_of(labels, over, flight)
@@ -195,7 +195,7 @@ def sums_of(
 
 
 def sample_of(
-    labels: np.ndarray, over: World, flight: Flight, rng: np.random.Generator | None = None
+    labels: np.ndarray, over: World, flight: SimulatedFlight, rng: np.random.Generator | None = None
 ) -> SpotObservations:
     """Return what a sampler takes of a flight: likeliest classes of fine cells, half as wide as a voxel.
 

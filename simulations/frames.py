@@ -47,7 +47,7 @@ CONDITIONS = (
 
 
 @dataclass(frozen=True)
-class Made:
+class MadeScene:
     """A scene, and how a model errs on it.
 
     Attributes:
@@ -71,7 +71,7 @@ class Made:
     noise: float
 
     @classmethod
-    def drawn(cls, rng: np.random.Generator, uneven: float) -> Made:
+    def drawn(cls, rng: np.random.Generator, uneven: float) -> MadeScene:
         """Draw a scene; `uneven` is the standard deviation of the log odds of an error between frames."""
         K, F = int(rng.integers(2, 13)), int(rng.integers(12, 41))
         at = np.stack(np.meshgrid(np.arange(GRID), np.arange(GRID)), axis=-1).reshape(-1, 1, 2)
@@ -117,7 +117,7 @@ def course(frames: int, rng: np.random.Generator) -> np.ndarray:
     return poses
 
 
-def named(made: Made, bad: bool, rng: np.random.Generator) -> tuple[set[int], set[int]]:
+def named(made: MadeScene, bad: bool, rng: np.random.Generator) -> tuple[set[int], set[int]]:
     """Return the frames that are bad, and those that are named."""
     first, sampler, planted = int(rng.integers(THIRD)), Sampler(made.K), set[int]()
     for frame in made.frames(rng):
@@ -139,7 +139,7 @@ def main(trials: int = 100, seed: int = 0) -> None:
         innocent = exact = found = planted = 0
         for trial in range(trials):
             rng = np.random.default_rng([seed, trial, bad])
-            truth, blamed = named(Made.drawn(np.random.default_rng([seed, trial]), uneven), bad, rng)
+            truth, blamed = named(MadeScene.drawn(np.random.default_rng([seed, trial]), uneven), bad, rng)
             innocent, exact = innocent + bool(blamed - truth), exact + (blamed == truth)
             found, planted = found + len(blamed & truth), planted + len(truth)
         share = f"{found / planted:.3f}" if planted else "-"

@@ -16,7 +16,7 @@ from typing import Literal
 
 import cases
 import numpy as np
-from flights import Flight, World, fly, number_of, sums_of, totals_of, world
+from flights import SimulatedFlight, World, fly, number_of, sums_of, totals_of, world
 
 from semstab.core.types import OTHER_SCENES, THIS_SCENE, Scope
 from semstab.data.statistics import Interval
@@ -32,15 +32,18 @@ RULE = parse("alpha drop < 0.02")
 LEVEL = 0.05
 
 
-def conditions() -> Iterator[tuple[str, Flight]]:
+def conditions() -> Iterator[tuple[str, SimulatedFlight]]:
     """Yield name and flight."""
     for frames, side in ((15, 32), (30, 32), (15, 64), (64, 32)):
         observations = frames if frames < 64 else 16
         for quality in ("alike", "bad", "uneven", "lasting"):
-            yield f"{frames} frames, {side} x {side}, {quality}", Flight(side, 1.5, 1.0, frames, observations, quality)
+            yield (
+                f"{frames} frames, {side} x {side}, {quality}",
+                SimulatedFlight(side, 1.5, 1.0, frames, observations, quality),
+            )
 
 
-def models(flight: Flight, same: bool, rng: np.random.Generator) -> list[ClusterSums]:
+def models(flight: SimulatedFlight, same: bool, rng: np.random.Generator) -> list[ClusterSums]:
     """The sums of the baseline and of each new model."""
     over = world(flight, rng)
     found = []
@@ -51,7 +54,7 @@ def models(flight: Flight, same: bool, rng: np.random.Generator) -> list[Cluster
     return found
 
 
-def rates(flight: Flight, trials: int, seed: int, scope: Scope = THIS_SCENE) -> list[float]:
+def rates(flight: SimulatedFlight, trials: int, seed: int, scope: Scope = THIS_SCENE) -> list[float]:
     """The margin, then shares of trials: without a difference failed, passed; with it passed, failed, undecided."""
     found: list[list[Interval]] = []
     totals = 0.0

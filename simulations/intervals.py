@@ -18,7 +18,7 @@ from typing import Literal
 
 import cases
 import numpy as np
-from flights import Flight, fly, number_of, sums_of, totals_of, world
+from flights import SimulatedFlight, fly, number_of, sums_of, totals_of, world
 
 from semstab.core.types import OTHER_SCENES, THESE_FRAMES, THIS_SCENE, Scope
 from semstab.data.statistics import Interval
@@ -32,7 +32,7 @@ FLIGHTS = 8
 
 
 @dataclasses.dataclass(frozen=True)
-class Row:
+class IntervalRow:
     """Results of the trials of one condition: for each its value, interval and target, and the spread of values."""
 
     name: str
@@ -60,14 +60,14 @@ HEAD = ["condition", "of", "target", "sd", "half width", "half width / 1.96 sd",
 
 
 def trials(
-    flight: Flight,
+    flight: SimulatedFlight,
     count: int,
     seed: int,
     scope: Scope,
     keys: Sequence[str] = KEYS,
     name: str = "",
     interval: Scope | None = None,
-) -> list[Row]:
+) -> list[IntervalRow]:
     """Simulate scene after scene: 'this scene' has a target of its own in each, the others one of all.
 
     The interval's scope is the same, unless it is given.
@@ -92,7 +92,7 @@ def trials(
             targets, spread = number_of(scenes, key), math.sqrt(one.var(axis=1, ddof=1).mean())
         else:
             targets, spread = np.full(count, float(number_of(scenes.sum(axis=0), key))), float(one.std(ddof=1))
-        rows.append(Row(name, key, spread, targets, tuple(intervals[key])))
+        rows.append(IntervalRow(name, key, spread, targets, tuple(intervals[key])))
     return rows
 
 
@@ -102,39 +102,43 @@ def trials(
 QUALITIES = ("alike", "bad", "uneven", "lasting", "regimes", "heavy", "objects", "view", "direction")
 
 
-def this_scene(count: int, seed: int) -> Iterator[Row]:
+def this_scene(count: int, seed: int) -> Iterator[IntervalRow]:
     """Simulate the same scene flown again: frames of nine kinds, of which all see all or each sees a strip."""
     yield from _flown(count, seed, THIS_SCENE)
 
 
-def other_scenes(count: int, seed: int) -> Iterator[Row]:
+def other_scenes(count: int, seed: int) -> Iterator[IntervalRow]:
     """Simulate other scenes, also with errors that reach up to a fifth of the scene."""
     yield from _flown(count, seed, OTHER_SCENES)
     for reach in (0.5, 5.0, 10.0):
         for quality in ("alike", "bad", "lasting", "objects"):
-            yield from _of_frames(Flight(45, reach, 1.0, 40, 5, quality), count, seed, OTHER_SCENES, f"reach {reach:g}")
+            yield from _of_frames(
+                SimulatedFlight(45, reach, 1.0, 40, 5, quality), count, seed, OTHER_SCENES, f"reach {reach:g}"
+            )
 
 
-def _flown(count: int, seed: int, scope: Scope) -> Iterator[Row]:
+def _flown(count: int, seed: int, scope: Scope) -> Iterator[IntervalRow]:
     for frames in (20, 40, 80, 150):
         for quality in QUALITIES:
-            yield from _of_frames(Flight(45, 2.0, 1.0, frames, 5, quality), count, seed, scope)
+            yield from _of_frames(SimulatedFlight(45, 2.0, 1.0, frames, 5, quality), count, seed, scope)
     for frames in (20, 60):
         for quality in ("alike", "bad", "lasting", "regimes", "objects"):
-            yield from _of_frames(Flight(32, 2.0, 1.0, frames, frames, quality), count, seed, scope)
+            yield from _of_frames(SimulatedFlight(32, 2.0, 1.0, frames, frames, quality), count, seed, scope)
     for quality in ("bad", "lasting", "objects"):
-        yield from _of_frames(Flight(60, 2.0, 1.0, 40, 5, quality, city=True), count, seed, scope, "city 60 x 60")
-        yield from _of_frames(Flight(45, 2.0, 1.0, 40, 5, quality, K=5), count, seed, scope, "five classes")
         yield from _of_frames(
-            Flight(45, 2.0, 1.0, 40, 5, quality, soft=True), count, seed, scope, "scores", "voxel_alpha"
+            SimulatedFlight(60, 2.0, 1.0, 40, 5, quality, city=True), count, seed, scope, "city 60 x 60"
         )
-        yield from _of_frames(Flight(45, 2.0, 2.2, 40, 5, quality), count, seed, scope, "few errors")
-        yield from _of_frames(Flight(45, 2.0, 1.0, 40, 5, quality), count, seed, scope, "", "psa")
+        yield from _of_frames(SimulatedFlight(45, 2.0, 1.0, 40, 5, quality, K=5), count, seed, scope, "five classes")
+        yield from _of_frames(
+            SimulatedFlight(45, 2.0, 1.0, 40, 5, quality, soft=True), count, seed, scope, "scores", "voxel_alpha"
+        )
+        yield from _of_frames(SimulatedFlight(45, 2.0, 2.2, 40, 5, quality), count, seed, scope, "few errors")
+        yield from _of_frames(SimulatedFlight(45, 2.0, 1.0, 40, 5, quality), count, seed, scope, "", "psa")
 
 
 def _of_frames(
-    flight: Flight, count: int, seed: int, scope: Scope, where: str = "", key: str = "voxel_alpha"
-) -> Iterator[Row]:
+    flight: SimulatedFlight, count: int, seed: int, scope: Scope, where: str = "", key: str = "voxel_alpha"
+) -> Iterator[IntervalRow]:
     overlap = "all see all" if flight.observations == flight.frames else "strips"
     name = ", ".join(filter(None, (f"{flight.frames} frames", flight.quality, overlap, where)))
     yield from trials(flight, count, seed, scope, (key,), name)
@@ -143,13 +147,13 @@ def _of_frames(
 BY_LOCATION = ("wrong_of_consistent", "entropy")
 
 
-def locations(count: int, seed: int) -> Iterator[Row]:
+def locations(count: int, seed: int) -> Iterator[IntervalRow]:
     """Numbers whose frames do not show how they vary: by locations, as they are printed, and by frames.
 
     The target of both is what many flights over the same scene have together.
     """
     for quality in QUALITIES:
-        flight, name = Flight(45, 2.0, 1.0, 40, 5, quality, K=5), f"40 frames, {quality}, strips, five classes"
+        flight, name = SimulatedFlight(45, 2.0, 1.0, 40, 5, quality, K=5), f"40 frames, {quality}, strips, five classes"
         for scope, by in ((THESE_FRAMES, "by location"), (THIS_SCENE, "by frame")):
             yield from trials(flight, count, seed, THIS_SCENE, BY_LOCATION, f"{name}, {by}", interval=scope)
 

@@ -81,14 +81,14 @@ class Box:
 
 
 @dataclass(frozen=True)
-class Street:
+class MadeStreet:
     """Objects of a street, and the views of them."""
 
     boxes: list[Box]
     poses: np.ndarray
 
     @classmethod
-    def drawn(cls, rng: np.random.Generator, *, movers: int = MOVERS) -> Street:
+    def drawn(cls, rng: np.random.Generator, *, movers: int = MOVERS) -> MadeStreet:
         """A street along x, with walls, parked boxes and movers in lanes of their own."""
         walls = [
             Box(np.array([x, y, 0.0]), (14.0, 8.0, rng.uniform(4, 9)))
@@ -219,7 +219,7 @@ def made(scenes: int, seed: int, noises: tuple[float, ...], movers: int) -> None
     for noise in noises:
         counts = Counts()
         for scene in range(scenes):
-            street = Street.drawn(np.random.default_rng([seed, scene]), movers=movers)
+            street = MadeStreet.drawn(np.random.default_rng([seed, scene]), movers=movers)
             spots, on = street.asked(noise, np.random.default_rng([seed, scene, 1]))
             assert spots.votes is not None
             boxes = [None, *street.boxes]

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import cases
 import numpy as np
-from moving import CLASSES, HEADS, Counts, Street
+from moving import CLASSES, HEADS, Counts, MadeStreet
 from scipy.spatial import cKDTree
 
 import semstab
@@ -31,7 +31,7 @@ STAYS, MOVES, WENT, UNSAID = range(4)
 """The truth of a point: its thing stays, moves, or went by its own length; or nothing is said of it."""
 
 
-def scans(street: Street, noise: float, rng: np.random.Generator) -> Iterator[tuple[Frame, Int64]]:
+def scans(street: MadeStreet, noise: float, rng: np.random.Generator) -> Iterator[tuple[Frame, Int64]]:
     """Yield scans of a street from the ground, with `noise` in metres, and the number of what each point is on."""
     up, at = np.meshgrid(np.radians(np.linspace(UP, DOWN, RINGS)), np.linspace(0, 2 * np.pi, COLUMNS, endpoint=False))
     rays = np.stack([np.cos(up) * np.cos(at), np.cos(up) * np.sin(at), np.sin(up)], axis=-1).reshape(-1, 3)
@@ -60,7 +60,7 @@ def made(scenes: int, seed: int, noises: tuple[float, ...], movers: int) -> None
     for noise in noises:
         counts = Counts()
         for scene in range(scenes):
-            street = Street.drawn(np.random.default_rng([seed, scene]), movers=movers)
+            street = MadeStreet.drawn(np.random.default_rng([seed, scene]), movers=movers)
             votes, ids = Sampler(CLASSES), Sampler(len(street.boxes) + 1, moving=False)
             for frame, objects in scans(street, noise, np.random.default_rng([seed, scene, 2])):
                 votes.add(frame)

@@ -25,7 +25,7 @@ Array = npt.NDArray[np.float64]
 
 
 @dataclass(frozen=True)
-class Views:
+class OrbitViews:
     """Labels (F, H, W) of a scene, which pixels see it, points (F, H, W, 3) in metres, and poses (F, 4, 4)."""
 
     labels: npt.NDArray[np.int64]
@@ -44,7 +44,9 @@ class Views:
         return 0.9 * self.labels.shape[2]
 
 
-def scene(rng: np.random.Generator, frames: int = 30, height: int = 60, width: int = 80, turns: float = 1.0) -> Views:
+def scene(
+    rng: np.random.Generator, frames: int = 30, height: int = 60, width: int = 80, turns: float = 1.0
+) -> OrbitViews:
     """Return the views of a new scene from an orbit."""
     sites, of = rng.uniform(-SIZE, SIZE, (40, 2)), rng.integers(0, TOP, 40)
     low = rng.uniform(-0.6 * SIZE, 0.6 * SIZE, (10, 2))
@@ -59,7 +61,7 @@ def scene(rng: np.random.Generator, frames: int = 30, height: int = 60, width: i
         poses.append(_looking(centre, np.array([*rng.normal(0, 3, 2), 0.0])))
         casts.append(_cast(poses[-1], rays, sites, of, boxes))
     labels, there, points = (np.stack(arrays) for arrays in zip(*casts, strict=True))
-    return Views(labels, there, points, np.stack(poses))
+    return OrbitViews(labels, there, points, np.stack(poses))
 
 
 def _circle(angle: float) -> Array:
@@ -101,7 +103,7 @@ def field(points: Array, rng: np.random.Generator, scale: float) -> Array:
     return np.cos(points @ waves.T + phase).sum(axis=-1) / np.sqrt(12)
 
 
-def predicted(views: Views, kind: str, rate: float, model: int, flight: int) -> npt.NDArray[np.int64]:
+def predicted(views: OrbitViews, kind: str, rate: float, model: int, flight: int) -> npt.NDArray[np.int64]:
     """Return the labels (F, H, W) of a model on a flight.
 
     Args:
@@ -122,34 +124,34 @@ def predicted(views: Views, kind: str, rate: float, model: int, flight: int) -> 
 Wrong = npt.NDArray[np.bool_] | tuple[npt.NDArray[np.bool_], npt.NDArray[np.int64]]
 
 
-def _blocks(views: Views, new: np.random.Generator, rate: float) -> npt.NDArray[np.bool_]:
+def _blocks(views: OrbitViews, new: np.random.Generator, rate: float) -> npt.NDArray[np.bool_]:
     F, (H, W) = len(views.labels), views.shape
     drawn = new.random((F, -(-H // 8), -(-W // 8))) < rate
     return drawn.repeat(8, axis=1).repeat(8, axis=2)[:, :H, :W]
 
 
-def _pixel(views: Views, rate: float, _: np.random.Generator, new: np.random.Generator) -> Wrong:
+def _pixel(views: OrbitViews, rate: float, _: np.random.Generator, new: np.random.Generator) -> Wrong:
     shape = views.labels.shape
     return new.random(shape) < rate, (views.labels + new.integers(1, K, shape)) % K
 
 
-def _persistent(views: Views, rate: float, of_model: np.random.Generator, _: np.random.Generator) -> Wrong:
+def _persistent(views: OrbitViews, rate: float, of_model: np.random.Generator, _: np.random.Generator) -> Wrong:
     return field(views.points, of_model, 3.0) > norm.isf(rate)
 
 
-def _view(views: Views, rate: float, of_model: np.random.Generator, new: np.random.Generator) -> Wrong:
+def _view(views: OrbitViews, rate: float, of_model: np.random.Generator, new: np.random.Generator) -> Wrong:
     """Each location is hard from directions of its own, which neighbours have in common."""
     azimuth = np.arctan2(views.poses[:, 1, 3], views.poses[:, 0, 3])[:, None, None]
     away = np.cos(np.pi * field(views.points, of_model, 6.0) - azimuth + 0.2 * new.normal(size=azimuth.shape))
     return away > np.cos(np.pi * rate)
 
 
-def _class(views: Views, rate: float, _: np.random.Generator, new: np.random.Generator) -> Wrong:
+def _class(views: OrbitViews, rate: float, _: np.random.Generator, new: np.random.Generator) -> Wrong:
     confused = np.isin(views.labels, (0, 2, TOP)) & _blocks(views, new, min(3 * rate, 1.0))
     return confused, np.full(views.labels.shape, 1)
 
 
-def _boundary(views: Views, rate: float, _: np.random.Generator, new: np.random.Generator) -> Wrong:
+def _boundary(views: OrbitViews, rate: float, _: np.random.Generator, new: np.random.Generator) -> Wrong:
     width = 1 + 2 * max(1, round(10 * rate))
     near = [ndimage.maximum_filter(image, width) != ndimage.minimum_filter(image, width) for image in views.labels]
     shift = new.integers(-(width // 2), width // 2 + 1, (len(views.labels), 2))
@@ -157,12 +159,12 @@ def _boundary(views: Views, rate: float, _: np.random.Generator, new: np.random.
     return np.stack(near), np.stack(moved)
 
 
-def _burst(views: Views, rate: float, _: np.random.Generator, new: np.random.Generator) -> Wrong:
+def _burst(views: OrbitViews, rate: float, _: np.random.Generator, new: np.random.Generator) -> Wrong:
     of_frame = np.where(new.random(len(views.labels)) < 0.12, min(3 * rate, 1.0), 0.3 * rate)
     return new.random(views.labels.shape) < of_frame[:, None, None]
 
 
-def _lasting(views: Views, rate: float, _: np.random.Generator, new: np.random.Generator) -> Wrong:
+def _lasting(views: OrbitViews, rate: float, _: np.random.Generator, new: np.random.Generator) -> Wrong:
     """Errors of a place last: a field over space whose autocorrelation from frame to frame is 0.85."""
     keep, result = 0.85, []
     waves, phase = new.normal(0, 0.5, (24, 3)), new.uniform(0, 2 * np.pi, 24)
@@ -175,7 +177,7 @@ def _lasting(views: Views, rate: float, _: np.random.Generator, new: np.random.G
     return np.stack(result)
 
 
-_WRONG: dict[str, Callable[[Views, float, np.random.Generator, np.random.Generator], Wrong]] = {
+_WRONG: dict[str, Callable[[OrbitViews, float, np.random.Generator, np.random.Generator], Wrong]] = {
     "none": lambda views, *_: np.zeros(views.labels.shape, np.bool_),
     "pixel": _pixel,
     "block": lambda views, rate, _, new: _blocks(views, new, rate),
@@ -188,7 +190,7 @@ _WRONG: dict[str, Callable[[Views, float, np.random.Generator, np.random.Generat
 }
 
 
-def frames(views: Views, labels: npt.NDArray[np.int64], stride: int = 1) -> Iterator[Frame]:
+def frames(views: OrbitViews, labels: npt.NDArray[np.int64], stride: int = 1) -> Iterator[Frame]:
     """Yield the frames of a flight, of which every stride-th pixel of each axis is kept."""
     (H, W), f = views.shape, views.focal
     for k, (pose, label, there) in enumerate(zip(views.poses, labels, views.there, strict=True)):

@@ -15,7 +15,7 @@ import itertools
 
 import cases
 import numpy as np
-from flights import Flight, fly, sums_of, world
+from flights import SimulatedFlight, fly, sums_of, world
 from scipy.optimize import brentq
 
 from semstab.comparison.differences import sums_difference
@@ -32,7 +32,7 @@ SIDE, EASE, WORLDS = 32, 1.0, 6
 
 def psa_at(ease: float, kind: str) -> float:
     """PSA of a model, over several scenes; the same random numbers at every ease."""
-    flight = Flight(SIDE, 2.0, ease, 60, 60, kind)
+    flight = SimulatedFlight(SIDE, 2.0, ease, 60, 60, kind)
     found = []
     for seed in range(WORLDS):
         rng = np.random.default_rng([7, seed])
@@ -49,7 +49,7 @@ def main(trials: int = 100, only: str = "") -> None:
     for kind in (kind for kind in KINDS if only in kind):
         eases = [EASE if not loss else ease_of(kind, loss) for loss in LOSSES]
         for frames, elsewhere in itertools.product(FRAMES, (False, True)):
-            flight = Flight(SIDE, 2.0, EASE, frames, frames, kind)
+            flight = SimulatedFlight(SIDE, 2.0, EASE, frames, frames, kind)
             cells = [part for ease in eases for part in found(flight, ease, trials, elsewhere=elsewhere)]
             where = "at other places" if elsewhere else "at the same places"
             cases.row([f"{frames}, {kind}, {where}", *cells])
@@ -61,7 +61,7 @@ def ease_of(kind: str, loss: float) -> float:
     return float(brentq(lambda ease: psa_at(ease, kind) - base + loss, -2, EASE, xtol=0.01))
 
 
-def found(flight: Flight, ease: float, trials: int, *, elsewhere: bool) -> list[str]:
+def found(flight: SimulatedFlight, ease: float, trials: int, *, elsewhere: bool) -> list[str]:
     """Return the shares of trials in which compare and gate find a loss; empty for equal models, errors elsewhere."""
     if elsewhere and ease == EASE:
         return ["", ""]

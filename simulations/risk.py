@@ -31,7 +31,7 @@ from typing import Literal
 import cases
 import numpy as np
 from alpha import RATES
-from orbit_views import KINDS, K, Views, frames, predicted, scene
+from orbit_views import KINDS, K, OrbitViews, frames, predicted, scene
 from signs import auroc
 from signs import table as table_of_signs
 
@@ -89,7 +89,7 @@ class Places:
     right: np.ndarray
 
     @classmethod
-    def of(cls, model: str, flight: str, table: VoxelTable, truth: VoxelTable) -> Places:
+    def from_tables(cls, model: str, flight: str, table: VoxelTable, truth: VoxelTable) -> Places:
         """Return the places of a map with the map of its ground truth."""
         label = join_truth(table, truth).label
         some = np.flatnonzero((label >= 0) & (table.op >= 3))
@@ -143,10 +143,12 @@ def made(scenes: int, seed: int) -> Iterator[Places]:
             for trial in range(scenes):
                 views = scene(np.random.default_rng([seed, trial]))
                 labels = predicted(views, kind, rate, trial, 0)
-                yield Places.of(f"{kind}, {rate:.2f}", f"{trial}", fused(views, labels), fused(views, views.labels))
+                yield Places.from_tables(
+                    f"{kind}, {rate:.2f}", f"{trial}", fused(views, labels), fused(views, views.labels)
+                )
 
 
-def fused(views: Views, labels: np.ndarray) -> VoxelTable:
+def fused(views: OrbitViews, labels: np.ndarray) -> VoxelTable:
     """Return the map of labels (F, H, W)."""
     backend = backends.create("numba", voxel_size=VOXEL, num_classes=K)
     for frame in frames(views, labels):
@@ -172,7 +174,7 @@ def of_run(run: str) -> Iterator[Places]:
     run_files = open_run(run)
     for name, entry in run_files.scenes.items():
         record = entry.with_voxels("this")
-        yield Places.of(run_files.model, name, record.table(), VoxelTable.load(record.truth_file))
+        yield Places.from_tables(run_files.model, name, record.table(), VoxelTable.load(record.truth_file))
 
 
 def rows(maps: Sequence[Places], family: Callable[[str], str], *, by_class: bool) -> Iterator[list[str]]:

@@ -70,7 +70,7 @@ def to_border_in_map(table: VoxelTable) -> np.ndarray:
     return distance
 
 
-class Rows:
+class VoxelRows:
     """The rows of a table's voxels."""
 
     def __init__(self, table: VoxelTable) -> None:
@@ -79,7 +79,7 @@ class Rows:
         self.order = np.argsort(key)
         self.key = key[self.order]
 
-    def of(self, index: np.ndarray) -> np.ndarray:
+    def find(self, index: np.ndarray) -> np.ndarray:
         """Return the rows (n,) of voxels (n, 3), all of which the table has."""
         key = np.ravel_multi_index(tuple((index - self.low).T), self.size)
         return self.order[np.searchsorted(self.key, key)]
@@ -90,11 +90,11 @@ def in_frames(task: Task, scored: Task | None, table: VoxelTable, stride: int) -
 
     Each frame counts with the mean over its pixels in the voxel.
     """
-    rows, found = Rows(table), []
+    rows, found = VoxelRows(table), []
     for index in task.indices:
         frame = read(task, index, stride)
         signs = of_pixels(task, scored, index, stride)
-        voxel = rows.of(voxel_index(back_project(frame), table.voxel_size, frame).T)
+        voxel = rows.find(voxel_index(back_project(frame), table.voxel_size, frame).T)
         row, inverse, pixels = np.unique(voxel, return_inverse=True, return_counts=True)
         means = [np.bincount(inverse, sign[frame.valid]) / pixels for sign in signs]
         found.append((row, np.stack(means, axis=1)))

@@ -25,7 +25,7 @@ from unittest import mock
 import cases
 import intervals as study
 import numpy as np
-from flights import Flight, fly, number_of, sums_of, totals_of, world
+from flights import SimulatedFlight, fly, number_of, sums_of, totals_of, world
 
 from semstab.core.types import OTHER_SCENES, THIS_SCENE, Scope
 from semstab.statistics import intervals
@@ -87,11 +87,13 @@ METHODS: Mapping[str, Callable[[Influences, Scope], Spread]] = {
 }  # fmt: skip
 
 
-def conditions(scope: Scope) -> Iterator[tuple[str, Flight, str]]:
+def conditions(scope: Scope) -> Iterator[tuple[str, SimulatedFlight, str]]:
     """Yield the name, the flight and the number of each condition of `intervals.py`."""
-    later: list[tuple[str, Flight, str]] = []
+    later: list[tuple[str, SimulatedFlight, str]] = []
 
-    def note(flight: Flight, _count: int, _seed: int, _scope: Scope, keys: tuple[str, ...], name: str) -> list[object]:
+    def note(
+        flight: SimulatedFlight, _count: int, _seed: int, _scope: Scope, keys: tuple[str, ...], name: str
+    ) -> list[object]:
         later.extend((name, flight, key) for key in keys)
         return []
 
@@ -100,7 +102,7 @@ def conditions(scope: Scope) -> Iterator[tuple[str, Flight, str]]:
     yield from later
 
 
-def rows(flight: Flight, key: str, count: int, seed: int, scope: Scope) -> Mapping[str, tuple[float, float]]:
+def rows(flight: SimulatedFlight, key: str, count: int, seed: int, scope: Scope) -> Mapping[str, tuple[float, float]]:
     """Return of each method the share of intervals that hold their target, and the median of half their width."""
     found: dict[str, list[tuple[float, float]]] = {name: [] for name in METHODS}
     totals = []

@@ -21,8 +21,8 @@ from dataclasses import dataclass
 import numpy as np
 from exact import Condition, frames
 from exact_errors import ERRORS, IGNORED, Labeller
-from exact_scenes import Array, Ints, Scene, Solid, rectangle, yard
-from exact_views import PATHS, Flight, ImagePoints, Pinhole
+from exact_scenes import Array, ExactScene, Ints, Solid, rectangle, yard
+from exact_views import PATHS, ExactFlight, ImagePoints, Pinhole
 
 from semstab.data.statistics import TwoVisits
 from semstab.statistics.visit_agreement import two_visits
@@ -70,24 +70,26 @@ K = 6
 
 
 @dataclass(frozen=True, eq=False)
-class Made:
+class MadeVisits:
     """Two flights with their labels, and the solids of each that the other one lacks."""
 
-    flights: tuple[Flight, Flight]
+    flights: tuple[ExactFlight, ExactFlight]
     labellers: tuple[Labeller, Labeller]
     alone: tuple[list[Solid], list[Solid]]
     common_faces: int
 
     @classmethod
-    def of(cls, visits: Visits, seed: int, size: tuple[int, int]) -> Made:
+    def from_visits(cls, visits: Visits, seed: int, size: tuple[int, int]) -> MadeVisits:
         """Make them."""
         streams = [np.random.default_rng(s) for s in np.random.SeedSequence([seed, 82]).spawn(7)]
         of_scene, boxes, *paths = streams[:4]
         both = yard(K, of_scene).solids
         alone = tuple([_box(boxes) for _ in range(visits.boxes)] for _ in range(2))
-        scenes = [Scene([*both, *solids]) for solids in alone]
+        scenes = [ExactScene([*both, *solids]) for solids in alone]
         course, sensor = PATHS[visits.path][1], Pinhole(size[1], size[0])
-        flights = [Flight(scene, sensor, course(visits.frames, rng)) for scene, rng in zip(scenes, paths, strict=True)]
+        flights = [
+            ExactFlight(scene, sensor, course(visits.frames, rng)) for scene, rng in zip(scenes, paths, strict=True)
+        ]
         errors = ERRORS[visits.error]
         at_place = [np.random.default_rng([seed, 7]) for _ in range(2)]  # errors of a place are the same
         drawn = at_place if visits.error == "place" else streams[4:6]
@@ -115,7 +117,7 @@ def _changing(labeller: Labeller, share: float, rng: np.random.Generator) -> Lab
     return label
 
 
-def said(made: Made, visits: Visits) -> tuple[VisitedSpots, TwoVisits]:
+def said(made: MadeVisits, visits: Visits) -> tuple[VisitedSpots, TwoVisits]:
     """Return what the tool says."""
     sampler, like = VisitSampler(K), Condition(visits.path, visits.error, visits.frames, K)
     series = [frames(*pair, like, np.random.default_rng(0)) for pair in zip(made.flights, made.labellers, strict=True)]
@@ -125,7 +127,7 @@ def said(made: Made, visits: Visits) -> tuple[VisitedSpots, TwoVisits]:
     return visited, two_visits(visited)
 
 
-def exact_across(made: Made, points: int, rng: np.random.Generator) -> Array:
+def exact_across(made: MadeVisits, points: int, rng: np.random.Generator) -> Array:
     """Return alpha within the first flight, within the second one, and across, of points that did not change."""
     point, face = made.flights[0].scene.draw(points, rng)
     common = face < made.common_faces
@@ -147,7 +149,7 @@ def exact_across(made: Made, points: int, rng: np.random.Generator) -> Array:
     return 1 - (1 - np.append(within, across)) / (1 - chance)
 
 
-def changes(made: Made, visited: VisitedSpots) -> Array:
+def changes(made: MadeVisits, visited: VisitedSpots) -> Array:
     """Return counts of spots: on boxes of one flight that the other one tells, those found; all found, wrong ones."""
     point, counts = visited.spots.point, np.zeros(4)
     found = np.isin(visited.change, (GONE, NEW))
@@ -168,7 +170,7 @@ def row(visits: Visits, seeds: int, points: int, size: tuple[int, int]) -> list[
     """Return the cells of a row."""
     off, true, held, counts = [], [], 0, np.zeros(4)
     for seed in range(seeds):
-        made = Made.of(visits, seed, size)
+        made = MadeVisits.from_visits(visits, seed, size)
         visited, told = said(made, visits)
         exact = exact_across(made, points, np.random.default_rng(seed))
         cost = exact[:2].mean() - exact[2]

@@ -374,7 +374,7 @@ def test_a_look_up_agrees_with_the_warp():
     """The check's vectorised reprojection against the compiled one that flicker uses."""
     room = Room()
     frames = [room.frame(i, "gt") for i in (0, 4)]
-    views = dict(enumerate(View.of(frame, 10_000) for frame in frames))
+    views = dict(enumerate(View.from_frame(frame, 10_000) for frame in frames))
     sample = Sample(views, [(0, 1)], Convention())
     matched = sample.matched((0, 1), Convention(), np.array([1.0]))
     assert len(views[0].u) == HEIGHT * WIDTH
@@ -388,11 +388,11 @@ def test_a_look_up_agrees_with_the_warp():
 def test_a_large_image_is_thinned_with_its_camera():
     depth = np.arange(1, 3001 * 1001 + 1, dtype=np.float32).reshape(1001, 3001)
     labels = np.zeros(depth.shape, np.uint8)
-    view = View.of(Frame(0, depth, CAMERA, np.eye(4), labels=labels), 100)
+    view = View.from_frame(Frame(0, depth, CAMERA, np.eye(4), labels=labels), 100)
     assert view.stride == 2
     assert view.depth.size <= MAX_PIXELS
     assert len(view.u) == 100
-    whole = View.of(Frame(0, depth, CAMERA, np.eye(4), labels=labels), 100)
+    whole = View.from_frame(Frame(0, depth, CAMERA, np.eye(4), labels=labels), 100)
     np.testing.assert_array_equal(view.u, whole.u)
     camera = view.sampled_camera(Convention())
     assert (camera.fx, camera.cx) == (CAMERA.fx / 2, CAMERA.cx / 2)

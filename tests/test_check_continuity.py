@@ -62,11 +62,11 @@ def test_a_step_of_four_times_the_steps_around_it_is_striking(step, positions) -
     """Steps of 0.1 m, but for the one from frame 10 on."""
     along = np.cumsum([0.0, *(step if k == 10 else 0.1 for k in range(19))])
     frames = [replace(f, T_wc=doctor.moved(np.eye(4), (x, 0, 0))) for f, x in zip(doctor.scene(0), along, strict=False)]
-    assert Neighbours(doctor.Made(frames), range(20), None, Convention()).striking() == positions
+    assert Neighbours(doctor.FramesInMemory(frames), range(20), None, Convention()).striking() == positions
 
 
 def test_poses_that_jump_are_refused_with_the_parts_to_fuse() -> None:
-    made = doctor.Made(doctor.jump(doctor.scene(0)))
+    made = doctor.FramesInMemory(doctor.jump(doctor.scene(0)))
     verdict = quick_check(made, range(len(made)))
     assert verdict.state == "unsound"
     assert "--frames :15 and --frames 15:" in verdict.text
@@ -77,7 +77,7 @@ def test_frames_that_do_not_fit_are_named_up_to_a_tenth_of_all(wrong) -> None:
     """Of thirty frames three may have a wrong pose, or labels of other classes; four are too many."""
     frames, few = doctor.scene(0), len(wrong) == 3
     off = [replace(f, T_wc=doctor.moved(f.T_wc, (0.3, 0.0, 0.3))) if f.index in wrong else f for f in frames]
-    verdict = quick_check(doctor.Made(off), range(len(frames)))
+    verdict = quick_check(doctor.FramesInMemory(off), range(len(frames)))
     assert verdict.state == ("sound" if few else "unsound")
     assert ("4 of 30 frames do not fit" in verdict.text) is not few
     assert sum("does not fit frames" in line for line in verdict.remarks) == 3 * few

@@ -20,7 +20,7 @@ DATA = Path(os.environ.get("SEMSTAB_DATA", Path(__file__).parents[1] / "../share
 
 
 def verdict(seed, mistake=lambda frames: frames):
-    made = doctor.Made(mistake(doctor.scene(seed)))
+    made = doctor.FramesInMemory(mistake(doctor.scene(seed)))
     return quick_check(made, range(len(made)))
 
 

@@ -41,7 +41,7 @@ def words(result) -> str:
 
 @pytest.mark.parametrize("mistake", LABELS, ids=lambda mistake: mistake.name)
 def test_what_is_wrong_with_labels_is_named(mistake, frames):
-    found = check_labels(doctor.Made(mistake.plant(frames)), range(len(frames)), "net", doctor.SPACE, 6)
+    found = check_labels(doctor.FramesInMemory(mistake.plant(frames)), range(len(frames)), "net", doctor.SPACE, 6)
     wrong = mistake.said.startswith("are ") or "same map" in mistake.said
     assert any(mistake.said in line for line in (found.wrong if wrong else found.remarks))
     assert bool(found.wrong) == wrong
@@ -135,7 +135,7 @@ def test_bands_at_borders_of_two_pairs_of_classes_are_half_of_fifty_pixels_or_mo
 
 
 def test_every_hypothesis_has_maps_of_the_shape_of_the_given_ones(frames):
-    views = [View.of(frame, 500) for frame in frames[:5]]
+    views = [View.from_frame(frame, 500) for frame in frames[:5]]
     run = LabelRun([LabelledFrame(view, (), view.labels) for view in views])
     assert all(hypothesis.applies(run) for hypothesis in MAPS)
     others = [(hypothesis, hypothesis.change(run).maps) for hypothesis in MAPS]

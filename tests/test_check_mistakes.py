@@ -25,7 +25,7 @@ PLANTED = {mistake.name: mistake for mistake in doctor.MISTAKES}
 
 
 def verdict(frames):
-    return quick_check(doctor.Made(frames), range(len(frames)))
+    return quick_check(doctor.FramesInMemory(frames), range(len(frames)))
 
 
 @pytest.mark.parametrize("name", NAMES)
@@ -59,7 +59,7 @@ def test_a_thinned_image_is_mirrored_to_the_pixel(axes) -> None:
     frame = dataclasses.replace(doctor.scene(0)[0], depth=np.arange(480 * 641, dtype=np.float32).reshape(480, 641) + 1,
                                 labels=np.zeros((480, 641), np.uint8))  # fmt: skip
     (mistake,) = (m for m in CAMERAS if m.name.endswith({(0,): "down", (1,): "right", (0, 1): "degrees"}[axes]))
-    view = View.of(frame, 500)
+    view = View.from_frame(frame, 500)
     mended = mistake.change(Sample({0: view}, [], Convention())).views[0]
     K, k = mended.camera.every(view.stride), frame.intrinsics
     for v, u in zip(mended.v[:50], mended.u[:50], strict=True):
@@ -73,7 +73,7 @@ def test_a_thinned_image_is_mirrored_to_the_pixel(axes) -> None:
 def test_nothing_is_said_of_files_that_are_right(seed) -> None:
     frames = doctor.scene(seed)
     found = verdict(frames)
-    views = {k: View.of(frame, 500) for k, frame in enumerate(frames[:6])}
+    views = {k: View.from_frame(frame, 500) for k, frame in enumerate(frames[:6])}
     sample = Sample(views, [(0, 3), (1, 4), (2, 5), (5, 0)], found.fits[0][1].convention)
     assert (found.state, found.remarks) == ("sound", ())
     assert with_mistakes(found, sample) is found

@@ -28,7 +28,7 @@ def sample_of(scene):
 
 
 def sample(seed, plant=lambda frames: frames):
-    return sample_of(doctor.Made(plant(doctor.scene(seed))))
+    return sample_of(doctor.FramesInMemory(plant(doctor.scene(seed))))
 
 
 def planted(of, **values):

@@ -133,7 +133,7 @@ def test_labels_of_7_scenes_are_given_the_camera_of_its_colour_to_paste(tmp_path
     if stated:  # wrongly: they are those of depth
         options |= {"color_intrinsics": four(frames[0]), "color_size": frames[0].shape[::-1]}
     scene = open_dataset("seven_scenes", options).scene(tmp_path.name)
-    views = [View.of(scene.frame(k, "net"), 500) for k in range(len(scene))]
+    views = [View.from_frame(scene.frame(k, "net"), 500) for k in range(len(scene))]
     (line,) = registration.notes(scene, views, "net")
     assert line.endswith(f"set dataset.options.color_intrinsics: {said}, or register them to the depth")
 

@@ -119,7 +119,7 @@ def test_a_plane_has_no_residual():
     v, u = np.indices((20, 30))
     depth = (1 / (0.2 + 0.001 * u + 0.002 * v)).astype(np.float32)
     frame = Frame(0, depth, CAMERA, np.eye(4), labels=np.zeros((20, 30), np.uint8))
-    residuals = plane_residuals(View.of(frame, 1000))
+    residuals = plane_residuals(View.from_frame(frame, 1000))
     assert len(residuals) == 20 * 28
     assert residuals.max() < 1e-5
 

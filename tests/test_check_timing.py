@@ -27,7 +27,7 @@ def words(result) -> str:
 
 @pytest.mark.parametrize(("by", "side", "mend"), [(1, "early", -1), (-1, "late", 1)])
 def test_whole_frames_are_named_with_what_mends_them(by, side, mend, frames):
-    verdict = quick_check(doctor.Made(doctor.poses_of(by)(frames)), range(len(frames)))
+    verdict = quick_check(doctor.FramesInMemory(doctor.poses_of(by)(frames)), range(len(frames)))
     assert verdict.state == "unsound"
     assert f"poses are one frame {side}" in verdict.text
     assert f"pose_shift: {mend}" in verdict.text
@@ -92,7 +92,7 @@ def test_a_part_of_a_frame_is_measured_to_a_tenth(late, frames, tmp_path):
 
 def test_clean_poses_are_silent(frames):
     """Those of two more scenes are so in test_check_mistakes.py."""
-    verdict = quick_check(doctor.Made(frames), range(len(frames)))
+    verdict = quick_check(doctor.FramesInMemory(frames), range(len(frames)))
     assert (verdict.state, verdict.remarks) == ("sound", ())
 
 

@@ -14,7 +14,7 @@ from semstab.statistics import describe
 
 RNG = np.random.default_rng(0)
 DENSE = RNG.random((50, 6)) * (RNG.random((50, 6)) < 0.4)
-SPARSE = Evidence.of(DENSE)
+SPARSE = Evidence.from_rows(DENSE)
 
 
 @pytest.mark.parametrize(

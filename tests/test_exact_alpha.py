@@ -8,8 +8,8 @@ import exact_coverage
 import numpy as np
 import pytest
 from exact_errors import ERRORS, border, in_squares, none, unlabelled
-from exact_scenes import Scene, Solid, rectangle
-from exact_views import Flight, Pinhole, flight, strips
+from exact_scenes import ExactScene, Solid, rectangle
+from exact_views import ExactFlight, Pinhole, flight, strips
 
 
 def by_hand(units):
@@ -51,8 +51,8 @@ def test_its_error_is_how_much_it_varies_with_the_points_drawn():
 def plane(K, frames, seed=0):
     """A flight over a plane with stripes of all classes, each 0.5 m wide."""
     stripes = {4: lambda points: np.floor(2 * points[:, 0]).astype(int) % K}
-    scene = Scene([Solid.prism(rectangle((-40, -40), (40, 40)), 0.0, 0, 0, bottom=-1.0, textures=stripes)])
-    return Flight(scene, Pinhole(80, 60), strips(frames, np.random.default_rng(seed)))
+    scene = ExactScene([Solid.prism(rectangle((-40, -40), (40, 40)), 0.0, 0, 0, bottom=-1.0, textures=stripes)])
+    return ExactFlight(scene, Pinhole(80, 60), strips(frames, np.random.default_rng(seed)))
 
 
 @pytest.mark.parametrize(("K", "wrong"), [(2, 0.1), (2, 0.3), (5, 0.2)])
@@ -96,7 +96,9 @@ def above_a_box():
     ground = Solid.prism(rectangle((-20, -20), (20, 20)), 0.0, 0, 0, bottom=-1.0)
     pose = np.eye(4)
     pose[:3, :3], pose[2, 3] = np.diag([1.0, -1.0, -1.0]), 10.0
-    return Flight(Scene([ground, Solid.prism(rectangle((-1, -1), (1, 1)), 4.0, 1, 2)]), Pinhole(81, 61), pose[None])
+    return ExactFlight(
+        ExactScene([ground, Solid.prism(rectangle((-1, -1), (1, 1)), 4.0, 1, 2)]), Pinhole(81, 61), pose[None]
+    )
 
 
 def test_a_box_hides_what_is_in_its_shadow():

@@ -101,11 +101,11 @@ def test_a_run_leaves_out_a_class_and_says_how_many_pixels(root, tmp_path) -> No
 def test_locations_of_a_class_are_left_out_and_errors_elsewhere_stay(root, tmp_path, tile_size) -> None:
     """Frames that miss the door elsewhere, or see one where there is none, count as before."""
 
-    def of(name, **settings):
+    def map_of(name, **settings):
         config = configure(root, statistics=True, tile_size=tile_size, **settings)
         return semstab.run(config, out=tmp_path / name, report=False).runs[0]
 
-    whole, some = of("whole"), of("some", exclude={"classes": ["door"]})
+    whole, some = map_of("whole"), map_of("some", exclude={"classes": ["door"]})
     tables = [semstab.load(tmp_path / name).table() for name in ("whole", "some")]
     keep = dominant(tables[0]) != tables[0].classes.index("door")
     assert 0 < keep.sum() < len(keep)

@@ -27,7 +27,7 @@ def test_features_are_compared_with_labels_network_by_network(monkeypatch):
         for n, of_network in enumerate(alphas)
         for s, alpha in enumerate(of_network)
     ]
-    grid = analysis.Grid(rows)
+    grid = analysis.StreetGrid(rows)
     assert "| features | +.20 (+.20 to +.20) | 100 % |" in feature_study.differences_table(grid)
     assert "| groups | +.00 (+.00 to +.00) | 0 % |" in feature_study.differences_table(grid)
     assert feature_study.correlations_table(grid)[-1].startswith("| features | labels | +1.00 (")

@@ -70,7 +70,7 @@ def seen_by(vectors, index=None):
     labels = np.zeros(n * F, np.uint16)
     spots = spots_at(index * 0.125, spot, view, labels, F, 1)
     unit = vectors / np.linalg.norm(vectors, axis=2, keepdims=True)
-    return FeatureObservations.of(spots.spot, spots.view, unit.reshape(n * F, -1).astype(np.float16), spots)
+    return FeatureObservations.from_answers(spots.spot, spots.view, unit.reshape(n * F, -1).astype(np.float16), spots)
 
 
 def alpha_by_hand(vectors):
@@ -610,11 +610,11 @@ def test_colours_tell_features_apart():
     rng = np.random.default_rng(0)
     cells = np.eye(6)[rng.integers(0, 3, (20, 20))] + 0.01 * rng.normal(size=(20, 20, 6))
     features = Features.over(cells, (40, 40))
-    colours = FeatureColours.of(features)(features).astype(int)
+    colours = FeatureColours.from_features(features)(features).astype(int)
     assert colours.shape == (20, 20, 3)
     kind = cells.argmax(axis=2)
     means = np.array([colours[kind == k].mean(axis=0) for k in range(3)])
     apart = np.linalg.norm(means[:, None] - means[None], axis=2)[~np.eye(3, dtype=bool)]
     assert apart.min() > 80
     two = Features.over(cells[..., :2] + 0.1, (40, 40))
-    assert FeatureColours.of(two)(two).shape == (20, 20, 3)
+    assert FeatureColours.from_features(two)(two).shape == (20, 20, 3)

@@ -41,7 +41,7 @@ def spots(places):
     """Observations of places, each with its labels in order of the views that see it: {view: label}."""
     spot = np.array([k for k, place in enumerate(places) for _ in place])
     view, label = (np.array([row[i] for place in places for row in place.items()]) for i in (0, 1))
-    views = Views.of([[10 * t, t, 0.0, 0.0, np.nan, 1.0] for t in range(int(view.max()) + 1)])
+    views = Views.from_rows([[10 * t, t, 0.0, 0.0, np.nan, 1.0] for t in range(int(view.max()) + 1)])
     point = np.array([[8.0 * k, 0, 0] for k in range(len(places))])
     return dataclasses.replace(spots_at(point, spot, view, label, len(views)), views=views)
 

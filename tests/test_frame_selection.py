@@ -204,5 +204,5 @@ def run_of(root, settings, **options):
 def test_frames_of_a_range_are_a_range_and_others_stay_as_they_are(chosen):
     listed = sorted(chosen)
     short = as_range(listed)
-    assert [*short] == listed == FrameSelection.of(short).indices(41)
+    assert [*short] == listed == FrameSelection.from_indices(short).indices(41)
     assert isinstance(as_range(listed[:1] + [k + listed[0] for k in (3, 6)]), range)

@@ -279,7 +279,7 @@ def test_a_rule_that_fails_leaves_the_map_as_it_is(folder, name, line) -> None:
     with pytest.raises(DataError, match=line):
         backend.integrate(sight_line(0, [(0.5, 0)]))
     assert len(backend.table()) == 0
-    assert Rule.of("mean")(np.zeros((0, K)), None).shape == (0, K)
+    assert Rule.from_name("mean")(np.zeros((0, K)), None).shape == (0, K)
 
 
 # --- Runs -------------------------------------------------------------------------------------------------------------

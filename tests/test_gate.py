@@ -15,7 +15,7 @@ import gate as simulation
 import numpy as np
 import pytest
 import tiny_scene
-from flights import Flight, World, sample_of
+from flights import SimulatedFlight, World, sample_of
 from posed_config import configure
 from posed_scene import fails
 from simulated_events import grid, log_of
@@ -118,7 +118,7 @@ def sums(labels, truth, side=16):
 def spots_of(labels, side=16, K=2):
     """A spot for each voxel of the floor."""
     over = World(grid(side), *[np.zeros(side * side)] * 4)
-    return sample_of(labels, over, Flight(side, frames=labels.shape[1], K=K))
+    return sample_of(labels, over, SimulatedFlight(side, frames=labels.shape[1], K=K))
 
 
 def test_a_planted_fault_fails_itself_passes_and_three_frames_are_undecided():
@@ -231,7 +231,7 @@ def test_a_class_that_is_nowhere_has_no_value_and_ends_are_one_sided():
 
 def test_simulated_pairs_seldom_fail_without_a_difference_or_pass_with_a_loss():
     """A small part of `simulations/simulate.py gate`; docs/gate.md has the whole table."""
-    margin, fails_, _, passes, _, _ = simulation.rates(Flight(32, 1.5, 1.0, 15, 15, "uneven"), 25, 0)
+    margin, fails_, _, passes, _, _ = simulation.rates(SimulatedFlight(32, 1.5, 1.0, 15, 15, "uneven"), 25, 0)
     assert 0.03 < margin < 0.12
     assert fails_ <= 0.12
     assert passes <= 0.16

@@ -56,7 +56,7 @@ def test_coincidences_are_those_of_all_pairs_of_views():
 
 def test_alpha_of_groups_is_that_of_the_labels_of_groups():
     spots = sampled(flight(np.random.default_rng(1)))
-    whole = Coincidences.of(halves_of(spots, sums_of_spots(spots)).sum(axis=0))
+    whole = Coincidences.from_counts(halves_of(spots, sums_of_spots(spots)).sum(axis=0))
     assert whole.alpha() == pytest.approx(value(sums_of_spots(spots), "alpha"), abs=1e-3)
     for group in ([0, 1, 1, 2, 2], [0, 0, 1, 1, 0], [0, 1, 2, 2, 3]):
         of = np.array(group)
@@ -66,7 +66,7 @@ def test_alpha_of_groups_is_that_of_the_labels_of_groups():
 
 def test_each_merge_is_the_best_one():
     spots = sampled(flight(np.random.default_rng(2), wrong=0.2))
-    whole = Coincidences.of(halves_of(spots, sums_of_spots(spots)).sum(axis=0))
+    whole = Coincidences.from_counts(halves_of(spots, sums_of_spots(spots)).sum(axis=0))
     steps = merges_of(whole)
     assert len(steps) == 3  # two groups are left
     for n, _ in enumerate(steps):
@@ -120,7 +120,7 @@ def test_the_choice_of_merges_does_not_flatter():
             sampled(flight(np.random.default_rng(seed), side=40, frames=frames, confused=0.35, wrong=0.15))
             for frames in (4, 30)
         )
-        whole = Coincidences.of(halves_of(spots, sums_of_spots(spots)).sum(axis=0))
+        whole = Coincidences.from_counts(halves_of(spots, sums_of_spots(spots)).sum(axis=0))
         for n, merge in enumerate(groupings(spots, sums_of_spots(spots)).merges):
             group = groups_after(5, merges_of(whole)[: n + 1])
             stated.append(merge.alpha)

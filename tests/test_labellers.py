@@ -26,28 +26,28 @@ def labelled(folder, models, **settings):
     return semstab.load_result(folder)
 
 
-def of(result, name):
+def statistics_of(result, name):
     (record,) = result.select(model=name)
     return record.statistics
 
 
 @pytest.mark.parametrize("name", NAMES)
 def test_no_labeller_is_stable_without_a_warning_that_names_it(result, name):
-    assert of(result, name).verdict.level != "stable" or any(name in text for text in warnings(result))
+    assert statistics_of(result, name).verdict.level != "stable" or any(name in text for text in warnings(result))
 
 
 def test_what_is_left_out_counts_and_caps_the_verdict(result):
     """Of the spots hardly one has a label of the model that leaves out all borders: it has no verdict at all."""
-    assert of(result, "sim-steady").spots.labelled > 0.95
+    assert statistics_of(result, "sim-steady").spots.labelled > 0.95
     for name in ("trick-border-ignoring", "trick-hard-ignoring"):
-        found = of(result, name)
+        found = statistics_of(result, name)
         assert found.spots.labelled < 0.9
         assert found.verdict.level != "stable"
         assert found.verdict.level == "no verdict" or any(
             "have no label in most frames" in text and name in text for text in warnings(result)
         )
-    assert of(result, "trick-hard-ignoring").verdict.level == "usable"
-    assert "of the locations have no label" in of(result, "trick-hard-ignoring").verdict.line
+    assert statistics_of(result, "trick-hard-ignoring").verdict.level == "usable"
+    assert "of the locations have no label" in statistics_of(result, "trick-hard-ignoring").verdict.line
 
 
 def test_coarse_labels_meet_few_edges(result):
@@ -62,7 +62,7 @@ def test_the_limits_of_a_verdict_are_settings(result, tmp_path):
         "stable": 0.8, "usable": pytest.approx(2 / 3), "labelled": 0.9, "class_locations": 100.0,
     }  # fmt: skip
     verdict = {"stable": 0.99, "class_locations": 1e9}
-    found = of(labelled(tmp_path / "run", ["sim-steady"], verdict=verdict, truth=False), "sim-steady")
+    found = statistics_of(labelled(tmp_path / "run", ["sim-steady"], verdict=verdict, truth=False), "sim-steady")
     assert found.verdict.level == "usable"
-    assert np.isfinite(of(result, "sim-steady").spots.critical_classes[0].unstable)
+    assert np.isfinite(statistics_of(result, "sim-steady").spots.critical_classes[0].unstable)
     assert not found.spots.critical_classes

@@ -147,7 +147,7 @@ def test_figures_show_it(study) -> None:
         draw_ecdf(found, informative(found.values())),
         draw_persistence(found),
         draw_sweep(describe("voxel_size"), swept),
-        draw_stability(FromAbove.of(table, (0, -1, 0))),
+        draw_stability(FromAbove.from_table(table, (0, -1, 0))),
     )
     for figure in panels:
         assert any("rival" in title.lower() for title in titles(figure)), titles(figure)

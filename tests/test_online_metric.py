@@ -53,7 +53,7 @@ def test_it_says_what_the_command_says(flights):
         "voxel_size": SIZE, "taxonomy": None, "check": None, "check_geometry": False,
     })  # fmt: skip
     rows = [
-        Summary.of(r.frames, r.map_summary, r.statistics, r.image_space.compensated_flicker_percent)
+        Summary.from_statistics(r.frames, r.map_summary, r.statistics, r.image_space.compensated_flicker_percent)
         for r in run.records
     ]
     values = metric.compute()

@@ -60,7 +60,7 @@ def row(y, n=4):
 def spots_in(places, r=0.5):
     """Spots at points, each with the answers (view, label)."""
     spot, view, label = zip(*((k, v, c) for k, (_, answers) in enumerate(places) for v, c in answers), strict=True)
-    views = Views.of([[10 * v, 0, 0, 0, v, 0.01] for v in range(4)])
+    views = Views.from_rows([[10 * v, 0, 0, 0, v, 0.01] for v in range(4)])
     zeros = np.zeros(len(spot), np.float32)
     label = np.array(label, np.uint16)
     return SpotObservations(
@@ -178,11 +178,11 @@ def test_ticks_are_round_and_few() -> None:
 
 def plate(up=(0, 0, 1)):
     index = [(x, y + 4, 0) for x in range(40) for y in range(20)]
-    return FromAbove.of(a_map([(index, [3, 0, 0])]), up)
+    return FromAbove.from_table(a_map([(index, [3, 0, 0])]), up)
 
 
 def test_a_picture_lies_in_the_coordinates_of_the_scene() -> None:
-    located = Located.of(plate())
+    located = Located.from_view(plate())
     lower, left = located.edges
     assert (lower.name, left.name, located.north) == ("x", "y", None)
     expected = {0: 0, 5: 0.25, 10: 0.5, 15: 0.75, 20: 1}
@@ -193,7 +193,7 @@ def test_a_picture_lies_in_the_coordinates_of_the_scene() -> None:
 
 
 def test_a_picture_lies_in_the_projection_and_north_is_up() -> None:
-    located = Located.of(plate(), Georeference(WKT, OFFSET))
+    located = Located.from_view(plate(), Georeference(WKT, OFFSET))
     lower, left = located.edges
     assert (lower.name, left.name, located.north) == ("east", "north", 0)
     assert [value for _, value in lower.ticks] == [576715, 576720, 576725, 576730]
@@ -207,7 +207,7 @@ def test_north_of_a_scene_that_is_turned_against_the_projection(degrees) -> None
     c, s = math.cos(math.radians(degrees)), math.sin(math.radians(degrees))
     turned = ((c, -s, 0.0), (s, c, 0.0), (0.0, 0.0, 1.0))  # the scene's x axis lies `degrees` north of east
     georeference = Georeference(WKT, OFFSET, turned)
-    located = Located.of(plate(), georeference)
+    located = Located.from_view(plate(), georeference)
     assert located.north == pytest.approx(degrees)
     lower, _ = located.edges
     assert lower.name == {3.0: "east", 30.0: "", -90.0: "north"}[degrees]
@@ -217,8 +217,8 @@ def test_north_of_a_scene_that_is_turned_against_the_projection(degrees) -> None
 
 
 def test_a_map_from_the_side_has_heights_and_no_north() -> None:
-    wall = FromAbove.of(a_map([([(x, 0, z) for x in range(20) for z in range(10)], [3, 0, 0])]), (0, 0, 1))
-    located = Located.of(wall, Georeference(WKT, OFFSET))
+    wall = FromAbove.from_table(a_map([([(x, 0, z) for x in range(20) for z in range(10)], [3, 0, 0])]), (0, 0, 1))
+    located = Located.from_view(wall, Georeference(WKT, OFFSET))
     assert wall.view == "from the side"
     assert [edge.name for edge in located.edges] == ["east", "height"]
     assert located.north is None
@@ -227,7 +227,7 @@ def test_a_map_from_the_side_has_heights_and_no_north() -> None:
 @pytest.mark.parametrize("along", [0, 1])
 def test_a_wall_is_seen_upright_from_either_side(along) -> None:
     index = [(k, 0, z) if along == 0 else (0, k, z) for k in range(20) for z in range(10)]
-    located = Located.of(FromAbove.of(a_map([(index, [3, 0, 0])]), (0, 0, 1)))
+    located = Located.from_view(FromAbove.from_table(a_map([(index, [3, 0, 0])]), (0, 0, 1)))
     lower, left = located.edges
     assert (lower.name, left.name) == ("xy"[along], "z")
     assert [value for _, value in sorted(left.ticks)] == [0, 1, 2, 3, 4, 5]

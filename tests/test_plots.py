@@ -206,17 +206,19 @@ def pixels(axes):
 def test_a_map_has_the_colours_of_its_categories_and_nothing_is_white():
     columns = {"op": [1, 4, 4], "evidence": [SURE, [2, 2, 0], [4, 0, 0]], "drift_sum": [0, 0.6, 0]}
     table = at([(0, 0, 0), (1, 0, 0), (2, 0, 0)], **columns)
-    kind, drift, doubt, *_ = draw_stability(FromAbove.of(table, (0, 0, 1))).axes
+    kind, drift, doubt, *_ = draw_stability(FromAbove.from_table(table, (0, 0, 1))).axes
     assert pixels(kind)[0].tolist() == [list(CATEGORY_COLORS[k]) for k in categories(table)]
     assert pixels(drift)[0, 0, :3].tolist() == pixels(doubt)[0, 0, :3].tolist() == [204, 204, 204]
     assert pixels(drift)[0, 2, :3].tolist() != pixels(drift)[0, 1, :3].tolist() != [204, 204, 204]
     apart = at([(0, 0, 0), (2, 0, 0)], op=[3, 3])
-    for axes in draw_stability(FromAbove.of(apart, (0, 0, 1))).axes[: 1 + sum(measure.panel for measure in measures())]:
+    for axes in draw_stability(FromAbove.from_table(apart, (0, 0, 1))).axes[
+        : 1 + sum(measure.panel for measure in measures())
+    ]:
         assert pixels(axes)[0, 1, :3].tolist() == [255, 255, 255]
 
 
 def test_the_overview_is_in_one_palette():
-    above = FromAbove.of(at([(0, 0, 0), (1, 0, 0)], evidence=[[0, 1, 0], [0, 0, 1]]), (0, 0, 1))
+    above = FromAbove.from_table(at([(0, 0, 0), (1, 0, 0)], evidence=[[0, 1, 0], [0, 0, 1]]), (0, 0, 1))
     overview = Overview(7, np.array([[0, 1], [2, 255]]), np.zeros((2, 2, 3), np.uint8), PALETTE)
     image, prediction, fused_map = draw_overview(above, overview).axes
     assert [axes.get_title(loc="left")[:3] for axes in (image, prediction, fused_map)] == ["(a)", "(b)", "(c)"]
@@ -333,11 +335,11 @@ def test_colours_are_as_many_as_classes_and_each_is_unlike_the_others() -> None:
 def test_a_room_is_cut_open_beneath_its_ceiling_and_a_wall_is_seen_from_the_side() -> None:
     x, y = (index.ravel() for index in np.meshgrid(range(20), range(20)))
     floor, ceiling = np.stack([x, y, 0 * x], axis=1), np.stack([x, y, 0 * x + 15], axis=1)
-    room = FromAbove.of(at(np.concatenate([floor, ceiling]), r=0.1), (0, 0, 1))
+    room = FromAbove.from_table(at(np.concatenate([floor, ceiling]), r=0.1), (0, 0, 1))
     assert room.view.startswith("cut open at")
     assert (room.table.iz == 0).all()
-    assert FromAbove.of(at(floor, r=0.1), (0, 0, 1)).view == "from above"
-    assert FromAbove.of(at(np.stack([x, 0 * x, y], axis=1), r=0.1), (0, 0, 1)).view == "from the side"
+    assert FromAbove.from_table(at(floor, r=0.1), (0, 0, 1)).view == "from above"
+    assert FromAbove.from_table(at(np.stack([x, 0 * x, y], axis=1), r=0.1), (0, 0, 1)).view == "from the side"
 
 
 @given(st.integers(0, 2**31), st.booleans())

@@ -463,7 +463,7 @@ def record_of(table: VoxelTable) -> Record:
 
 def planned(indices: Sequence[int] = (0,)) -> Unit:
     task = Task(Scene(), "net/x", indices, CLASSES.mapping_to(CLASSES), ("numpy",))
-    return Unit.of(Variation(), Config(voxel_size=0.25), task, "key", image_space=True, stored=True)
+    return Unit.from_task(Variation(), Config(voxel_size=0.25), task, "key", image_space=True, stored=True)
 
 
 def record(path: Path | Target, frames: list[Frame], *, finish: bool = True) -> tuple[Recording, VoxelTable]:

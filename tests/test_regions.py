@@ -120,7 +120,7 @@ REGION_MAPS = hnp.arrays(np.int64, (4, 5), elements=st.integers(0, 4))
 def test_the_matching_is_the_best_one(previous, current):
     from semstab.metrics.flicker import _Contingency
 
-    table = _Contingency.of(previous.ravel(), current.ravel())
+    table = _Contingency.between(previous.ravel(), current.ravel())
     found = 0.0
     for p, q in table.pairs(0):
         inside = int(table.shared[p, q])

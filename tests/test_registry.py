@@ -6,15 +6,15 @@ import pytest
 
 from semstab import backends
 from semstab.core import registry
-from semstab.core.registry import Entry, Registry
+from semstab.core.registry import Registration, Registry
 from semstab.errors import ConfigError, MissingDependencyError
 
 SHAPES = Registry(
     "shape",
     {
-        "fraction": Entry("fractions:Fraction", "in the standard library"),
-        "engine": Entry("semstab_no_such_engine:Engine", "", "pip install the-engine"),
-        "bare": Entry("semstab_no_such_engine:Engine", ""),
+        "fraction": Registration("fractions:Fraction", "in the standard library"),
+        "engine": Registration("semstab_no_such_engine:Engine", "", "pip install the-engine"),
+        "bare": Registration("semstab_no_such_engine:Engine", ""),
     },
 )
 

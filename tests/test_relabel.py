@@ -108,7 +108,7 @@ def test_without_its_own_vote_a_frame_sees_the_map_of_the_others(soft):
 
 
 def labels(table, belief):
-    return FusedLabels(Tiles.of(table), belief, table.K)
+    return FusedLabels(Tiles.from_table(table), belief, table.K)
 
 
 def table_of(frames):

@@ -129,7 +129,7 @@ def test_the_map_of_the_page_has_the_numbers_of_the_voxels(walls):
     maps = json.loads(re.search(r'id="maps">(.*?)</script>', text, re.DOTALL)[1])
     assert [(m["scene"], m["model"]) for m in maps] == [(r.unit.scene, r.unit.model) for r in result.select()]
     for map_of_page, unit_record in zip(maps, result.select(), strict=True):
-        above = FromAbove.of(unit_record.table(), result.up[unit_record.unit.scene])
+        above = FromAbove.from_table(unit_record.table(), result.up[unit_record.unit.scene])
         first, second = (np.asarray(pixels(source)) for source in map_of_page["numbers"])
         occupied = above.rows != EMPTY
         assert first.shape[:2] == tuple(reversed(map_of_page["size"])) == above.rows.shape

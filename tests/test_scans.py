@@ -51,7 +51,7 @@ def test_neighbours_of_sparse_points_are_looked_for_as_far_as_points_are_apart(e
     depth = np.zeros((400, 400), np.float32)
     depth[::every, ::every] = 5
     frame = Frame(0, depth, Intrinsics(200, 200, 200, 200), np.eye(4), labels=np.zeros((400, 400), np.uint8))
-    assert SparseDepth.of(frame, 3).reach == reach
+    assert SparseDepth.from_frame(frame, 3).reach == reach
 
 
 REFUSED = {

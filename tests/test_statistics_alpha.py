@@ -489,9 +489,9 @@ def test_views_are_found_by_the_index_of_their_frame_whatever_their_order():
     views = Views(np.array([7, 2, 5]), np.arange(9.0).reshape(3, 3), np.array([0.5, math.nan, 1.0]), np.full(3, 0.1))
     assert views.rank(np.array([5, 7, 7, 2])).tolist() == [2, 0, 0, 1]
     assert views.rows()[1].tolist() == [2, 3, 4, 5, pytest.approx(math.nan, nan_ok=True), 0.1]
-    np.testing.assert_array_equal(Views.of(views.rows().tolist()).rows(), views.rows())
+    np.testing.assert_array_equal(Views.from_rows(views.rows().tolist()).rows(), views.rows())
     with pytest.raises(ValueError, match="without an index"):
-        Views.of([[math.nan, 0, 0, 0, 0, 1]])
+        Views.from_rows([[math.nan, 0, 0, 0, 0, 1]])
 
 
 def test_a_sampler_that_saw_no_frame_has_an_empty_sample():
@@ -706,7 +706,7 @@ def test_two_spots_beside_a_face_of_their_cells_are_two_units():
         **dict.fromkeys(("near", "far"), np.zeros(4, np.float32)),
         point=np.array([[0.507, 0.1, 0.1], [0.5085, 0.1, 0.1]]),
         drawn=np.arange(2, dtype=np.uint32),
-        views=Views.of([[index, index, 0, 0, 0, 0.01] for index in range(2)]),
+        views=Views.from_rows([[index, index, 0, 0, 0, 0.01] for index in range(2)]),
         spacing=1.0,
         K=2,
     )

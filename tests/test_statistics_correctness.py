@@ -42,7 +42,9 @@ def test_accuracy_and_miou_are_scikit_learns_and_brier_is_of_normalised_evidence
     events = log_of_evidence([[[0.2, 0.8], [0.6, 0.4], [0.7, 0.3]]])
     table = events.table()
     truth = join_truth(table, log_of_evidence([[[0.0, 1.0]]]).table())
-    (everything, *_) = by_stratum(Predictions.of(table.evidence, truth.label), table.op, truth.known, (1, 2, 5))
+    (everything, *_) = by_stratum(
+        Predictions.from_evidence(table.evidence, truth.label), table.op, truth.known, (1, 2, 5)
+    )
     assert everything.brier == pytest.approx(2 * normalise(table.evidence)[0, 0] ** 2)
 
 
@@ -80,7 +82,7 @@ def test_strata_hold_the_voxels_of_their_op():
     truth = join_truth(table, log_of([[0], [0], [2], [1]]).table())
     rows = {
         row.name: (row.voxels, row.accuracy)
-        for row in by_stratum(Predictions.of(table.evidence, truth.label), table.op, truth.known, (1, 2, 5))
+        for row in by_stratum(Predictions.from_evidence(table.evidence, truth.label), table.op, truth.known, (1, 2, 5))
     }
     assert rows["all"] == (4, 0.5)
     assert rows["OP=1"] == (1, 1.0)

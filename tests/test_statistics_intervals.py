@@ -7,7 +7,7 @@ import math
 
 import numpy as np
 import pytest
-from flights import Flight, fly, sums_of, world
+from flights import SimulatedFlight, fly, sums_of, world
 from intervals import trials
 from scipy import stats
 from simulated_events import grid, log_of, spots_of
@@ -45,7 +45,7 @@ def moved(sums, by):
 
 def simulated(seed=0, **settings):
     rng = np.random.default_rng(seed)
-    flight = Flight(**settings)
+    flight = SimulatedFlight(**settings)
     over = world(flight, rng)
     return sums_of(fly(flight, over, rng), over)
 
@@ -77,7 +77,7 @@ def test_no_error_seen_is_not_no_error_and_next_to_nothing_is_nowhere():
     assert alpha.low == pytest.approx(of_voxels.low)  # the second answers are the first ones: there is no fall
     # Of 150 classes so few voxels may be stable that the square of their number is none any more
     rng = np.random.default_rng(0)
-    places = Cubes.of(log_of(np.zeros((32 * 32, 3), dtype=int), K=2, index=grid(32), voxel_size=0.125).table())
+    places = Cubes.from_table(log_of(np.zeros((32 * 32, 3), dtype=int), K=2, index=grid(32), voxel_size=0.125).table())
     columns = np.stack([rng.random(32 * 32) < 0.3, np.ones(32 * 32)], axis=1)
     assert places.estimate(columns, ratio_of).decided
     assert places.estimate(1e-112 * columns, ratio_of).undecided == NO_LOCATIONS
@@ -193,14 +193,14 @@ def test_a_worse_map_differs_and_what_pairs_share_does_not_blur_it():
     same = difference(sums, sums, "psa")
     assert same.low == same.value == same.high == 0
     rng = np.random.default_rng(0)
-    flight = Flight(frames=64, observations=64, side=32)
+    flight = SimulatedFlight(frames=64, observations=64, side=32)
     over = world(flight, rng)
     worse = sums_of(fly(flight, over, rng, ease=0.4), over)
     found = difference(sums, worse, "alpha")
     assert found.low > 0
     assert found.p_value < 0.001
     # One scene and the same bad frames for both: what they share does not blur the difference
-    flight = Flight(frames=64, observations=64, side=32, quality="bad")
+    flight = SimulatedFlight(frames=64, observations=64, side=32, quality="bad")
     over = world(flight, np.random.default_rng(0))
     pair = [sums_of(fly(flight, over, np.random.default_rng(1), ease=ease), over) for ease in (1.0, 0.8)]
     paired, apart = difference(*pair, "alpha"), difference(*pair, "alpha", same_frames=False)
@@ -212,8 +212,8 @@ def test_a_worse_map_differs_and_what_pairs_share_does_not_blur_it():
 
 
 @pytest.mark.parametrize(("flight", "scope"), [
-    (Flight(side=64, reach=2.0), THESE_FRAMES), (Flight(24, 1.5, 1.0, 24, 24, "lasting"), THIS_SCENE),
-    (Flight(32, 2.0, 1.0, 40, 5, "lasting"), OTHER_SCENES),
+    (SimulatedFlight(side=64, reach=2.0), THESE_FRAMES), (SimulatedFlight(24, 1.5, 1.0, 24, 24, "lasting"), THIS_SCENE),
+    (SimulatedFlight(32, 2.0, 1.0, 40, 5, "lasting"), OTHER_SCENES),
 ])  # fmt: skip
 def test_intervals_hold_their_target(flight, scope):
     """So many of few intervals hold it that their level may be 95 %: 3 standard errors below."""

@@ -291,7 +291,7 @@ def view_of(depths: np.ndarray, *, around: bool = False) -> KeptPoints:
     with np.errstate(divide="ignore"):
         points = column, row, np.where(depths.ravel() > 0, 1 / depths.ravel(), 0.0)
     camera = (w * step / (2 * np.pi), 200.0, 0.0, 0.0) if around else (90.0, 90.0, 0.0, 0.0)
-    return KeptPoints.of(0, np.eye(4), camera, around, step, (int(h * step), int(w * step)), points)
+    return KeptPoints.from_points(0, np.eye(4), camera, around, step, (int(h * step), int(w * step)), points)
 
 
 def spot_at(column: float, row: float, depth: float) -> np.ndarray:
@@ -351,7 +351,7 @@ def test_the_points_of_256_views_take_64_megabytes() -> None:
     """A scan of 128 rings and 4000 columns."""
     rng = np.random.default_rng(0)
     u, v, w = rng.uniform(0, 8000, 512_000), rng.uniform(1500, 2100, 512_000), np.ones(512_000)
-    view = KeptPoints.of(0, np.eye(4), (1273.0, 1273.0, 0.0, 0.0), True, 2.0, (4001, 8000), (u, v, w))
+    view = KeptPoints.from_points(0, np.eye(4), (1273.0, 1273.0, 0.0, 0.0), True, 2.0, (4001, 8000), (u, v, w))
     assert view.near.nbytes <= 64e6 / MOST_KEPT * 1.02
     assert np.mean(view.near > 0) > 0.9
 

@@ -30,23 +30,23 @@ def made(accuracy, **columns):
 def grid():
     rng = np.random.default_rng(0)
     accuracy = rng.uniform(0.3, 0.9, (6, 5))
-    return analysis.Grid(made(accuracy, alpha=accuracy**2, sbd=1 - accuracy, flip=-accuracy))
+    return analysis.StreetGrid(made(accuracy, alpha=accuracy**2, sbd=1 - accuracy, flip=-accuracy))
 
 
 def test_a_measure_that_rises_with_accuracy_answers_every_question(grid):
-    accuracy = grid.of("accuracy")
+    accuracy = grid.column("accuracy")
     for statistic in analysis.QUESTIONS.values():
         assert statistic(2 * accuracy - 1, accuracy) == pytest.approx(1.0)
 
 
 def test_a_measure_that_falls_with_accuracy_orders_no_pair(grid):
-    accuracy = grid.of("accuracy")
-    assert analysis.within_a_street(grid.of("flip"), accuracy) == pytest.approx(-1.0)
-    assert analysis.pairs_on_a_street(grid.of("flip"), accuracy) == 0.0
+    accuracy = grid.column("accuracy")
+    assert analysis.within_a_street(grid.column("flip"), accuracy) == pytest.approx(-1.0)
+    assert analysis.pairs_on_a_street(grid.column("flip"), accuracy) == 0.0
 
 
 def test_measures_of_which_less_is_better_are_turned(grid):
-    assert analysis.within_a_street(grid.of("sbd"), grid.of("accuracy")) == pytest.approx(1.0)
+    assert analysis.within_a_street(grid.column("sbd"), grid.column("accuracy")) == pytest.approx(1.0)
 
 
 def test_pairs_of_nearly_the_same_accuracy_are_not_asked_for():
@@ -55,7 +55,7 @@ def test_pairs_of_nearly_the_same_accuracy_are_not_asked_for():
 
 
 def test_an_interval_of_noise_holds_zero_and_that_of_a_law_does_not(grid):
-    noise, accuracy = np.random.default_rng(3).normal(size=(6, 5)), grid.of("accuracy")
+    noise, accuracy = np.random.default_rng(3).normal(size=(6, 5)), grid.column("accuracy")
     _, low, high = analysis.with_interval(grid, noise, analysis.streets_of_a_network, accuracy)
     assert low < 0 < high
     value, low, high = analysis.with_interval(grid, accuracy**2, analysis.streets_of_a_network, accuracy)

@@ -411,7 +411,7 @@ def test_a_worker_without_the_folder_sends_the_voxels_back_and_jobs_fail_as_a_wh
     plan = make_plan(config)
     (cell,) = plan.units
     elsewhere = tmp_path / "elsewhere"
-    (done,) = run_job((Work.of(cell, Start("start", elsewhere)),))
+    (done,) = run_job((Work.from_unit(cell, Start("start", elsewhere)),))
     assert not elsewhere.exists()
     folder = Folder(tmp_path / "out", plan)
     folder.save(done)
@@ -423,7 +423,7 @@ def test_a_worker_without_the_folder_sends_the_voxels_back_and_jobs_fail_as_a_wh
     config = resolve(configure(root, sweeps={"voxel_size": [0.5]}, backends=["numpy"], models=["a"]))
     start = Start("start", tmp_path)
     units = [dataclasses.replace(unit, name=UnitName("hall", "a", "numpy")) for unit in make_plan(config).units]
-    errors = [work.error for work in run_job(tuple(Work.of(unit, start) for unit in units))]
+    errors = [work.error for work in run_job(tuple(Work.from_unit(unit, start) for unit in units))]
     assert errors == [errors[0]] * 2
     assert "scene 'hall' is not there" in errors[0]
 

@@ -103,7 +103,7 @@ class Deadly(Work):
 def test_a_job_that_kills_its_process_fails_and_the_others_finish(root, tmp_path) -> None:
     config = tiny_study.configure(root, sweeps={}, backends=["numpy"], models=["a"])
     start = Start("start", tmp_path)
-    (fine,) = [Work.of(cell, start) for cell in make_plan(config).units]
+    (fine,) = [Work.from_unit(cell, start) for cell in make_plan(config).units]
     deadly = Deadly(start, dataclasses.replace(fine.unit, identity="deadly"), range(1))
     jobs = iter([(deadly,), (fine,)])
     done = {
@@ -205,7 +205,7 @@ def test_a_dask_cluster_gives_the_same_numbers_though_a_worker_is_killed(
 
     monkeypatch.setattr("semstab.engine.executors.CONNECT_SECONDS", 1)  # after which it is given up
     executor = DaskCluster(address)
-    jobs = iter([(Work.of(make_plan(config).units[0], Start("start", tmp_path)),)] * 9)
+    jobs = iter([(Work.from_unit(make_plan(config).units[0], Start("start", tmp_path)),)] * 9)
     finished = executor.run(lambda: next(jobs, None), Observers([]))
     next(finished)
     scheduler.kill()

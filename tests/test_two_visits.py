@@ -66,7 +66,7 @@ def test_what_a_visit_sees_and_sees_through_moved_within_it() -> None:
 def test_agreement_across_is_that_of_points_of_the_surface(error: str, share: float) -> None:
     """Other paths, the same scene: without changes another visit costs nothing, else what the changed places do."""
     condition = simulated.Visits("orbit", error, share, frames=16)
-    made = simulated.Made.of(condition, 1, (90, 120))
+    made = simulated.MadeVisits.from_visits(condition, 1, (90, 120))
     _, told = simulated.said(made, condition)
     *alphas, across = simulated.exact_across(made, 5000, np.random.default_rng(0))
     cost = np.mean(alphas) - across
@@ -128,10 +128,10 @@ def test_points_turn_and_move_the_second_visit() -> None:
     first = rng.normal(0, 20, (8, 3))
     turn = Rotation.from_rotvec([0.1, -0.2, 1.0]).as_matrix()
     second = (first - [5, 6, 7]) @ turn
-    exactly = Alignment.of(first, second)
+    exactly = Alignment.between(first, second)
     assert exactly.residual < 1e-9
     np.testing.assert_allclose(second @ exactly.matrix[:3, :3].T + exactly.matrix[:3, 3], first, atol=1e-9)
-    noisy = Alignment.of(first + rng.normal(0, 0.1, first.shape), second)
+    noisy = Alignment.between(first + rng.normal(0, 0.1, first.shape), second)
     left = first - (second @ noisy.matrix[:3, :3].T + noisy.matrix[:3, 3])
     assert 0.05 < noisy.residual < 0.25
     assert np.abs(left).max() < 0.3

@@ -111,7 +111,7 @@ def test_the_table_has_each_scene_and_all_of_them_as_one_set_of_videos(run):
                 motion, visible = flow_by_depth(a, b)
                 together.add(a.predicted, warp_labels(b.predicted, motion), visible)
         assert total["tc_seen_etc"] == pytest.approx(together.value)
-        assert total["tc_seen_vspw"] == pytest.approx(together.of("vspw"))
+        assert total["tc_seen_vspw"] == pytest.approx(together.score("vspw"))
     assert total["tc_ssp"] == pytest.approx((first["tc_ssp"] + second["tc_ssp"]) / 2)
     assert total["vc8"] == pytest.approx((first["vc8"] + second["vc8"]) / 2)  # of as many clips
     assert "VC and TC as published: semstab-bench show out video_measures" in said

@@ -221,17 +221,17 @@ def test_names_change_as_the_text_beside_the_file_says(tmp_path, monkeypatch):
 def test_a_name_in_other_words_is_no_change(tmp_path):
     """Renaming with the same labels changes none; a label that is taken away becomes another one, or none."""
     from semstab.comparison.prompts import effect
-    from semstab.predict.prompts import Changes
+    from semstab.predict.prompts import VocabularyChanges
     from semstab.statistics import SpotObservations
 
     room(tmp_path / "room")
     bench("room", "--voxel-size", "0.2", "-o", "run", "--no-truth", "--vocabulary", vocabulary(tmp_path), cwd=tmp_path)
     full = SpotObservations.load(semstab.load_result(tmp_path / "run").record(model="net@five").observations_file)
     same = dataclasses.replace(full, classes=("space", *full.classes[1:]))
-    found = effect(full, same, Changes(rename=((full.classes[0], "space"),)))
+    found = effect(full, same, VocabularyChanges(rename=((full.classes[0], "space"),)))
     assert (found.changed, found.most, found.difference.value) == (0, "", 0)
     silent = dataclasses.replace(full, label=np.where(full.label == 1, full.K, full.label).astype(np.uint16))
-    found = effect(full, silent, Changes(without=(full.classes[1],)))
+    found = effect(full, silent, VocabularyChanges(without=(full.classes[1],)))
     assert found.changed == pytest.approx(np.mean(full.label == 1))
     assert found.most == f"{full.classes[1]} to no label"
 

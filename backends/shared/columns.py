@@ -49,7 +49,7 @@ def update_rows(rows: Int64, observed: Observed, frame: int, **columns: Any) -> 
         columns["first_frame"], columns["last_frame"], columns["self_sum"], columns["frame_entropy_sum"], *changed,
     )  # fmt: skip
     vss, entropy, drift, new, recurrent = sums.sum(axis=0)
-    return Change.of((observed.pixels.sum(), len(rows), new, drift, vss, entropy, recurrent)), changed
+    return Change.from_sums((observed.pixels.sum(), len(rows), new, drift, vss, entropy, recurrent)), changed
 
 
 @compiled(helper=True, forceinline=True)

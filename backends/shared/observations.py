@@ -153,7 +153,7 @@ class Change:
     recurrent: int
 
     @classmethod
-    def of(cls, sums: Iterable[float]) -> Change:
+    def from_sums(cls, sums: Iterable[float]) -> Change:
         """Make it of numbers in the order of the fields."""
         points, voxels, new, drift, vss, entropy, recurrent = sums
         return cls(int(points), int(voxels), int(new), float(drift), float(vss), float(entropy), int(recurrent))

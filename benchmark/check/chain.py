@@ -253,7 +253,7 @@ class MapContent:
     name: int
 
     @classmethod
-    def of(cls, view: View) -> MapContent:
+    def from_view(cls, view: View) -> MapContent:
         """Count the labels of a view that has some."""
         assert view.labels is not None
         counts = np.bincount(view.labels[view.labels != view.ignore_id].ravel())
@@ -270,7 +270,7 @@ def chained(views: Iterable[tuple[int, View | None]], configured: Convention) ->
     maps = dict[int, MapContent]()
     for position, view in views:
         if view is not None and view.labels is not None:
-            maps[position] = MapContent.of(view)
+            maps[position] = MapContent.from_view(view)
         if view is None or len(view.u) < LEAST_SEEN:
             continue
         for gap in (gap for gap in GAPS if gap <= len(last)):
@@ -296,8 +296,10 @@ def linked(first: View, second: View, configured: Convention) -> Link:
             np.concatenate([(matches.depth / matches.z)[0][finite_first], (back.z / back.depth)[0][finite_second]])
         )
     ratio = float(np.median(logs))
-    forth = Shared.of(first, matches).labels(first.labels, second.labels, first.ignore_id, second.ignore_id)
-    labels_back = Shared.of(second, back).labels(second.labels, first.labels, second.ignore_id, first.ignore_id)
+    forth = Shared.from_matches(first, matches).labels(first.labels, second.labels, first.ignore_id, second.ignore_id)
+    labels_back = Shared.from_matches(second, back).labels(
+        second.labels, first.labels, second.ignore_id, first.ignore_id
+    )
     labels = np.concatenate([forth, labels_back[::-1]], axis=1)
     return Link(
         error=float(median_of_seen(errors)),

@@ -134,10 +134,10 @@ class Neighbours:
         if position in self._known:
             return self._known[position]
         with contextlib.suppress(DataError):
-            return View.of(self._read(self.indices[position]), POINTS, labelled=self.source is not None)
+            return View.from_frame(self._read(self.indices[position]), POINTS, labelled=self.source is not None)
         if self.source is not None:
             with contextlib.suppress(DataError):
-                return View.of(reader(self.scene, None)(self.indices[position]), POINTS, labelled=False)
+                return View.from_frame(reader(self.scene, None)(self.indices[position]), POINTS, labelled=False)
         return None
 
     def located(self, pair: Pair) -> tuple[int, Chain] | None:

@@ -251,7 +251,7 @@ class Coverage:
     def _same_surface(self, pair: Pair) -> SharedPoints:
         a, b = self.sample.views[pair[0]], self.sample.views[pair[1]]
         match = self._matches[pair]
-        shared = Shared.of(a, match)
+        shared = Shared.from_matches(a, match)
         first, second = shared.labels(a.labels, b.labels, a.ignore_id, b.ignore_id)
         return SharedPoints(
             offset=np.abs(match.depth - match.z)[0][shared.chosen],

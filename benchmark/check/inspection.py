@@ -43,7 +43,7 @@ class Depth:
     p95: float
 
     @classmethod
-    def of(cls, valid: Sequence[float], depths: Sequence[Float32]) -> Depth:
+    def from_samples(cls, valid: Sequence[float], depths: Sequence[Float32]) -> Depth:
         """Return it from the share and the valid depths of each frame."""
         all_depths = np.concatenate(depths)
         p5, p50, p95 = np.percentile(all_depths, (5, 50, 95)).tolist() if len(all_depths) else (np.nan,) * 3
@@ -97,7 +97,7 @@ class Inspection:
             self._take_note(frame)
             if self._labelled:
                 self.tally.add(frame)
-            self.views[position] = View.of(frame, self._points, labelled=self._labelled)
+            self.views[position] = View.from_frame(frame, self._points, labelled=self._labelled)
 
     def _take_note(self, frame: Frame) -> None:
         """Remember the farthest pixel of all frames."""
@@ -164,4 +164,4 @@ class Inspection:
         """Return the depth of all frames that were read."""
         views = self.views.values()
         valid = [float(np.mean((view.depth > 0) & (view.depth < np.inf))) for view in views]
-        return Depth.of(valid, [view.depth[view.v, view.u] for view in views])
+        return Depth.from_samples(valid, [view.depth[view.v, view.u] for view in views])

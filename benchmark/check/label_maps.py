@@ -74,7 +74,7 @@ def read(scene: Scene, index: int, model: str) -> LabelledFrame:
     """Read a frame with its labels and its colour; raises DataError."""
     frame = scene.frame(index, model, color=False)
     stride = max(1, math.ceil(math.sqrt(math.prod(frame.shape) / PIXELS)))
-    view = View.of(frame.every(stride), POINTS)
+    view = View.from_frame(frame.every(stride), POINTS)
     edges = [depth_edges(view.depth)]
     try:
         color = scene.color(index)
@@ -134,7 +134,9 @@ Common = dict[Pair, Shared]
 def shared_of(views: Mapping[int, View], pairs: Sequence[Pair]) -> Common:
     """Return what pairs of frames see in common, where that is enough."""
     sample, factors = Sample(dict(views), pairs, Convention()), np.array([1.0])
-    shared_by_pair = {(a, b): Shared.of(views[a], sample.matched((a, b), Convention(), factors)) for a, b in pairs}
+    shared_by_pair = {
+        (a, b): Shared.from_matches(views[a], sample.matched((a, b), Convention(), factors)) for a, b in pairs
+    }
     return {pair: shared for pair, shared in shared_by_pair.items() if shared.chosen.sum() >= LEAST_POINTS}
 
 

@@ -56,7 +56,7 @@ class Turn:
     fit: float
 
     @classmethod
-    def of(cls, rows: Sequence[tuple[int, float, float]]) -> Turn:
+    def from_fits(cls, rows: Sequence[tuple[int, float, float]]) -> Turn:
         """Find the place at which the sum of the better fits is largest, of index, given and other fit of frames."""
         _, fit_given, fit_other = np.reshape(rows, (-1, 3)).T
         gain = np.nan_to_num(np.subtract(fit_other, fit_given))
@@ -65,8 +65,8 @@ class Turn:
         fits = np.concatenate([fit_given[:position], fit_other[position:]])
         return cls(
             position,
-            FitContrast.of(fit_other[:position], fit_given[:position]),
-            FitContrast.of(fit_given[position:], fit_other[position:]),
+            FitContrast.between(fit_other[:position], fit_given[:position]),
+            FitContrast.between(fit_given[position:], fit_other[position:]),
             float(np.nanmean(fits)) if np.isfinite(fits).any() else np.nan,
         )
 
@@ -85,7 +85,7 @@ def from_a_frame_on(scene: Scene, model: str, runs: Sequence[LabelRun], everywhe
         rows = [row for (_, other), run in zip(tried, runs, strict=True) for row in run.by_frame(other)]
         if len(rows) < 2 * LEAST_TOLD:
             continue
-        turn, hypothesis = Turn.of(rows), tried[0][0]
+        turn, hypothesis = Turn.from_fits(rows), tried[0][0]
         if turn.is_one and not everywhere >= turn.fit:
             index = _located(scene, model, hypothesis, rows[turn.at - 1][0], rows[turn.at][0])
             before, after = turn.before, turn.after
@@ -117,7 +117,7 @@ def _located(scene: Scene, model: str, hypothesis: Hypothesis[LabelRun], last: i
             return first
         first, last = (middle, last) if float(np.nansum(gains)) > 0 else (first, middle)
     near = rows(range(max(0, last - IN_A_RUN), min(len(scene), first + IN_A_RUN + 1)))
-    return near[min(Turn.of(near).at, len(near) - 1)][0] if near else first
+    return near[min(Turn.from_fits(near).at, len(near) - 1)][0] if near else first
 
 
 # --- another order ---------------------------------------------------------------------------------------------------
@@ -154,7 +154,7 @@ def in_another_order(scene: Scene, indices: Sequence[int], model: str, pixels: i
     near = [(a, b) for a in range(n) for b in range(a + 1, min(n, a + 4))]
     common = shared_of({k: frame.view for k, frame in enumerate(frames)}, near)
     maps = ({k: frames[source].labels for k, source in enumerate(sequence)} for sequence in (range(n), order))
-    agreement = FitContrast.of(*(agreements(common, labels, frames[0].view.ignore_id) for labels in maps))
+    agreement = FitContrast.between(*(agreements(common, labels, frames[0].view.ignore_id) for labels in maps))
     if not (agreement.is_clear and 1 - agreement.other <= FEWER * (1 - agreement.given)):
         return None
     text = (

@@ -132,7 +132,7 @@ def _compared(
 
 
 def _contrast(rows: Sequence[tuple[float, float]]) -> FitContrast:
-    return FitContrast.of(*np.reshape(rows, (-1, 2)).T)
+    return FitContrast.between(*np.reshape(rows, (-1, 2)).T)
 
 
 # --- findings --------------------------------------------------------------------------------------------------------

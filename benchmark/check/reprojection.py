@@ -65,7 +65,7 @@ class View:
     v: Int64
 
     @classmethod
-    def of(cls, frame: Frame, points: int, labelled: bool = True) -> View:
+    def from_frame(cls, frame: Frame, points: int, labelled: bool = True) -> View:
         """Thin a frame. The sample is drawn at random by the frame's index: the same one each time."""
         H, W = frame.shape
         stride = max(1, math.ceil(math.sqrt(H * W / MAX_PIXELS)))
@@ -295,7 +295,7 @@ class Shared:
     chosen: Mask
 
     @classmethod
-    def of(cls, view: View, matches: Matches) -> Shared:
+    def from_matches(cls, view: View, matches: Matches) -> Shared:
         """Return the pixels of a view's sample that lie on one surface with the pixels that they meet."""
         consistent = matches.error[0] <= CONSISTENT
         return cls(

@@ -65,7 +65,7 @@ def contrast(ordered: InOrder, order: Order) -> FitContrast:
     given, ignore = ordered.labels, ordered.ignore
     other = {p: reordered for p in given if (reordered := order.of(given, p)) is not None}
 
-    def of(labels: Labels, position: int) -> float:
+    def agreement_at(labels: Labels, position: int) -> float:
         scan_labels = labels[position]
         row, nearest = ordered.own[position]
         within = agreement(scan_labels[row], scan_labels[nearest], ignore)
@@ -76,7 +76,7 @@ def contrast(ordered: InOrder, order: Order) -> FitContrast:
         ]
         return (within + float(np.mean(between))) / 2 if between else math.nan
 
-    return FitContrast.of([of(given, p) for p in other], [of(other, p) for p in other])
+    return FitContrast.between([agreement_at(given, p) for p in other], [agreement_at(other, p) for p in other])
 
 
 def agreement(first: Int64, second: Int64, ignore: int) -> float:

@@ -13,7 +13,7 @@ import numpy as np
 from semstab.check.chain import GAPS, LEAST_SEEN, STRIKING_SHIFT, Chain, Link
 from semstab.check.continuity import LEAVE_OUT, MOST_BAD, MOST_NAMED
 from semstab.check.reprojection import CONSISTENT, Pair, frames_at, motion, reader
-from semstab.check.scan_sample import Cloud
+from semstab.check.scan_sample import ScanPoints
 from semstab.check.surfaces import LEAST_RANGE, Surfaces
 from semstab.check.verdict import Verdict
 from semstab.core.arrays import evenly
@@ -66,9 +66,9 @@ def in_order(scene: Scene, indices: Sequence[int], source: str | None) -> InOrde
     """Read scans in order and compare them; those that cannot be read are passed over."""
     links, rows, nearest_in_scan = dict[Pair, Link](), dict[Pair, Int64](), dict[int, Int64]()
     labels, ignore, positions = dict[int, Int64](), -1, list[int]()
-    last = deque[tuple[int, Float64, Cloud]](maxlen=APART_BY)
+    last = deque[tuple[int, Float64, ScanPoints]](maxlen=APART_BY)
     for position, scan in _read(scene, indices, source):
-        if len((cloud := Cloud(scan)).rows) < LEAST_SEEN:
+        if len((cloud := ScanPoints(scan)).rows) < LEAST_SEEN:
             continue
         positions.append(position)
         if source is not None:
@@ -91,7 +91,7 @@ def _read(scene: Scene, indices: Sequence[int], source: str | None) -> Iterator[
     return frames_at(set(wanted), indices, reader(scene, source), passing_over=True)
 
 
-def _nearest_in(cloud: Cloud) -> Int64:
+def _nearest_in(cloud: ScanPoints) -> Int64:
     """Return (2, n) rows of points of a scan, and of the nearest other points of it."""
     chosen = np.array(evenly(len(cloud.rows), NEXT_TO), dtype=np.int64)
     nearest = cloud.tree.query(cloud.points[chosen], k=1 + NEAREST)[1][:, 1:]
@@ -99,9 +99,9 @@ def _nearest_in(cloud: Cloud) -> Int64:
     return rows
 
 
-def _linked(first: Cloud, second: Cloud, turn: Float64, shift: Float64) -> tuple[Link, Int64]:
+def _linked(first: ScanPoints, second: ScanPoints, turn: Float64, shift: Float64) -> tuple[Link, Int64]:
     """Return how far one scan is off the surfaces of another, and the rows (2, n) of points that meet there."""
-    around = Surfaces.of(first.sought[::SOUGHT], second.points, second.tree, turn, shift)
+    around = Surfaces.nearest_to(first.sought[::SOUGHT], second.points, second.tree, turn, shift)
     distance, nearest = second.tree.query(first.sought @ turn.T + shift)
     meet = distance <= CONSISTENT * np.linalg.norm(first.sought, axis=1)
     rows = np.stack([first.rows[first.chosen], second.rows[nearest]])[:, meet]

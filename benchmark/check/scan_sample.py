@@ -94,7 +94,7 @@ class ScanSample:
         read = frames_at(positions, indices, reader(scene, source), passing_over=passing_over)
         self.scans: dict[int, Frame] = dict(read)
         self.poses: dict[int, Float64] = {position: scan.T_wc for position, scan in self.scans.items()}
-        clouds = {position: Cloud(self.scans[position]) for position in compared & self.scans.keys()}
+        clouds = {position: ScanPoints(self.scans[position]) for position in compared & self.scans.keys()}
         self._clouds = {position: cloud for position, cloud in clouds.items() if len(cloud.rows)}
         self.pairs = [pair for pair in pairs_within(groups) if pair[0] < pair[1] and {*pair} <= self._clouds.keys()]
 
@@ -138,7 +138,7 @@ class ScanSample:
     def surfaces(self, pair: Pair, every: int = 1) -> Surfaces:
         """Compare points of the pair's first scan with surfaces of its second scan."""
         cloud_a, cloud_b = (self._clouds[position] for position in pair)
-        return Surfaces.of(cloud_a.sought[::every], cloud_b.points, cloud_b.tree, *self._motion(pair))
+        return Surfaces.nearest_to(cloud_a.sought[::every], cloud_b.points, cloud_b.tree, *self._motion(pair))
 
     @cached_property
     def _errors(self) -> list[Float64]:
@@ -180,7 +180,7 @@ class ScanSample:
         """
         above = below = flat = flatter = points = 0
         for cloud in [*self._clouds.values()][:LEVELLED]:
-            around = Surfaces.of(cloud.sought[::JUDGED], cloud.points, cloud.tree, np.eye(3), np.zeros(3))
+            around = Surfaces.nearest_to(cloud.sought[::JUDGED], cloud.points, cloud.tree, np.eye(3), np.zeros(3))
             level = around.flat & (np.abs(around.normal[:, 2]) > LEVEL)
             above += int(np.count_nonzero(level & (around.middle[:, 2] > BESIDE)))
             below += int(np.count_nonzero(level & (around.middle[:, 2] < -BESIDE)))
@@ -252,7 +252,7 @@ class ScanSample:
         return np.concatenate(first), np.concatenate(second)
 
 
-class Cloud:
+class ScanPoints:
     """The points of a scan that have a range, and those of them that are sought in others.
 
     Attributes:

@@ -234,7 +234,7 @@ def _check_scans(
         frames=len(scene),
         selected=len(indices),
         size=(int(np.median([scan.depth.size for scan in scans])), 1),
-        depth=Depth.of(valid, ranges),
+        depth=Depth.from_samples(valid, ranges),
         motion=None,
         verdict=verdict,
         sources=scene.sources,

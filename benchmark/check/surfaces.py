@@ -52,7 +52,7 @@ class Surfaces:
     reach: Float64
 
     @classmethod
-    def of(cls, points: Float64, others: Float64, tree: Any, turn: Float64, shift: Float64) -> Surfaces:
+    def nearest_to(cls, points: Float64, others: Float64, tree: Any, turn: Float64, shift: Float64) -> Surfaces:
         """Find the surface nearest to each of the points (n, 3), of others (m, 3), which are in the tree."""
         distance, rows = tree.query(points @ turn.T + shift, k=min(NEIGHBOURS, len(others)))
         distance, rows = distance.reshape(len(points), -1), rows.reshape(len(points), -1)

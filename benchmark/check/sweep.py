@@ -27,7 +27,7 @@ class Swept:
     pairs: tuple[tuple[Surfaces, Float64, Float64], ...]
 
     @classmethod
-    def of(cls, sample: ScanSample) -> Swept:
+    def from_sample(cls, sample: ScanSample) -> Swept:
         """Seek the points of each pair of scans; pairs of which no point is near to a surface are left out."""
         motions = {p: _motion(sample, p) for pair in sample.pairs for p in pair}
         sought = [(sample.surfaces((a, b)), motions[a], motions[b]) for a, b in sample.pairs]
@@ -68,7 +68,7 @@ def with_sweep(verdict: Verdict, sample: ScanSample) -> Verdict:
     """Return the verdict with a remark where points lie clearly nearer to surfaces once scans are deskewed."""
     if verdict.state != "sound" or sample.scene.settings.get("deskew") is not None:
         return verdict
-    if not (swept := Swept.of(sample)).pairs:
+    if not (swept := Swept.from_sample(sample)).pairs:
         return verdict
     now, best = swept.fit(), ranked(HYPOTHESES, swept)[0]
     if best.fit.error > now.error - LEAST or not best.is_right(swept, now, BETTER):

@@ -112,7 +112,7 @@ class FitContrast:
     count: int
 
     @classmethod
-    def of(cls, given: Sequence[float] | Float64, other: Sequence[float] | Float64) -> FitContrast:
+    def between(cls, given: Sequence[float] | Float64, other: Sequence[float] | Float64) -> FitContrast:
         """Compare two measures, one pair of numbers for each frame or pair; NaN does not count."""
         pairs = np.array([given, other], dtype=np.float64).reshape(2, -1)
         pairs = pairs[:, np.isfinite(pairs).all(axis=0)]
@@ -142,7 +142,7 @@ class FitContrast:
 def falls(errors: Float64, present: Float64, least: float = 0.0) -> FitContrast:
     """Compare errors (pairs,) with the present ones, by their logarithms; of pairs that change by less none counts."""
     now, other = (-np.log(np.maximum(values, TINY)) for values in (present, errors))
-    return FitContrast.of(now, np.where(np.abs(other - now) > least, other, np.nan) if least else other)
+    return FitContrast.between(now, np.where(np.abs(other - now) > least, other, np.nan) if least else other)
 
 
 def clearly_falls(errors: Float64, present: Float64) -> bool:

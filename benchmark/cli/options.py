@@ -193,7 +193,7 @@ Vocabularies = Annotated[list[Path] | None, typer.Option(
 
 
 @dataclass(frozen=True)
-class Prediction:
+class PredictionOptions:
     """A model that makes the labels in memory, and filters over the labels."""
 
     predict: Predicted = None

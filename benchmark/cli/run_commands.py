@@ -32,7 +32,7 @@ def run(
     out: Annotated[Path | None, typer.Option("--out", "-o", help="Run folder.", show_default="runs/TIME")] = None,
     execution: opt.Execution,
     tile_size: opt.TileSize = None,
-    prediction: opt.Prediction,
+    prediction: opt.PredictionOptions,
     quiet: opt.Quiet = False,
     verbose: opt.Verbose = False,
 ) -> None:  # fmt: skip
@@ -49,7 +49,7 @@ def run(
         execute(loaded, out, execution, quiet=quiet, verbose=verbose)
 
 
-def _configured(prediction: opt.Prediction, config: Path | None, content: dict[str, Any]) -> Config:
+def _configured(prediction: opt.PredictionOptions, config: Path | None, content: dict[str, Any]) -> Config:
     """Return the configuration of a file and further settings, with vocabularies over the features of its models."""
     from semstab.configure import with_vocabularies
 
@@ -57,7 +57,7 @@ def _configured(prediction: opt.Prediction, config: Path | None, content: dict[s
     return with_vocabularies(loaded, prediction.vocabulary) if prediction.vocabulary else loaded
 
 
-def _labelled(prediction: opt.Prediction, config: Path | None, content: dict[str, Any]) -> Config:
+def _labelled(prediction: opt.PredictionOptions, config: Path | None, content: dict[str, Any]) -> Config:
     """Return the configuration of a file and further settings, of stored labels or of a model that predicts them."""
     from semstab.configure import filtered_config, load_config, predicted_config
     from semstab.predict.predictor import parse_predictors
@@ -132,7 +132,7 @@ def benchmark(
     data: Annotated[Path | None, typer.Option(help="Folder of its data.", show_default="built in")] = None,
     labels: Annotated[Path | None, typer.Option(
         help="Folder of label maps, SCENE/MODEL/NAME.png below it.", show_default="the data's own")] = None,
-    prediction: opt.Prediction,
+    prediction: opt.PredictionOptions,
     taxonomy: Annotated[str | None, typer.Option(
         metavar="FILE", help="The benchmark's classes, with your names for them as members.",
         show_default="the benchmark's", rich_help_panel=opt.LABELS)] = None,
@@ -184,7 +184,7 @@ def benchmark(
 def filters(
     *,
     source: opt.Source,
-    prediction: opt.Prediction,
+    prediction: opt.PredictionOptions,
     frames: opt.Frames = None,
     voxel_size: opt.VoxelSize = None,
     taxonomy: Annotated[str | None, typer.Option(help="Taxonomy to fuse and assess in: a name or a file.")] = None,

@@ -223,7 +223,7 @@ def _of_voxels(measure: Measure, base: VoxelTable, other: VoxelTable, edge: floa
     defined = ~np.isnan(before) & ~np.isnan(after) & (base.op >= measure.op) & (other.op >= measure.op)
     if not defined.any():
         return Contrast(measure.name, "", math.nan, math.nan, UNKNOWN, math.nan, "")
-    cubes, columns = Cubes.of(base, edge, where=defined), np.stack([after - before, defined], axis=1)
+    cubes, columns = Cubes.from_table(base, edge, where=defined), np.stack([after - before, defined], axis=1)
     before, after = before[defined], after[defined]
     change = cubes.estimate(columns, ratio_of, (-measure.largest, measure.largest), "plain")
     result = no_difference(change) if np.array_equal(before, after) else _with_p_value(change)

@@ -58,7 +58,7 @@ class Changed:
     right: Int64 | None
 
     @classmethod
-    def of(cls, base: VoxelTable, other: VoxelTable, truth: VoxelTable | None) -> Changed:
+    def between(cls, base: VoxelTable, other: VoxelTable, truth: VoxelTable | None) -> Changed:
         """Compare two maps, or parts of them, voxel by voxel."""
         rows = shared_rows(base, other)
         again = (base.op[rows[0]] >= 2) & (other.op[rows[1]] >= 2)
@@ -168,7 +168,7 @@ def _changed(common: Common, number: int) -> Iterator[Changed]:
     assert common.regions is not None
     for region in common.regions():
         tables = [*region.tables.values()]
-        yield Changed.of(tables[0], tables[number], region.truth)
+        yield Changed.between(tables[0], tables[number], region.truth)
 
 
 def _put(n: int, at: Int64, values: Int64) -> Int64:

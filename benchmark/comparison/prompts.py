@@ -15,7 +15,7 @@ from semstab.comparison.ranking import with_one_number_of_classes
 from semstab.core.types import Int64
 from semstab.data.records import Record, Result
 from semstab.data.statistics import Interval
-from semstab.predict.prompts import Changes
+from semstab.predict.prompts import VocabularyChanges
 from semstab.statistics.accumulate import sums_of_spots
 from semstab.statistics.agreement import ALPHA
 from semstab.statistics.observations import SpotObservations, same_spots
@@ -45,7 +45,7 @@ class ChangedVocabulary:
     """A vocabulary with other names, on a scene: its record, the changes, and their effect."""
 
     full: str
-    changes: Changes
+    changes: VocabularyChanges
     record: Record
     effect: Effect
 
@@ -54,7 +54,7 @@ def changed_vocabularies(result: Result) -> Iterator[ChangedVocabulary]:
     """Yield the vocabularies of a run with other names than a full one of the run, scene by scene."""
     records = {(record.unit.scene, record.unit.model): record for record in result.select()}
     for (scene, model), record in records.items():
-        name, changes = Changes.of_model(model)
+        name, changes = VocabularyChanges.of_model(model)
         full = records.get((scene, name))
         if not changes or full is None:
             continue
@@ -67,12 +67,12 @@ def changed_vocabularies(result: Result) -> Iterator[ChangedVocabulary]:
 
 
 @functools.lru_cache(maxsize=1024)
-def _effect_of(full: Path, other: Path, changes: Changes, _: tuple[int, int]) -> Effect:
+def _effect_of(full: Path, other: Path, changes: VocabularyChanges, _: tuple[int, int]) -> Effect:
     """Return the effect of changes from files of observations, which terminal, tables and report ask for in turn."""
     return effect(SpotObservations.load(full), SpotObservations.load(other), changes)
 
 
-def effect(full: SpotObservations, other: SpotObservations, changes: Changes) -> Effect:
+def effect(full: SpotObservations, other: SpotObservations, changes: VocabularyChanges) -> Effect:
     """Return what changes of names do to the labels that views of the same frames give spots."""
     wide = with_one_number_of_classes({"full": full, "other": other})
     before, after = common_observations([wide["full"], wide["other"]]).shared

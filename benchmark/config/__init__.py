@@ -69,7 +69,7 @@ class BackendConfig(Part):
     check: bool | None = Field(None, description="whether it must agree; by default if it associates by pixel")
 
     @classmethod
-    def of(cls, text: str) -> Self:
+    def parse(cls, text: str) -> Self:
         """Return the backend of a name, or of FILE.py:NAME."""
         if not is_code(text):
             return cls(name=text)
@@ -258,7 +258,7 @@ class Config(Settings):
         listed = [value] if isinstance(value, str) else value
         if not isinstance(listed, list | tuple):
             return value
-        return [BackendConfig.of(item) if isinstance(item, str) else item for item in listed]
+        return [BackendConfig.parse(item) if isinstance(item, str) else item for item in listed]
 
     @field_validator("backends")
     @classmethod
@@ -327,7 +327,7 @@ class Config(Settings):
         """Return the backends that fuse the base units: those named, and the one they are checked against."""
         if self.check is None or self.check in (SAMPLE, *(backend.name for backend in self.backends)):
             return [*self.backends]
-        checking, fusing = BackendConfig.of(self.check), {backend.name: backend for backend in self.backends}
+        checking, fusing = BackendConfig.parse(self.check), {backend.name: backend for backend in self.backends}
         by_rule = [checking.like(backend) for backend in self.backends]
         return [*self.backends, *{backend.name: backend for backend in by_rule if backend.name not in fusing}.values()]
 

@@ -217,7 +217,7 @@ class FrameSelection(Settings):
         return self
 
     @classmethod
-    def of(cls, indices: Sequence[int]) -> Self:
+    def from_indices(cls, indices: Sequence[int]) -> Self:
         """Select exactly these frames, ascending; in a few numbers where they are a range."""
         if isinstance(indices, range):
             return cls(start=indices.start, stop=indices.stop, stride=indices.step)

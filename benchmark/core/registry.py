@@ -34,7 +34,7 @@ def name_code(kind: str, name: str, text: str) -> None:
 
 
 @dataclass(frozen=True)
-class Entry:
+class Registration:
     """One name: its class ('module:Class'), a description, and how to install what it needs.
 
     Attributes:
@@ -50,23 +50,23 @@ class Entry:
 class Registry:
     """The entries of one kind ('backend', 'dataset', ...), built in and from entry points."""
 
-    def __init__(self, kind: str, builtin: Mapping[str, Entry]) -> None:
+    def __init__(self, kind: str, builtin: Mapping[str, Registration]) -> None:
         self.kind = kind
         self.builtin = dict(builtin)
 
-    def entries(self) -> dict[str, Entry]:
+    def entries(self) -> dict[str, Registration]:
         """Return every known entry by name; a built-in name is not replaced by a plug-in's."""
         return self._plugins | self.builtin
 
     @functools.cached_property
-    def _plugins(self) -> dict[str, Entry]:
+    def _plugins(self) -> dict[str, Registration]:
         # read once: it looks through all that is installed
         return {
-            point.name: Entry(point.value, f"from the package {point.dist.name if point.dist else point.module}")
+            point.name: Registration(point.value, f"from the package {point.dist.name if point.dist else point.module}")
             for point in entry_points(group=f"semstab.{self.kind}s")
         }
 
-    def entry(self, name: str) -> Entry:
+    def entry(self, name: str) -> Registration:
         """Return the entry of that name.
 
         Raises:

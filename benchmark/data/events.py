@@ -101,7 +101,7 @@ class Events:
         starts, s_bar = self.starts, self.evidence[:]
         return {
             "op": np.diff(np.append(starts, len(self))).astype(np.int32),
-            "evidence": Evidence.of(_sum_by_voxel(s_bar, starts)),
+            "evidence": Evidence.from_rows(_sum_by_voxel(s_bar, starts)),
             "drift_sum": _sum_by_voxel(self.drift(), starts),
             "pixels": _sum_by_voxel(self.pixels.astype(np.int64), starts),
             "first_frame": np.minimum.reduceat(self.frame, starts) if len(self) else self.frame,
@@ -209,7 +209,7 @@ class Events:
 def accumulated(events: Events) -> Evidence:
     """Return the evidence (n, K) of each voxel of a log."""
     logs = events._few_at_a_time()
-    return Evidence.joined([Evidence.of(_sum_by_voxel(log.evidence[:], log.starts)) for log in logs])
+    return Evidence.joined([Evidence.from_rows(_sum_by_voxel(log.evidence[:], log.starts)) for log in logs])
 
 
 def _sum_by_voxel(values: npt.NDArray[Any], starts: Int64) -> npt.NDArray[Any]:

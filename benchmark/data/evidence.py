@@ -62,7 +62,7 @@ class Evidence(NDArrayOperatorsMixin):
     known: Concentration | None = field(default=None, kw_only=True)
 
     @classmethod
-    def of(cls, rows: npt.ArrayLike | Evidence) -> Evidence:
+    def from_rows(cls, rows: npt.ArrayLike | Evidence) -> Evidence:
         """Return dense rows (n, K), or evidence as it is."""
         if isinstance(rows, Evidence):
             return rows
@@ -160,7 +160,7 @@ class Evidence(NDArrayOperatorsMixin):
     @property
     def concentration(self) -> Concentration:
         """Return how the rows are spread over the classes."""
-        return self.known or Concentration.of(*self.entries)
+        return self.known or Concentration.from_entries(*self.entries)
 
     def measured(self) -> Self:
         """Return the same, with its concentration, so that nobody computes that again: 34 bytes a row."""

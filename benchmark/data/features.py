@@ -115,7 +115,7 @@ class FeatureColours:
     high: npt.NDArray[np.float32]
 
     @classmethod
-    def of(cls, features: Features) -> FeatureColours:
+    def from_features(cls, features: Features) -> FeatureColours:
         """Return the colours by which a frame's features differ most."""
         vectors = features.vectors.reshape(-1, features.D).astype(np.float32)
         mean = vectors.mean(axis=0)

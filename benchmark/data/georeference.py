@@ -42,7 +42,9 @@ class Georeference:
     linear: Linear = IDENTITY
 
     @classmethod
-    def of(cls, crs: str, offset: tuple[float, float, float], where: str, linear: Linear | None = None) -> Georeference:
+    def from_crs(
+        cls, crs: str, offset: tuple[float, float, float], where: str, linear: Linear | None = None
+    ) -> Georeference:
         """Make it of a reference system in any words that pyproj reads: EPSG:32615, '+proj=utm +zone=15', WKT.
 
         Raises:

@@ -90,7 +90,7 @@ class Concentration:
     squares: Float64
 
     @classmethod
-    def of(cls, starts: Int64, label: UInt16, weight: Float64) -> Concentration:
+    def from_entries(cls, starts: Int64, label: UInt16, weight: Float64) -> Concentration:
         """Compute it of entries as `Evidence` has them."""
         from semstab.data.kernels import concentrate
 

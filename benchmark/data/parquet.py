@@ -253,5 +253,5 @@ def _to_numpy(column: pa.ChunkedArray) -> npt.NDArray[Any] | Evidence:
         raise DataError("a column has missing values")
     if pa.types.is_fixed_size_list(column.type):
         flat = pa.chunked_array([part.flatten() for part in column.chunks], column.type.value_type)
-        return Evidence.of(values_of(flat).reshape(-1, column.type.list_size))
+        return Evidence.from_rows(values_of(flat).reshape(-1, column.type.list_size))
     return values_of(column)

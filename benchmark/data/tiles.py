@@ -53,7 +53,7 @@ class Tiles(Generic[T]):
         return cls(load, tiles[files[0]].size, voxel_size)
 
     @classmethod
-    def of(cls, table: T) -> Tiles[T]:
+    def from_table(cls, table: T) -> Tiles[T]:
         """Return a table as the one tile of its map."""
         return cls({(0, 0): lambda: table}, None, table.voxel_size)
 

@@ -144,7 +144,7 @@ def _evidence(table: Any, evidence: npt.NDArray[Any] | Evidence) -> Evidence:
     shape = np.shape(evidence)
     if len(shape) != 2:
         raise DataError(f"{type(table).__name__}: evidence of shape {shape}, expected one row of K classes each")
-    return Evidence.of(evidence)
+    return Evidence.from_rows(evidence)
 
 
 @dataclass(frozen=True, eq=False)

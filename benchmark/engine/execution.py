@@ -133,11 +133,11 @@ class _Execution:
         untiled = list[Work]()
         for key, unit in self._missing.items():
             if (error := sizing.refused.get(key)) is not None:
-                self._keep(Work.of(unit, start).failed(ConfigError(error)))
+                self._keep(Work.from_unit(unit, start).failed(ConfigError(error)))
             elif (size := sizing.tile_sizes.get(key)) is not None:
                 self._tiled[key] = TiledUnit(unit, size, self._folder, start)
             else:
-                untiled.append(Work.of(unit, start))
+                untiled.append(Work.from_unit(unit, start))
         self._queue = deque(jobs_of(untiled, self._executor.width))
         self.ended = [work for tiled in self._tiled.values() if (work := tiled.ended()) is not None]
 

@@ -87,7 +87,7 @@ class Fusion:
         maps = list[LiveMap]()
         for work in works:
             try:
-                maps.append(LiveMap.of(work, scene))
+                maps.append(LiveMap.from_work(work, scene))
             except Exception as error:  # noqa: BLE001 - a failing unit is reported, and the others continue
                 self.failed.append(work.failed(error))
         self.streams = streams_of(maps, self.watch, observers)

@@ -85,7 +85,7 @@ class LiveMap:
     """Seconds of the fusion of the last frame."""
 
     @classmethod
-    def of(cls, work: Work, scene: Scene) -> LiveMap:
+    def from_work(cls, work: Work, scene: Scene) -> LiveMap:
         """Return an empty map for a work on its scene."""
         unit, task = work.unit, work.unit.task_on(scene)
         task = task if work.tile is None else dataclasses.replace(task, indices=work.frames)

@@ -123,7 +123,7 @@ def _result(live: LiveMap, stream: Stream, fused: FusedMap | None, sample: MapSa
     if not live.work.unit.fuses:
         sums = TableSums.nothing(len(live.task.mapping.target), strata).arrays()
     elif fused is not None:
-        sums = (TableSums.of(fused.table, strata) if sample is None else sample.summary).arrays()
+        sums = (TableSums.from_table(fused.table, strata) if sample is None else sample.summary).arrays()
     return TileResult(
         {},
         None if fused is None or fused.checked is None else fused.checked.result(),

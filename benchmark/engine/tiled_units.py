@@ -54,7 +54,7 @@ class TiledUnit:
     """
 
     def __init__(self, unit: Unit, size: int, folder: Folder, start: Start) -> None:
-        self._folder, self._work = folder, Work.of(unit, start)
+        self._folder, self._work = folder, Work.from_unit(unit, start)
         self._frames = UnitTile(unit.key, size)
         self._results: dict[UnitTile, TileResult] = {}
         self._samples: list[MapSample] = []

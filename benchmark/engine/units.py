@@ -96,9 +96,9 @@ class Unit:
     fuses: bool = True
 
     @classmethod
-    def of(cls, variation: Variation, config: Config, task: Task, identity: str, **wanted: bool) -> Unit:
+    def from_task(cls, variation: Variation, config: Config, task: Task, identity: str, **wanted: bool) -> Unit:
         """Return the unit of a task at these settings, and what is `wanted` of it, see the attributes."""
-        config = config.model_copy(update={"frames": FrameSelection.of(task.indices)})
+        config = config.model_copy(update={"frames": FrameSelection.from_indices(task.indices)})
         return cls(task.units[0], variation, config, task, identity, task.left_out, **wanted)
 
     def task_on(self, scene: Scene) -> Task:
@@ -254,7 +254,7 @@ def _base_units(config: Config, scenes: Mapping[str, Scene]) -> Iterator[Unit]:
                 _check_video(config, task)
             flags = {"image_space": True, "stored": True, "sampled": sampled}
             flags |= {"assessed": scene.posed, "fuses": scene.posed}
-            yield Unit.of(Variation(BASE), model_settings, task, identity(model_settings, task), **flags)
+            yield Unit.from_task(Variation(BASE), model_settings, task, identity(model_settings, task), **flags)
         if others:
             first, *more = dict.fromkeys(others)
             logger.warning(
@@ -297,7 +297,7 @@ def _planned_regions(config: Config, scenes: Mapping[str, Scene]) -> Iterator[Un
             task = Task(scene, model, frames, space.mapping_to(space), ("none",))
             content = settings.model_dump(mode="json", include=OF_REGIONS, exclude_defaults=True)
             key = _hash(content, {"regions": [name, model], "frames": frames})
-            yield Unit.of(Variation(REGIONS), settings, task, key, fuses=False)
+            yield Unit.from_task(Variation(REGIONS), settings, task, key, fuses=False)
 
 
 def _varied_units(config: Config, base: Sequence[Unit], scenes: Mapping[str, Scene]) -> Iterator[Unit]:
@@ -317,7 +317,7 @@ def _varied_units(config: Config, base: Sequence[Unit], scenes: Mapping[str, Sce
             assessed = varied.statistics or not reference
             sampled = compares_backends and _is_sampled(config, backend)
             flags = {"stored": compares_backends, "assessed": assessed, "sampled": sampled}
-            yield Unit.of(variation, varied, task, identity(varied, task), **flags)
+            yield Unit.from_task(variation, varied, task, identity(varied, task), **flags)
 
 
 def _variations(config: Config) -> Iterator[tuple[Variation, Part, Any]]:

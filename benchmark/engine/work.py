@@ -110,7 +110,7 @@ class Work:
     seconds: Mapping[str, float] = field(default_factory=dict)
 
     @classmethod
-    def of(cls, unit: Unit, start: Start) -> Work:
+    def from_unit(cls, unit: Unit, start: Start) -> Work:
         """Return the whole of a unit as work."""
         return cls(start, unit, as_range(unit.task.indices))
 

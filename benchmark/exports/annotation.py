@@ -80,7 +80,7 @@ def annotation_tasks(chosen: ExportedUnit, task: Task, most: int) -> list[Annota
         ConfigError: If frames disagree nowhere, or no frame shows it large enough.
         DataError: If the frames have no colour image.
     """
-    locations = _Locations.of(chosen, MORE * most)
+    locations = _Locations.from_unit(chosen, MORE * most)
     views = [view for fetched in prefetch(lambda i: _views(task, i, locations), task.indices) for view in fetched.item]
     by_location: dict[int, list[_View]] = {}
     for view in views:
@@ -111,7 +111,7 @@ class _Locations:
     projected: Callable[[Float64], Float64]
 
     @classmethod
-    def of(cls, chosen: ExportedUnit, most: int) -> _Locations:
+    def from_unit(cls, chosen: ExportedUnit, most: int) -> _Locations:
         """Return the locations with the most entropy, at most `most`."""
         parts = list(chosen)
         first = parts[0]

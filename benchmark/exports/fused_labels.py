@@ -66,7 +66,7 @@ class Belief:
             if name not in CATEGORIES:
                 raise ConfigError(f"no category '{name}'; {nearest(name, CATEGORIES)}")
 
-    def of(self, table: VoxelTable) -> Mask:
+    def trusts(self, table: VoxelTable) -> Mask:
         """Return a mask (n,) of the voxels that meet the criteria."""
         believed = table.op >= max(self.min_op, 1)
         if self.min_psa > 0:
@@ -117,7 +117,7 @@ class FusedLabels:
         voxels = rows_of(lookup.table, rows)
         if vote is not None:
             voxels = _without(vote, lookup, voxels, rows)
-        label = np.where(self._belief.of(voxels), dominant(voxels), UNSTABLE)
+        label = np.where(self._belief.trusts(voxels), dominant(voxels), UNSTABLE)
         labels = np.full(len(points), UNSEEN)
         labels[met] = label[inverse]
         return labels
@@ -138,7 +138,7 @@ def _without(vote: Observations, lookup: VoxelLookup, voxels: VoxelTable, rows: 
     evidence[positions] = np.abs(np.round(evidence[positions] - vote.s_bar[met], DECIMALS))
     op[positions] -= 1
     self_sum[positions] -= (vote.s_bar[met] ** 2).sum(axis=1)
-    return dataclasses.replace(voxels, evidence=Evidence.of(evidence), op=op, self_sum=self_sum)
+    return dataclasses.replace(voxels, evidence=Evidence.from_rows(evidence), op=op, self_sum=self_sum)
 
 
 def labels_of(fused: Int64, ids: Sequence[int]) -> UInt8 | UInt16:

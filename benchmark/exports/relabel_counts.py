@@ -24,7 +24,7 @@ class Accuracy:
     miou: float
 
     @classmethod
-    def of(cls, confusion: Int64) -> Accuracy:
+    def from_confusion(cls, confusion: Int64) -> Accuracy:
         """Return the accuracy of pixels (K, K) by true and given class; a class without pixels does not count."""
         right, n = confusion.diagonal(), int(confusion.sum())
         miou = mean_iou(right, confusion.sum(axis=1), confusion.sum(axis=0))
@@ -129,4 +129,6 @@ class PixelTally:
         """Return the accuracies, or None without ground truth."""
         if not self._confusion["all_before"].any():
             return None
-        return RelabelCorrectness(**{name: Accuracy.of(confusion) for name, confusion in self._confusion.items()})
+        return RelabelCorrectness(
+            **{name: Accuracy.from_confusion(confusion) for name, confusion in self._confusion.items()}
+        )

@@ -22,7 +22,7 @@ from semstab.data.statistics import ORDER_KNOWN, Interval
 from semstab.data.statistics.intervals import short
 from semstab.errors import ConfigError, DataError
 from semstab.gating.result import Judgement, negative, verdict
-from semstab.gating.rules import Rule
+from semstab.gating.rules import GateRule
 from semstab.report.comparison.sentences import LEAST_LEFT_OUT, left_out
 from semstab.statistics.agreement import ALPHA, PSA, VOXEL_ALPHA
 from semstab.statistics.cluster_sums import ClusterSums, chance_of, functional, parts_of, value
@@ -31,7 +31,7 @@ from semstab.statistics.intervals import counted, estimate, mean_of, mean_over_f
 from semstab.statistics.verdict import LEAST_CLASSES
 
 
-def require_data(rule: Rule, new: RunHandle, base: RunHandle | None, scenes: Sequence[str]) -> None:
+def require_data(rule: GateRule, new: RunHandle, base: RunHandle | None, scenes: Sequence[str]) -> None:
     """Raise ConfigError or DataError for a rule whose scene, class, baseline or sums the runs do not have."""
     if rule.change is not None and base is None:
         raise ConfigError(f"rule '{rule.text}': a {rule.change} needs a baseline; give --against RUN")
@@ -67,7 +67,7 @@ def require_data(rule: Rule, new: RunHandle, base: RunHandle | None, scenes: Seq
             )
 
 
-def _has(rule: Rule, entry: Entry) -> bool:
+def _has(rule: GateRule, entry: Entry) -> bool:
     """Return whether a run has the data of a measure."""
     if rule.measure.quantity is FLICKER:
         return len(entry.flicker) > 1
@@ -87,7 +87,7 @@ def _order_known(sums: ClusterSums) -> tuple[float, int]:
     return float(sums["sbd_known"].sum()), round(float(sums["voxels"].sum()))
 
 
-def _few_known(rule: Rule, entry: Entry) -> str:
+def _few_known(rule: GateRule, entry: Entry) -> str:
     """Return at how few locations SBD in random order is known, which are no random sample; empty for other rules."""
     num_with_null, locations = _order_known(entry.sums) if rule.measure.quantity is SBD_EXCESS else (0.0, 0)
     few = f", which is known at {num_with_null:,.0f} of {locations:,} locations, fewer than {ORDER_KNOWN:.0%}"
@@ -97,7 +97,7 @@ def _few_known(rule: Rule, entry: Entry) -> str:
 Pair = tuple[Entry, Entry | None]
 
 
-def _k(rule: Rule, entry: Entry) -> int | None:
+def _k(rule: GateRule, entry: Entry) -> int | None:
     return None if rule.class_name is None else entry.classes.index(rule.class_name)
 
 
@@ -109,7 +109,7 @@ class GateRuns:
     base: RunHandle | None
     scenes: tuple[str, ...]
 
-    def on_common(self, rule: Rule) -> bool:
+    def on_common(self, rule: GateRule) -> bool:
         """Return whether a rule is on a change of alpha, which is of common observations."""
         return self.base is not None and rule.change is not None and rule.measure.quantity is ALPHA
 
@@ -128,7 +128,7 @@ class GateRuns:
             pairs[scene] = new, old
         return pairs, tuple(notes)
 
-    def pairs(self, rule: Rule) -> list[Pair]:
+    def pairs(self, rule: GateRule) -> list[Pair]:
         """Return the runs on each scene that a rule is about; for a rule on a value only the new one."""
         scenes = [rule.scene] if rule.scene else self.scenes
         if self.on_common(rule):
@@ -137,13 +137,13 @@ class GateRuns:
         return [(self.new.scenes[scene], base.get(scene)) for scene in scenes]
 
 
-def with_values(rules: Sequence[Rule], runs: GateRuns) -> tuple[tuple[Rule, ...], dict[str, list[str]]]:
+def with_values(rules: Sequence[GateRule], runs: GateRuns) -> tuple[tuple[GateRule, ...], dict[str, list[str]]]:
     """Return the rules of classes that have a value everywhere, and the other classes by the run that has none.
 
     A class that only the baseline has stays: the run has lost it, and no drop of a measure shows that. Where no class
     is left all rules are returned, and the first of them raises the error.
     """
-    with_value, absent = list[Rule](), dict[str, list[str]]()
+    with_value, absent = list[GateRule](), dict[str, list[str]]()
     for rule in rules:
         pairs = runs.pairs(rule)
         entries = (entry for pair in pairs for entry in pair if entry is not None)
@@ -158,7 +158,7 @@ def with_values(rules: Sequence[Rule], runs: GateRuns) -> tuple[tuple[Rule, ...]
 LOST = "the baseline has this class, and the run gives it to no location that was seen twice"
 
 
-def is_lost(rule: Rule, pairs: Sequence[Pair]) -> bool:
+def is_lost(rule: GateRule, pairs: Sequence[Pair]) -> bool:
     """Return whether a class has a value in the baseline of a scene, and none in the run."""
     return any(
         old is not None and math.isnan(value_of(rule, new)) and not math.isnan(value_of(rule, old))
@@ -173,7 +173,7 @@ OF_EVIDENCE = (PSA, VOXEL_ALPHA, RECURRENT_VSS, SBD_EXCESS, ECE)
 """Measures that depend on the output of a model, labels or scores, as do all measures of the register."""
 
 
-def require_values(rule: Rule, pairs: Sequence[Pair]) -> None:
+def require_values(rule: GateRule, pairs: Sequence[Pair]) -> None:
     """Raise ConfigError for a rule that cannot be evaluated, with advice."""
     for new, old in pairs:
         for entry in (new, old):
@@ -189,14 +189,14 @@ def require_values(rule: Rule, pairs: Sequence[Pair]) -> None:
             raise ConfigError(f"rule '{rule.text}': {SCORES}")
 
 
-def assess(rule: Rule, pairs: Sequence[Pair], level: float, scope: Scope) -> Judgement:
+def assess(rule: GateRule, pairs: Sequence[Pair], level: float, scope: Scope) -> Judgement:
     """Assess a rule by the mean of the scenes, whose errors are independent, or in the scene that it names."""
     result = mean_of([_interval_of(rule, new, old, level, scope) for new, old in pairs])
     values = [[math.nan if entry is None else value_of(rule, entry) for entry in pair] for pair in pairs]
     return Judgement(rule, verdict(rule, result), result, *(float(mean) for mean in np.mean(values, axis=0)))
 
 
-def value_of(rule: Rule, entry: Entry) -> float:
+def value_of(rule: GateRule, entry: Entry) -> float:
     """Return the number of a rule's measure in a run on a scene; NaN if undefined."""
     if rule.measure.quantity is FLICKER:
         return float(np.mean(list(entry.flicker.values())))
@@ -206,7 +206,7 @@ def value_of(rule: Rule, entry: Entry) -> float:
     return entry.pairs.of_all(number) if bounds_alpha(rule) else number
 
 
-def _interval_of(rule: Rule, new: Entry, base: Entry | None, level: float, scope: Scope) -> Interval:
+def _interval_of(rule: GateRule, new: Entry, base: Entry | None, level: float, scope: Scope) -> Interval:
     if rule.measure.quantity is COVERAGE and base is not None and _same_frames(new, base):
         change = counted(_covered(new.sums, base.sums), new.sums)
         return change if rule.change == "rise" else negative(change)
@@ -229,7 +229,7 @@ def _interval_of(rule: Rule, new: Entry, base: Entry | None, level: float, scope
 
 
 def bounded(
-    rule: Rule,
+    rule: GateRule,
     new: ClusterSums,
     base: ClusterSums | None = None,
     *,
@@ -249,16 +249,16 @@ def bounded(
 ONE_CLASS = "nearly the whole map is one class, so that alpha tells nothing"
 
 
-def _of_all_alpha(rule: Rule) -> bool:
+def _of_all_alpha(rule: GateRule) -> bool:
     return rule.measure.quantity is ALPHA and rule.class_name is None
 
 
-def bounds_alpha(rule: Rule) -> bool:
+def bounds_alpha(rule: GateRule) -> bool:
     """Return whether a rule bounds alpha itself, for which what has no label counts as disagreeing."""
     return _of_all_alpha(rule) and rule.change is None
 
 
-def silence_notes(rule: Rule, pairs: Sequence[Pair]) -> list[str]:
+def silence_notes(rule: GateRule, pairs: Sequence[Pair]) -> list[str]:
     """Return how alpha of a rule differs from that of what the run labels."""
     if not bounds_alpha(rule):
         return []

@@ -34,7 +34,7 @@ from semstab.gating.evaluation import (
     with_values,
 )
 from semstab.gating.result import GateResult, Judgement, Undecided
-from semstab.gating.rules import ALL, Rule, parse
+from semstab.gating.rules import ALL, GateRule, parse
 from semstab.statistics.cluster_sums import functional
 
 
@@ -131,7 +131,7 @@ def gate(new: str | os.PathLike[str], against: str | os.PathLike[str] | None, co
     )
 
 
-def _rules(parsed_rule: Rule, runs: GateRuns) -> tuple[tuple[Rule, ...], list[str]]:
+def _rules(parsed_rule: GateRule, runs: GateRuns) -> tuple[tuple[GateRule, ...], list[str]]:
     """Return the rules that a parsed rule stands for, all of which the runs have data for, and notes on others."""
     rules = parsed_rule.of_each(runs.new.scenes[runs.scenes[0]].classes)
     for rule in rules:
@@ -145,7 +145,7 @@ def _rules(parsed_rule: Rule, runs: GateRuns) -> tuple[tuple[Rule, ...], list[st
     ]
 
 
-def _of_lost_class(rule: Rule, pairs: Sequence[Pair]) -> Judgement:
+def _of_lost_class(rule: GateRule, pairs: Sequence[Pair]) -> Judgement:
     """Return an undecided judgement on a rule, with the baseline's mean over the scenes in which it has the class."""
     base = float(np.nanmean([value_of(rule, old) for _, old in pairs if old is not None]))
     return Judgement(rule, "undecided", dataclasses.replace(UNKNOWN, undecided=LOST), math.nan, base)

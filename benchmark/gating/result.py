@@ -12,7 +12,7 @@ from semstab.comparison.quantities import COVERAGE
 from semstab.core.types import THESE_FRAMES, Scope
 from semstab.data.statistics import Interval
 from semstab.data.statistics.intervals import without_zero
-from semstab.gating.rules import GateMeasure, Rule
+from semstab.gating.rules import GateMeasure, GateRule
 from semstab.statistics.intervals import LEAST_FRAMES, standard_error
 
 # The verdict on one rule, for one scene or over all.
@@ -29,7 +29,7 @@ EXIT_CODES: Mapping[Verdict, int] = {"passes": 0, "fails": 4, "undecided": 5}
 """Exit codes of the command, by the outcome."""
 
 
-def verdict(rule: Rule, interval: Interval) -> Verdict:
+def verdict(rule: GateRule, interval: Interval) -> Verdict:
     """Return the verdict on a rule from an interval, each end of which is missed with the gate's level.
 
     A rule passes if the whole interval is within the limit, and fails if the whole interval is outside. A loss fails as
@@ -67,7 +67,7 @@ class Judgement:
         new, base: The numbers of both runs, NaN without a number.
     """
 
-    rule: Rule
+    rule: GateRule
     verdict: Verdict
     interval: Interval
     new: float

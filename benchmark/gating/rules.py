@@ -126,7 +126,7 @@ RULE = re.compile(
 
 
 @dataclass(frozen=True)
-class Rule:
+class GateRule:
     """A condition on a measure.
 
     Attributes:
@@ -146,7 +146,7 @@ class Rule:
     class_name: str | None = None
     or_equal: bool = False
 
-    def of_each(self, classes: Sequence[str]) -> tuple[Rule, ...]:
+    def of_each(self, classes: Sequence[str]) -> tuple[GateRule, ...]:
         """Return the rules that this one stands for: itself, or with 'class *' one for each class."""
         if self.class_name != ALL:
             return (self,)
@@ -161,7 +161,7 @@ class Rule:
         return self.below and self.change == loss
 
 
-def parse(text: str) -> Rule:
+def parse(text: str) -> GateRule:
     """Return a rule from its text.
 
     Raises:
@@ -181,7 +181,7 @@ def parse(text: str) -> Rule:
     if result["change"]:
         change = "drop" if result["change"].lower() == "drop" else "rise"
     relation = result["relation"]
-    rule = Rule(
+    rule = GateRule(
         text.strip(), measure, change, relation[0] == "<", limit, result["scene"], result["class"], len(relation) > 1
     )
     _check_rule(rule)
@@ -200,7 +200,7 @@ def _change_meant(name: str) -> tuple[str, str] | None:
     return (word, near[0]) if near and _plain(measure) in names and _plain(name) not in names else None
 
 
-def _check_rule(rule: Rule) -> None:
+def _check_rule(rule: GateRule) -> None:
     name = rule.measure.name
     if not math.isfinite(rule.limit):
         raise ConfigError(f"rule '{rule.text}': its number is too large")

@@ -32,9 +32,9 @@ from semstab.statistics.intervals import estimate, scope_of
 from semstab.statistics.verdict import verdict
 
 OF_TRUTH: Mapping[Number, Column] = {
-    "accuracy": Column.of(ACCURACY),
-    "miou": Column.of(MIOU),
-    "wrong_of_consistent": Column.of(MISLEADING),
+    "accuracy": Column.for_quantity(ACCURACY),
+    "miou": Column.for_quantity(MIOU),
+    "wrong_of_consistent": Column.for_quantity(MISLEADING),
 }
 """The columns that need ground truth."""
 
@@ -60,7 +60,7 @@ class SceneNumbers:
     truth: Mapping[Number, Interval]
 
     @classmethod
-    def of(cls, sums: ClusterSums, spots: Spots) -> SceneNumbers:
+    def from_sums(cls, sums: ClusterSums, spots: Spots) -> SceneNumbers:
         """Return the numbers of sums that were checked."""
         complete = completed(sums, spots)
         alpha, of_labelled = (estimate(part, "alpha", scope=scope_of(part)) for part in (complete, sums))
@@ -211,7 +211,7 @@ def board_of(benchmark: Benchmark, results: Sequence[Result]) -> Board:
         raise DataError(f"{first} and {second}: both are called '{twice}'; name one otherwise in its card")
     places, geometry = benchmark.places(), benchmark.geometry
     numbers = {
-        name: {scene: SceneNumbers.of(handle.scenes[scene].sums, geometry[scene]) for scene in benchmark.scenes}
+        name: {scene: SceneNumbers.from_sums(handle.scenes[scene].sums, geometry[scene]) for scene in benchmark.scenes}
         for name, (_, _, handle) in zip(names, results, strict=True)
     }
     unranked = _unranked(numbers)

@@ -178,7 +178,7 @@ class _Rows:
     drift_sum: Float64
 
     @classmethod
-    def of(cls, table: VoxelTable, rows: Int64) -> _Rows:
+    def from_table(cls, table: VoxelTable, rows: Int64) -> _Rows:
         return cls(table.op[rows], table.evidence[rows], table.drift_sum[rows])
 
 
@@ -192,7 +192,7 @@ class _Difference(NamedTuple):
 
 def _differences(a: VoxelTable, b: VoxelTable, in_a: Int64, in_b: Int64, tolerance: float) -> dict[str, _Difference]:
     """Return the differences of each quantity: columns, then measures, then the label."""
-    rows_a, rows_b = _Rows.of(a, in_a), _Rows.of(b, in_b)
+    rows_a, rows_b = _Rows.from_table(a, in_a), _Rows.from_table(b, in_b)
 
     def values(name: str) -> tuple[npt.NDArray[Any], npt.NDArray[Any]]:
         if name == "evidence":

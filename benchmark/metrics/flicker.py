@@ -348,7 +348,7 @@ def matched_region_flicker(
         sizes = " and ".join(f"{W}x{H}" for H, W in (previous.shape, current.shape))
         raise DataError(f"region maps differ in size ({sizes}); bring them to one size")
     counted = slice(None) if valid is None else valid
-    table = _Contingency.of(previous[counted].ravel(), current[counted].ravel())
+    table = _Contingency.between(previous[counted].ravel(), current[counted].ravel())
     pairs = table.pairs(iou_threshold)
     stayed = table.both_unassigned + sum(int(table.shared[pair]) for pair in pairs)
     return RegionChange(
@@ -393,7 +393,7 @@ class _Contingency:
     shared: Int64
 
     @classmethod
-    def of(cls, previous: Regions, current: Regions) -> _Contingency:
+    def between(cls, previous: Regions, current: Regions) -> _Contingency:
         previous_ids, p = np.unique(previous, return_inverse=True)
         current_ids, q = np.unique(current, return_inverse=True)
         shape = (len(previous_ids), len(current_ids))

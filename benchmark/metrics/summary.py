@@ -48,7 +48,7 @@ def summarise(table: VoxelTable, edges: Sequence[int] = STRATA) -> TableSummary:
     edges are the strata's upper bounds of OP, ascending; a last stratum holds the voxels above. Each mean runs over the
     voxels where its measure is defined; over no voxel it is NaN.
     """
-    return TableSums.of(table, edges).summary(table.voxel_size, table.classes, edges)
+    return TableSums.from_table(table, edges).summary(table.voxel_size, table.classes, edges)
 
 
 @dataclass(frozen=True, eq=False)
@@ -81,7 +81,7 @@ class TableSums:
         return cls(np.zeros(3), stratum, kind, recurrence, step, np.zeros(len(CATEGORIES)), np.zeros((C, C)))
 
     @classmethod
-    def of(cls, table: VoxelTable, edges: Sequence[int] = STRATA) -> TableSums:
+    def from_table(cls, table: VoxelTable, edges: Sequence[int] = STRATA) -> TableSums:
         """Return the sums of a table."""
         table = table.summing_to_op()
         steps = _steps(edges)

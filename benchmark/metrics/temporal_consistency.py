@@ -93,9 +93,9 @@ class TemporalConsistency:
     @property
     def value(self) -> float:
         """TC of the videos so far, 0 to 1; NaN if no pixel counts."""
-        return self.of(self.form)
+        return self.score(self.form)
 
-    def of(self, form: Form) -> float:
+    def score(self, form: Form) -> float:
         """Return TC of the same pairs in another form."""
         if form == "ssp":
             videos = [*self._videos, *([float(np.mean(self._pairs))] if self._pairs else [])]

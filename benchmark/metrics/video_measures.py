@@ -106,4 +106,4 @@ def image_of(frame: Frame, shape: tuple[int, int]) -> UInt8:
 
 def _overlap(metric: TemporalConsistency) -> WarpedOverlap:
     sums = tuple(tuple(row) for row in metric.sums.tolist())
-    return WarpedOverlap(metric.of("vspw"), metric.of("etc"), metric.of("ssp"), sums)
+    return WarpedOverlap(metric.score("vspw"), metric.score("etc"), metric.score("ssp"), sums)

@@ -43,7 +43,7 @@ class FusedResult(Result):
         record = self.record()
         assert record.statistics is not None
         flicker = record.image_space.compensated_flicker_percent
-        return Summary.of(record.frames, record.map_summary, record.statistics, flicker)
+        return Summary.from_statistics(record.frames, record.map_summary, record.statistics, flicker)
 
     def report(self, path: str | Path) -> Path:
         """Write report.html, one file without a network; return its path."""
@@ -110,7 +110,7 @@ def fuse(
     sequence, token = Sequence(frames), uuid.uuid4().hex
     Frames.sequences[token] = sequence
     options = {"token": token, "scene": scene, "model": model, "classes": tuple(classes)}
-    fused_by = BackendConfig.of(backend).fusing_by(rule)
+    fused_by = BackendConfig.parse(backend).fusing_by(rule)
     content = {"name": scene, "dataset": {"name": "frames", "options": options}, "backends": [fused_by], **settings}
     config = as_config(content if voxel_size is None else {**content, "voxel_size": voxel_size})
     folder = ScratchFolder()

@@ -98,7 +98,7 @@ class State:
     def summary(self) -> Summary:
         """Return the numbers of a run of these frames."""
         analysis = analyse(MapSample.draw(self._table()), self.spots, features=self.features)
-        return Summary.of(self.frames, analysis.table, analysis.summary, self._flicker)
+        return Summary.from_statistics(self.frames, analysis.table, analysis.summary, self._flicker)
 
     def _table(self) -> VoxelTable:
         """Return the map; of a voxel that two processes saw, SBD is the mean over the steps that were taken."""

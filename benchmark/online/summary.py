@@ -51,7 +51,7 @@ class Summary:
     feature_alpha_high: float = math.nan
 
     @classmethod
-    def of(cls, frames: int, table: TableSummary, statistics: MapStatistics, flicker: float) -> Summary:
+    def from_statistics(cls, frames: int, table: TableSummary, statistics: MapStatistics, flicker: float) -> Summary:
         """Return the summary of a map's statistics."""
         verdict, alpha = statistics.verdict, statistics.headline.alpha
         of_features = UNKNOWN if statistics.features is None else statistics.features.alpha

@@ -119,8 +119,8 @@ def compare_maps(
     result = load_result(folder)
     record = result.record(scene=scene, model=model, backend=backend)
     first = ExportedUnit(result, record, columns=("op",)).first
-    target = RunClasses.of(first.classes, first.colors, first.taxonomy)
-    ours, compared = RunMap.of(record, first.classes), []
+    target = RunClasses.from_taxonomy(first.classes, first.colors, first.taxonomy)
+    ours, compared = RunMap.from_record(record, first.classes), []
     for path, name in zip(map(Path, others), _names(others), strict=True):
         cloud = read_cloud(path, field)
         system = _system(cloud, frame, first.georeference)

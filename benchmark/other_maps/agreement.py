@@ -39,7 +39,7 @@ class RunMap:
     true: Int64 | None
 
     @classmethod
-    def of(cls, record: Record, classes: tuple[str, ...]) -> RunMap:
+    def from_record(cls, record: Record, classes: tuple[str, ...]) -> RunMap:
         """Read the map of a unit, and its ground truth if the run fused it.
 
         Raises:

@@ -42,7 +42,7 @@ class RunClasses:
     row_of: Mapping[str, int]
 
     @classmethod
-    def of(cls, classes: tuple[str, ...], colors: UInt8, taxonomy: str) -> RunClasses:
+    def from_taxonomy(cls, classes: tuple[str, ...], colors: UInt8, taxonomy: str) -> RunClasses:
         """Return the classes of a run; a taxonomy that ships has ids and members of each class."""
         row_of = {name_key(name): row for row, name in enumerate(classes)}
         try:

@@ -13,7 +13,7 @@ from typing import Any, ClassVar, cast
 import numpy as np
 import numpy.typing as npt
 
-from semstab.core.registry import Entry, Registry
+from semstab.core.registry import Registration, Registry
 from semstab.core.types import Float32, UInt16
 from semstab.data.frames import Frame
 from semstab.data.labels import LabelSpace, ignore_id
@@ -28,16 +28,16 @@ Belief = Float32
 REGISTRY = Registry(
     "filter",
     {
-        "ema": Entry(
+        "ema": Registration(
             "semstab.predict.filters:Ema",
             "KEEP: running mean of a pixel; KEEP weighs its past",
         ),
-        "ema-warped": Entry(
+        "ema-warped": Registration(
             "semstab.predict.filters:EmaWarped",
             "KEEP: running mean of a surface point, by its pose",
         ),
-        "vote": Entry("semstab.predict.filters:Vote", "N: majority of the pixel's last N labels"),
-        "guided": Entry(
+        "vote": Registration("semstab.predict.filters:Vote", "N: majority of the pixel's last N labels"),
+        "guided": Registration(
             "semstab.predict.filters:Guided",
             "PIXELS: guided filter; borders follow the image",
         ),

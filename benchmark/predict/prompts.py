@@ -16,7 +16,7 @@ CHANGE = re.compile(r",(without|add|rename)=")
 
 
 @dataclass(frozen=True)
-class Changes:
+class VocabularyChanges:
     """Names that are taken out of a vocabulary, added to it, or renamed.
 
     Attributes:

@@ -20,7 +20,7 @@ from semstab.core.types import Float32, Float64, Int64, UInt8, UInt16
 from semstab.data.features import Features
 from semstab.data.labels import IGNORE_8BIT, IGNORE_16BIT, LabelSpace
 from semstab.errors import ConfigError, DataError, MissingDependencyError, nearest
-from semstab.predict.prompts import EACH, Changes
+from semstab.predict.prompts import EACH, VocabularyChanges
 
 MOST_BYTES = 1 << 28
 """The largest file of embeddings."""
@@ -203,7 +203,7 @@ class VocabularyFile:
         ends = np.cumsum([len(entry.words) for entry in settings.names])
         return cls(path, settings, tuple(np.split(embeddings, ends[:-1])))
 
-    def changed(self, changes: Changes) -> VocabularyFile:
+    def changed(self, changes: VocabularyChanges) -> VocabularyFile:
         """Return what the file would hold with other names; a new name is encoded like the names of the file.
 
         Raises:
@@ -298,15 +298,15 @@ def named(vocabularies: Sequence[Path]) -> dict[str, Vocabulary]:
     'FILE,without=each' stands for the vocabulary of the file, and for the same without each of its names.
 
     Raises:
-        ConfigError: If two have one name, and what `Changes.parse` and `VocabularyFile` raise.
+        ConfigError: If two have one name, and what `VocabularyChanges.parse` and `VocabularyFile` raise.
     """
-    wanted = dict.fromkeys(Changes.parse(str(path)) for path in vocabularies)
+    wanted = dict.fromkeys(VocabularyChanges.parse(str(path)) for path in vocabularies)
     files = {file: VocabularyFile.load(file) for file in dict.fromkeys(file for file, _ in wanted)}
-    listed: dict[tuple[Path, Changes], None] = {}
+    listed: dict[tuple[Path, VocabularyChanges], None] = {}
     for file, changes in wanted:
         if EACH in changes.without:
-            removals = (Changes(without=(entry.name,)) for entry in files[file].settings.names)
-            listed |= dict.fromkeys((file, variant) for variant in (Changes(), *removals))
+            removals = (VocabularyChanges(without=(entry.name,)) for entry in files[file].settings.names)
+            listed |= dict.fromkeys((file, variant) for variant in (VocabularyChanges(), *removals))
         else:
             listed[file, changes] = None
     by_name: dict[str, Vocabulary] = {}

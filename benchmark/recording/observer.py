@@ -114,7 +114,7 @@ class GroupLog:
             image = rr.SegmentationImage(picture, draw_order=-10)
             stream.log(self._picture(name), image, *self._placed(name, picture_stride))
         if frame.features is not None:  # in the colours of the first frame
-            self._colours = self._colours or FeatureColours.of(frame.features)
+            self._colours = self._colours or FeatureColours.from_features(frame.features)
         if frame.features is not None and self._colours is not None and self._colours.fit(frame.features):
             colours = frame.features.image(self._colours(frame.features), frame.shape, 0)[::stride, ::stride]
             image_of_features = rr.Image(np.ascontiguousarray(colours), draw_order=-5).compress(jpeg_quality=90)
@@ -512,5 +512,5 @@ def _plan_of(run: Path, config: Config, result: Result) -> Plan:
         assert record.series is not None
         frames = [frame for frame, *_ in timeline.read_rows(record.series)]
         task = Task(cast(Scene, scene), unit.model, frames, space.mapping_to(space), (unit.backend,))
-        units.append(Unit.of(record.variation, config, task, record.key, stored=True))
+        units.append(Unit.from_task(record.variation, config, task, record.key, stored=True))
     return Plan(config, {}, tuple(units), ())

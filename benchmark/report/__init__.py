@@ -51,7 +51,7 @@ class Reporting(Observer):
         if table is not None and isinstance(record, Record) and record.up is not None and unit.image_space:
             from semstab.report.places import ShownMap
 
-            self._shown[unit.name.slug] = self._beside.submit(partial(ShownMap.of, record, table))
+            self._shown[unit.name.slug] = self._beside.submit(partial(ShownMap.from_record, record, table))
 
     def run_finished(self, result: Result) -> None:
         """Write tables and report, or nothing where every unit failed."""

@@ -136,7 +136,7 @@ class RepeatSpread:
     repeats: int
 
     @classmethod
-    def of(cls, values: Sequence[float]) -> RepeatSpread:
+    def from_values(cls, values: Sequence[float]) -> RepeatSpread:
         """Return the statistics of the repeats where the value is defined."""
         defined = [value for value in values if not math.isnan(value)]
         sd = statistics.stdev(defined) if len(defined) > 1 else math.nan
@@ -152,7 +152,7 @@ class Level:
 
     def spread(self, measure: Callable[[Pooled], float]) -> RepeatSpread:
         """Return a measure over the repeats."""
-        return RepeatSpread.of([measure(repeat) for repeat in self.repeats])
+        return RepeatSpread.from_values([measure(repeat) for repeat in self.repeats])
 
     def mean(self, measure: Callable[[Pooled], float]) -> float:
         """Return the measure's mean over the repeats."""

@@ -293,7 +293,7 @@ def _map(
     shades = [NOT_ASSESSED] * len(CATEGORIES) if silent else CATEGORY_COLORS
     palette = np.array([(k * 67 % 256, k * 131 % 256, k * 29 % 256) for k in range(table.K)], dtype=np.uint8)
     palette = palette if overview is None else overview.palette
-    cell, located = step * above.cell, Located.of(above, georeference)
+    cell, located = step * above.cell, Located.from_view(above, georeference)
     size = rows.shape[1] * cell, rows.shape[0] * cell
     cut = any(all_of_it > 1.02 * extent + 2 * cell for all_of_it, extent in zip(above.whole, size, strict=True))
     of_whole = f" of {above.whole[0]:.3g} m by {above.whole[1]:.3g} m (without outlying voxels)" if cut else ""

@@ -38,9 +38,9 @@ class ShownMap:
     places: Sequence[Place]
 
     @classmethod
-    def of(cls, record: Record, table: VoxelTable) -> ShownMap:
+    def from_record(cls, record: Record, table: VoxelTable) -> ShownMap:
         """Find both in the voxels of a unit, which are in memory; up must be known."""
-        return cls(FromAbove.of(table, np.asarray(record.up)), places_of(record, LISTED, table))
+        return cls(FromAbove.from_table(table, np.asarray(record.up)), places_of(record, LISTED, table))
 
 
 def frame_names(record: Record) -> dict[int, str]:

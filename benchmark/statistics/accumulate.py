@@ -57,7 +57,7 @@ class Cubes:
     edge: float
 
     @classmethod
-    def of(cls, table: VoxelTable, edge: float | None = None, *, where: Mask | None = None) -> Cubes:
+    def from_table(cls, table: VoxelTable, edge: float | None = None, *, where: Mask | None = None) -> Cubes:
         """Return the cubes of a table, without the voxels for which `where` (n,), OP >= 2 if not given, does not hold.
 
         There are at most MOST_CELLS cubes, unless their edge is given, in metres.
@@ -138,7 +138,7 @@ def cluster_sums_of(
         cubes: The cubes, if they are known already.
         consistent: (n,) the stability posterior, if it is known already.
     """
-    cubes = Cubes.of(table, edge) if cubes is None else cubes
+    cubes = Cubes.from_table(table, edge) if cubes is None else cubes
     likely = (
         None
         if true_label is None
@@ -216,7 +216,7 @@ def _sums_of_log(
     consistent = np.zeros(0) if likely is None else likely
     in_chunks(
         add_influences, order, bounds, (events.starts, events.ends), longest, events.evidence.entries, K, group,
-        fused_label, label, consistent, FirstColumns.of(K, truth=truth), len(groups), sums,
+        fused_label, label, consistent, FirstColumns.for_classes(K, truth=truth), len(groups), sums,
     )  # fmt: skip
     if square is not None:
         counted = np.flatnonzero(cubes.at[events.voxel] >= 0)

@@ -82,9 +82,9 @@ class Predictions:
     K: int
 
     @classmethod
-    def of(cls, evidence: Float64 | Evidence, label: Int64) -> Predictions:
+    def from_evidence(cls, evidence: Float64 | Evidence, label: Int64) -> Predictions:
         """Return predictions from evidence (n, K), up to a factor; they mean nothing where the label is -1."""
-        evidence = Evidence.of(evidence)
+        evidence = Evidence.from_rows(evidence)
         spread, of = evidence.concentration, np.repeat(np.arange(len(evidence)), np.diff(evidence.starts))
         total = np.bincount(of, weights=evidence.weight, minlength=len(evidence))
         hit, hits = evidence.label == label[of], np.zeros(len(evidence))
@@ -101,7 +101,7 @@ class Predictions:
 
 def correctness(belief: Float64 | Evidence, label: Int64, name: str = "all") -> Correctness:
     """Return accuracy and calibration of beliefs (n, K) whose true classes are (n,)."""
-    return correctness_of(prediction_sums(Predictions.of(belief, label), label >= 0), name)
+    return correctness_of(prediction_sums(Predictions.from_evidence(belief, label), label >= 0), name)
 
 
 @dataclass(frozen=True, eq=False)
@@ -192,7 +192,7 @@ def reliability_of(sums: PredictionSums) -> tuple[Reliability, ...]:
 
 def reliability(belief: Float64 | Evidence, label: Int64) -> tuple[Reliability, ...]:
     """Return the bins of the reliability diagram (Guo et al. 2017, ICML) of beliefs (n, K) and true classes (n,)."""
-    return reliability_of(prediction_sums(Predictions.of(belief, label), label >= 0))
+    return reliability_of(prediction_sums(Predictions.from_evidence(belief, label), label >= 0))
 
 
 def by_stratum(predictions: Predictions, op: Int32, has_truth: Mask, edges: Sequence[int]) -> tuple[Correctness, ...]:
@@ -222,7 +222,7 @@ def quadrants(table: VoxelTable, truth: Truth, consistent: Float64, edge: float,
     counted, likely, right = _masks(table, truth, consistent)
     if not (counted.any() and table.counts_frames):
         return Quadrants(0, *[UNKNOWN] * 5)
-    cubes = Cubes.of(table, edge, where=counted)
+    cubes = Cubes.from_table(table, edge, where=counted)
     parts = (likely * right, likely * ~right, (1 - likely) * right, (1 - likely) * ~right)
     sums = cubes.named(cubes.means(dict(zip(QUADRANTS, parts, strict=True))))
     shares = {name: estimate(sums, mean_functional(name)) for name in QUADRANTS}

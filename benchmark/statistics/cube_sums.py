@@ -102,7 +102,7 @@ class FlippingSums:
     together: Float64
 
     @classmethod
-    def of(cls, table: VoxelTable, consistent: Float64, cubes: Cubes) -> FlippingSums:
+    def from_table(cls, table: VoxelTable, consistent: Float64, cubes: Cubes) -> FlippingSums:
         """Return the sums of a table by the stability posterior (n,), over the cubes of its voxels with OP >= 2."""
         inconsistent = np.round((1 - consistent) / UNIT) * UNIT
         share = cubes.named(cubes.means({"inconsistent": inconsistent}))

@@ -128,7 +128,7 @@ class FeatureStore:
         """Return a copy of the answers so far, whose spots and views a sample of the same frames has."""
         n, one_in = self._count, max(1, spots.share // self.share)
         answers = self._spot[:n].copy(), self._view[:n].copy(), self._vectors[:n].copy()
-        return FeatureObservations.of(*answers, spots, one_in)
+        return FeatureObservations.from_answers(*answers, spots, one_in)
 
 
 def _longer(array: npt.NDArray[Any], length: int) -> npt.NDArray[Any]:
@@ -153,7 +153,7 @@ class FeatureObservations:
     one_in: int = 1
 
     @classmethod
-    def of(
+    def from_answers(
         cls, spot: Int32, view: Int32, vectors: npt.NDArray[np.float16], spots: SpotObservations, one_in: int = 1
     ) -> FeatureObservations:
         """Build them from answers (a,) with vectors (a, D), and a sample that has their spots and views."""
@@ -173,7 +173,7 @@ class FeatureObservations:
         """Read a file that `save` wrote, of the frames of a sample."""
         with np.load(path) as content:
             answers = content["spot"], content["view"], content["vectors"]
-            return cls.of(*answers, spots, int(content["one_in"]))
+            return cls.from_answers(*answers, spots, int(content["one_in"]))
 
     def __len__(self) -> int:
         """Return the number of observations: spots and views."""

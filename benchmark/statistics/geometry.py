@@ -87,7 +87,7 @@ def losses(table: VoxelTable, limit: VoxelTable) -> Losses:
     repeated = (table.op[rows] >= 2) & (limit.op[limit_rows] >= 2)
     rows, limit_rows = rows[repeated], limit_rows[repeated]
     total, geometry = 1 - psa(table)[rows], 1 - psa(limit)[limit_rows]
-    cubes = Cubes.of(table.rows(rows), where=np.ones(len(rows), np.bool_))
+    cubes = Cubes.from_table(table.rows(rows), where=np.ones(len(rows), np.bool_))
     means = cubes.means({"total": total, "geometry": geometry, "model": total - geometry})
     means["share"] = np.stack([means["geometry"][:, 0], means["total"][:, 0]], axis=1)
     sums = cubes.named(means)

@@ -45,7 +45,7 @@ class Coincidences:
     pairs: Float64
 
     @classmethod
-    def of(cls, counted: Float64) -> Coincidences:
+    def from_counts(cls, counted: Float64) -> Coincidences:
         """Build them from numbers of pairs (K, K)."""
         total = float(counted.sum())
         return cls(counted / total if total > 0 else counted)
@@ -166,10 +166,10 @@ def groupings(
     if not (sums.answers and 2 < K <= MOST_CLASSES):
         return None
     pairs = halves_of(spots, sums)
-    coincidences = Coincidences.of(pairs.sum(axis=0))
+    coincidences = Coincidences.from_counts(pairs.sum(axis=0))
     if not (steps := merges_of(coincidences)):
         return None
-    less = flattery([Coincidences.of(half) for half in pairs], len(steps))
+    less = flattery([Coincidences.from_counts(half) for half in pairs], len(steps))
     names = spots.classes or tuple(str(k) for k in range(K))
     merges = []
     for n, step in enumerate(steps):

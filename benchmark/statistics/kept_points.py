@@ -59,7 +59,7 @@ class KeptPoints:
     near: UInt16
 
     @classmethod
-    def of(
+    def from_points(
         cls,
         view: int,
         T_wc: Float64,

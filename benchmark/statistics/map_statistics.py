@@ -207,7 +207,7 @@ def analyse(
     shares = shares_of(table)
     consistent = consistency_posterior(table, shares)
     null = expected_sbd(table, events, seed=seed)
-    columns, cubes = row_columns(table, null), Cubes.of(table)
+    columns, cubes = row_columns(table, null), Cubes.from_table(table)
     sums = cluster_sums_of(
         table, events, true_label, spots=spots, sbd_excess=columns["sbd_excess"], cubes=cubes, consistent=consistent
     )
@@ -223,7 +223,7 @@ def analyse(
     repeats = map_summary.means.voxels[SBD.key]
     repeated = Repeated(repeats, repeats / map_summary.voxels if map_summary.voxels else math.nan)
     headline, means = headline_of(sums, scope), _means(locations, sums, scope)
-    flips = FlippingSums.of(table, consistent, cubes).flipping(table.classes)
+    flips = FlippingSums.from_table(table, consistent, cubes).flipping(table.classes)
     lone = None if spots is None else lone_disagreement(spots)
     of_spots: dict[str, Any] = dict.fromkeys(OF_SPOTS)
     if spots is not None:
@@ -350,7 +350,7 @@ def _correctness(
     edges: Sequence[int],
     headline: HeadlineStatistics,
 ) -> CorrectnessStatistics:
-    predictions = Predictions.of(table.evidence, truth.label)
+    predictions = Predictions.from_evidence(table.evidence, truth.label)
     repeated = prediction_sums(predictions, truth.known & (table.op >= 2))
     miou = estimate(sums, MIOU.key, scope=scope_of(sums, headline.accuracy_op2.scope, MIOU.key))
     if math.isnan(miou.value):  # more than MOST_CLASSES classes have no sums by class

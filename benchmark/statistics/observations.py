@@ -52,7 +52,7 @@ class Views:
         return len(self.frame)
 
     @classmethod
-    def of(cls, rows: Sequence[Sequence[float]] | Float64) -> Views:
+    def from_rows(cls, rows: Sequence[Sequence[float]] | Float64) -> Views:
         """Build views from rows (V, 6).
 
         Raises:
@@ -317,7 +317,7 @@ class SpotObservations:
             about = parse_json((content.schema.metadata or {})[b"semstab"])
             if (about.pop("kind"), about.pop("schema")) != ("SpotObservations", SCHEMA):
                 raise DataError("it is of another kind or version; run it again")
-            views = Views.of(about.pop("views"))
+            views = Views.from_rows(about.pop("views"))
             about["classes"] = tuple(about["classes"])
             if "distances" in about:
                 about["distances"] = np.array(about["distances"], np.float64).reshape(about["K"], about["K"])
@@ -337,7 +337,7 @@ class SpotObservations:
             cell_hash = arrays.values_of(content.column("drawn")).astype(np.uint32)
             if "votes" in about:
                 counts = {name: arrays.values_of(content.column(name)) for name in OF_SPOTS}
-                about["votes"] = SpotVotes.of(counts, about["votes"])
+                about["votes"] = SpotVotes.from_columns(counts, about["votes"])
             read = cls(**columns, point=point.astype(np.float64), drawn=cell_hash, views=views, **about)
             read._require_sound()
             return read

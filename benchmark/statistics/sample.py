@@ -60,7 +60,7 @@ class MapSample:
         if truth is not None:
             require_same_grid(table, truth)
         table = table.summing_to_op()
-        summary = TableSums.of(table, edges)
+        summary = TableSums.from_table(table, edges)
         if len(table) > most:
             rows = _drawn(table, most)
             table, events = table.rows(rows), None if events is None else events.rows(rows)

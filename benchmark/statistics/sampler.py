@@ -145,7 +145,7 @@ class Sampler:
         few = few[(few > 0) & (few < np.inf)]
         if not len(few):
             few = frame.depth[(frame.depth > 0) & (frame.depth < np.inf)]
-        sparse = SparseDepth.of(frame, self.K)
+        sparse = SparseDepth.from_frame(frame, self.K)
         view = self._view_of(frame, float(np.median(few)), sparse) if len(few) else None
         if view is None:
             return
@@ -242,7 +242,7 @@ class Sampler:
                 self._memory.add(KeptDepth.of_image(view, T.copy(), pinhole(frame.intrinsics), fixed(frame.depth)))
             return
         points, place = (sparse.u, sparse.v, sparse.w), (sparse.camera, sparse.around, sparse.spacing)
-        depth = KeptPoints.of(view, T.copy(), *place, sparse.grid.shape, points)
+        depth = KeptPoints.from_points(view, T.copy(), *place, sparse.grid.shape, points)
         self._firm[new] = depth.at_points(self._point[new], self._sigma)
         if self._memory.wants(view):
             self._memory.add(depth)
@@ -364,7 +364,7 @@ class Sampler:
             **answers,
             point=self._point[: self._spots].copy(),
             drawn=self._hash[: self._spots].copy(),
-            views=Views.of(self._views.table().copy()),
+            views=Views.from_rows(self._views.table().copy()),
             spacing=self._spacing if len(self._views) else 1.0,
             K=self.K,
             share=self._share,
@@ -379,7 +379,7 @@ class Sampler:
         """
         if self._memory is None:
             raise ValueError("no depth of views is kept; make the sampler with moving=True")
-        sparse = of_lidar(SparseDepth.of(frame, self.K))
+        sparse = of_lidar(SparseDepth.from_frame(frame, self.K))
         return self._memory.moving_pixels(frame, self._sigma, votes.misplaced, self._spacing, sparse=sparse)
 
     def _votes(self) -> SpotVotes | None:

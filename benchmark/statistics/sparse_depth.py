@@ -51,7 +51,7 @@ class SparseDepth:
     labels: UInt16 | None = None
 
     @classmethod
-    def of(cls, frame: Frame, K: int) -> SparseDepth | None:
+    def from_frame(cls, frame: Frame, K: int) -> SparseDepth | None:
         """Return the points of a scan, or the pixels with depth of an image with sparse depth; None of another image.
 
         Args:

@@ -246,7 +246,7 @@ class Effects:
     error: Float64 | None
 
     @classmethod
-    def of(cls, grid: Influences) -> Effects:
+    def from_influences(cls, grid: Influences) -> Effects:
         """Fit the model to influences."""
         occupied = grid.size.sum(axis=1) > 0
         cell, size = grid.cell[occupied], grid.size[occupied]
@@ -383,7 +383,7 @@ def spread_of(grid: Influences, scope: Scope) -> Spread:
     largest = float(np.abs(grid.block).max(initial=np.abs(grid.cell).max(initial=0.0)))
     if largest < ROUNDING:
         return EXACT
-    effects = Effects.of(grid)
+    effects = Effects.from_influences(grid)
     noise = Variances(np.ones(1), np.array([effects.noise]))
     if scope == THESE_FRAMES:
         parts = effects.locations.plus(noise)
@@ -398,11 +398,11 @@ def spread_of_flights(one: Influences, other: Influences, between: Influences, s
     """Return the spread of the difference of two flights over the same locations, each with frames of its own."""
     if scope == THESE_FRAMES:
         return spread_of(between, scope)
-    effects = [Effects.of(one), Effects.of(other)]
+    effects = [Effects.from_influences(one), Effects.from_influences(other)]
     noise = effects[0].noise + effects[1].noise
     parts = effects[0].frames.plus(effects[1].frames).plus(Variances(np.ones(1), np.array([noise])))
     if scope != THIS_SCENE:
-        parts = parts.plus(Effects.of(between).locations)
+        parts = parts.plus(Effects.from_influences(between).locations)
     return parts.spread() if (parts.variance > 0).all() else EXACT
 
 

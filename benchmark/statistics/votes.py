@@ -136,7 +136,7 @@ class SpotVotes:
         return {"through_of_view": shares, **lists, "gap": self.gap}
 
     @classmethod
-    def of(cls, columns: Mapping[str, npt.NDArray[Any]], of_views: Mapping[str, Any]) -> SpotVotes:
+    def from_columns(cls, columns: Mapping[str, npt.NDArray[Any]], of_views: Mapping[str, Any]) -> SpotVotes:
         """Build votes from columns (n,) by name, and what `of_views` returned.
 
         Raises:

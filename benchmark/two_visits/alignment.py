@@ -56,10 +56,10 @@ class Alignment:
             rows.append(row)
         if len(rows) < LEAST_POINTS:
             raise DataError(f"{file}: {len(rows)} points; give {LEAST_POINTS} or more that both visits know")
-        return cls.of(np.array(rows)[:, :3], np.array(rows)[:, 3:], str(file))
+        return cls.between(np.array(rows)[:, :3], np.array(rows)[:, 3:], str(file))
 
     @classmethod
-    def of(cls, first: Float64, second: Float64, where: str = "points") -> Alignment:
+    def between(cls, first: Float64, second: Float64, where: str = "points") -> Alignment:
         """Fit points (n, 3) of the second visit to those of the first one, by least squares (Kabsch 1976).
 
         Raises:

@@ -16,7 +16,7 @@ from semstab.datasets.bag.cameras import camera_of, is_rectified
 from semstab.datasets.bag.options import BagOptions
 from semstab.datasets.bag.poses import SensorPoses
 from semstab.datasets.bag.reading import NANOSECONDS, MessagePosition, OpenBag, stamp_of
-from semstab.datasets.bag.topics import ChosenTopics, Images, choose
+from semstab.datasets.bag.topics import ChosenTopics, ImageTopic, choose
 from semstab.datasets.geometry.cameras import Camera, nearest
 from semstab.datasets.geometry.lenses import Lens
 from semstab.errors import DataError
@@ -157,7 +157,7 @@ def read_once(bag: OpenBag, options: BagOptions) -> Content:
 
 
 def _camera(
-    bag: OpenBag, options: BagOptions, topic: str, message: object, images: Images
+    bag: OpenBag, options: BagOptions, topic: str, message: object, images: ImageTopic
 ) -> tuple[Camera, Lens | None]:
     rectified = is_rectified(images.base) if options.rectified is None else options.rectified
     return camera_of(message, f"{bag.path}, {topic}", rectified=rectified)

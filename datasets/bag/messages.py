@@ -11,7 +11,7 @@ from typing import Any
 
 from semstab.datasets.bag.images import content
 from semstab.datasets.bag.reading import MessagePosition, OpenBag
-from semstab.datasets.bag.topics import Images
+from semstab.datasets.bag.topics import ImageTopic
 from semstab.datasets.files.options import Folders
 from semstab.datasets.formats.disk import digest
 
@@ -39,7 +39,7 @@ class TopicFolder:
 
     @classmethod
     def of_images(
-        cls, bag: OpenBag, images: Images, places: Sequence[MessagePosition | None], *, color: bool
+        cls, bag: OpenBag, images: ImageTopic, places: Sequence[MessagePosition | None], *, color: bool
     ) -> TopicFolder:
         """Return the folder of the images of a topic, those of `color` as RGB."""
 
@@ -72,11 +72,11 @@ class Messages(Folders):
         self._topics = {str(folder.path): folder for folder in folders}
         self._index: Mapping[str, int] = {name: k for k, name in enumerate(frames)}
 
-    def folder(self, images: Images) -> Path:
+    def folder(self, images: ImageTopic) -> Path:
         """Return the folder of the images of a topic."""
         return topic_path(self._bag, images.topic)
 
-    def file(self, images: Images, frame: str) -> Path:
+    def file(self, images: ImageTopic, frame: str) -> Path:
         """Return the file of a frame's image."""
         return self.folder(images) / f"{frame}{images.kind.suffix}"
 

@@ -26,7 +26,7 @@ TRANSPORT = re.compile(r"/(?:compressed|compressedDepth)$")
 
 
 @dataclass(frozen=True)
-class Images:
+class ImageTopic:
     """A topic of images: how they are stored, and the frame of the first one."""
 
     topic: str
@@ -56,9 +56,9 @@ class ChosenTopics:
         others: Other topics that could be depth or colour.
     """
 
-    depth: Images | None
-    color: Images | None
-    labels: dict[str, Images]
+    depth: ImageTopic | None
+    color: ImageTopic | None
+    labels: dict[str, ImageTopic]
     depth_info: str | None
     color_info: str | None
     others: tuple[str, ...]
@@ -119,7 +119,7 @@ def has_depth(bag: OpenBag) -> bool:
     return any(is_depth(candidate) and not LABELS.search(candidate.topic.lower()) for candidate in images.values())
 
 
-def is_depth(images: Images) -> bool:
+def is_depth(images: ImageTopic) -> bool:
     """Return whether images may be depth, by encoding and name."""
     if images.kind.transport == "compressedDepth" or images.kind.encoding == "32FC1":
         return True
@@ -128,7 +128,7 @@ def is_depth(images: Images) -> bool:
     return images.kind.encoding == "mono16" and "depth" in images.topic.lower()
 
 
-def is_color(images: Images) -> bool:
+def is_color(images: ImageTopic) -> bool:
     """Return whether images may be colour."""
     return images.kind.transport != "compressedDepth" and images.kind.encoding not in DEPTH_ENCODINGS
 
@@ -156,7 +156,7 @@ def require(bag: OpenBag, option: str, name: str, types: tuple[str, ...]) -> Non
         raise DataError(f"{bag.path}: option {option}: {name} is {what}; its topics: {bag.listed()}")
 
 
-def _images(bag: OpenBag, options: BagOptions) -> Iterable[tuple[str, Images]]:
+def _images(bag: OpenBag, options: BagOptions) -> Iterable[tuple[str, ImageTopic]]:
     """Yield the topics of images that can be read; of a named one that cannot be an error is raised."""
     requested = {topic for topic, _ in _named(options).values()}
     for name in bag.of_types(RAW, COMPRESSED):
@@ -169,10 +169,10 @@ def _images(bag: OpenBag, options: BagOptions) -> Iterable[tuple[str, Images]]:
             if name in requested:
                 raise
         else:
-            yield name, Images(name, kind, bare(message.header.frame_id))
+            yield name, ImageTopic(name, kind, bare(message.header.frame_id))
 
 
-def _labels(images: dict[str, Images], options: BagOptions) -> dict[str, Images]:
+def _labels(images: dict[str, ImageTopic], options: BagOptions) -> dict[str, ImageTopic]:
     if options.label_topics is not None:
         return {name: images[topic] for name, topic in options.label_topics.items()}
     label_maps = [
@@ -199,13 +199,13 @@ Rank = tuple[bool | int | str, ...]
 
 
 def _one(
-    topic: str | None, images: dict[str, Images], candidates: list[Images], rank: Callable[[Images], Rank]
-) -> Images | None:
+    topic: str | None, images: dict[str, ImageTopic], candidates: list[ImageTopic], rank: Callable[[ImageTopic], Rank]
+) -> ImageTopic | None:
     """Return the images of a named topic, else the candidate of the lowest rank, or None without candidates."""
     return images[topic] if topic is not None else min(candidates, key=rank, default=None)
 
 
-def _depth_rank(images: Images, bag: OpenBag) -> Rank:
+def _depth_rank(images: ImageTopic, bag: OpenBag) -> Rank:
     return (
         not REGISTERED.search(images.topic),
         _info_of(bag, images) is None,
@@ -215,7 +215,7 @@ def _depth_rank(images: Images, bag: OpenBag) -> Rank:
     )
 
 
-def _color_rank(images: Images, depth: Images | None) -> Rank:
+def _color_rank(images: ImageTopic, depth: ImageTopic | None) -> Rank:
     return (
         bool(NO_COLOR.search(images.topic.lower())),
         images.kind.encoding in ID_ENCODINGS,
@@ -226,7 +226,7 @@ def _color_rank(images: Images, depth: Images | None) -> Rank:
     )
 
 
-def _info_of(bag: OpenBag, images: Images) -> str | None:
+def _info_of(bag: OpenBag, images: ImageTopic) -> str | None:
     """Return the CameraInfo topic of images: the topic of their namespace, else of their frame, else None."""
     infos = bag.of_types(INFO)
     sibling = f"{images.base.rpartition('/')[0]}/camera_info"

@@ -39,16 +39,18 @@ class Light:
     sky: Float64
 
     @classmethod
-    def of(cls, sun: tuple[float, ...], ambient: Sequence[float], sunlight: Sequence[float], sky: Any) -> Light:
+    def from_colors(
+        cls, sun: tuple[float, ...], ambient: Sequence[float], sunlight: Sequence[float], sky: Any
+    ) -> Light:
         """Make it of the direction towards the sun, of any length, and colours."""
         return cls(np.array(sun) / np.linalg.norm(sun), *(np.array(color) for color in (ambient, sunlight, sky)))
 
 
 LIGHTS = {
-    "noon": Light.of((0.42, -0.38, 0.82), [0.52] * 3, [0.60] * 3, (0.62, 0.72, 0.85)),
-    "morning": Light.of((0.85, 0.30, 0.34), (0.40, 0.44, 0.52), (0.68, 0.60, 0.48), (0.70, 0.76, 0.85)),
-    "evening": Light.of((-0.90, -0.20, 0.26), (0.36, 0.36, 0.44), (0.78, 0.56, 0.34), (0.86, 0.70, 0.56)),
-    "overcast": Light.of((0.0, 0.0, 1.0), (0.62, 0.64, 0.67), [0.08] * 3, (0.74, 0.75, 0.77)),
+    "noon": Light.from_colors((0.42, -0.38, 0.82), [0.52] * 3, [0.60] * 3, (0.62, 0.72, 0.85)),
+    "morning": Light.from_colors((0.85, 0.30, 0.34), (0.40, 0.44, 0.52), (0.68, 0.60, 0.48), (0.70, 0.76, 0.85)),
+    "evening": Light.from_colors((-0.90, -0.20, 0.26), (0.36, 0.36, 0.44), (0.78, 0.56, 0.34), (0.86, 0.70, 0.56)),
+    "overcast": Light.from_colors((0.0, 0.0, 1.0), (0.62, 0.64, 0.67), [0.08] * 3, (0.74, 0.75, 0.77)),
 }
 """The light by the name of an option: noon, sun low in the east or in the west, or clouds."""
 

@@ -92,7 +92,9 @@ class LabelSource:
     first: tuple[str, Path] | None = None
 
     @classmethod
-    def of(cls, kind: Kind, base: Path, template: str, frames: Sequence[Named], folders: Folders) -> LabelSource:
+    def with_first_file(
+        cls, kind: Kind, base: Path, template: str, frames: Sequence[Named], folders: Folders
+    ) -> LabelSource:
         """Return one source, with the first frame that has a file."""
         source = cls(kind, base, template, folders)
         files = ((frame.name, file) for frame in frames if (file := source.file(frame)) is not None)
@@ -148,7 +150,7 @@ def find_sources(
     if options.labels_root is not None and not os.path.isdir(base):  # noqa: PTH112  Path.is_dir raises where the name is too long
         raise ConfigError(f"{base}: there is no such folder; correct labels_root")
     for name, folder in given.items():
-        sources[name] = LabelSource.of("labels", folder, "{name}", frames, folders)
+        sources[name] = LabelSource.with_first_file("labels", folder, "{name}", frames, folders)
     for kind in KINDS:
         templates: dict[str, str] = {}
         for model, template in _stated(kind, options).items():
@@ -159,7 +161,7 @@ def find_sources(
             folders_of = matching_folders(base, template, "model", scene=entry.below_root)
             templates |= {f"{name}{suffix}": filled for name, filled in folders_of.items()}
         for name, filled in templates.items():
-            source = LabelSource.of(kind, base, filled, frames, folders)
+            source = LabelSource.with_first_file(kind, base, filled, frames, folders)
             if name in sources:
                 raise ConfigError(f"{entry.folder}: two label sources are called '{name}'; rename one")
             if source.first is not None:
@@ -175,7 +177,9 @@ def find_sources(
         )  # fmt: skip
     if options.ground_truth and GROUND_TRUTH not in sources:
         truth = Template("ground_truth", options.ground_truth, ("scene", "name"), ("name",))
-        source = LabelSource.of("truth", entry.folder, truth.filled(scene=entry.below_root), frames, folders)
+        source = LabelSource.with_first_file(
+            "truth", entry.folder, truth.filled(scene=entry.below_root), frames, folders
+        )
         sources |= {GROUND_TRUTH: source} if source.first is not None else {}
     return sources
 
@@ -290,7 +294,7 @@ class LabelMaps:
         labels, base = find_sources(options, entry, frames, folders, given), options.labels_root or entry.folder
         template = Template("regions", REGIONS, ("model", "name"), ("model", "name"))
         regions = {
-            name: LabelSource.of("labels", base, filled, frames, folders)
+            name: LabelSource.with_first_file("labels", base, filled, frames, folders)
             for name, filled in matching_folders(base, template, "model", scene=entry.below_root).items()
         }
         if duplicate := next((name for name in regions if name in labels), None):
@@ -300,7 +304,7 @@ class LabelMaps:
         regions = {name: source for name, source in regions.items() if source.first is not None}
         template = Template("features", FEATURES, ("model", "name"), ("model", "name"))
         features = {
-            name: LabelSource.of("features", base, filled, frames, folders)
+            name: LabelSource.with_first_file("features", base, filled, frames, folders)
             for name, filled in matching_folders(base, template, "model", scene=entry.below_root).items()
         }
         self._features = {name: source for name, source in features.items() if source.first is not None}

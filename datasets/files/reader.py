@@ -140,10 +140,10 @@ class FileDataset(ScenesBelow[OwnOptions]):
         return self.options
 
     def georeference(self, folder: Path, options: FileOptions) -> Georeference | None:
-        """Return the georeference of a scene that the options give, else None. Raises what `Georeference.of` raises."""
+        """Return the georeference that the options give, else None; it raises what `Georeference.from_crs` raises."""
         if options.crs is None:
             return None
-        return Georeference.of(options.crs, options.offset or (0.0, 0.0, 0.0), f"{folder}: crs", options.linear)
+        return Georeference.from_crs(options.crs, options.offset or (0.0, 0.0, 0.0), f"{folder}: crs", options.linear)
 
     def mesh_origin(self, folder: Path, surface: Path) -> tuple[float, float, float] | None:
         """Return the origin of a mesh's coordinates in the projection, or None if they are the scene's coordinates."""

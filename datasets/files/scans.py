@@ -184,7 +184,7 @@ class ScanScene(Scene):
         base = self.options.labels_root or entry.folder
         self._truth = None
         if dataset.truth is not None:
-            truth = LabelSource.of("points", entry.folder, dataset.truth, scans, self._files)
+            truth = LabelSource.with_first_file("points", entry.folder, dataset.truth, scans, self._files)
             self._truth = None if truth.first is None else truth
         templates = dataset.labels if self.options.labels_root is None else (SEPARATE, *dataset.labels)
         templates = templates if self.options.labels is None else (self.options.labels,)
@@ -196,7 +196,7 @@ class ScanScene(Scene):
         self._sources = dict[str, LabelSource]()
         for template in label_templates:
             sources = {
-                model: LabelSource.of("points", base, filled, scans, self._files)
+                model: LabelSource.with_first_file("points", base, filled, scans, self._files)
                 for model, filled in matching_folders(base, template, "model", scene=entry.below_root).items()
             }
             self._sources |= {model: source for model, source in sources.items() if source.first is not None}
@@ -205,7 +205,7 @@ class ScanScene(Scene):
         for name, labels in (given or {}).items():
             if name in self._sources:
                 raise ConfigError(f"{entry.folder}: two label sources are called '{name}'; rename one")
-            self._sources[name] = LabelSource.of("points", labels, "{name}", scans, self._files)
+            self._sources[name] = LabelSource.with_first_file("points", labels, "{name}", scans, self._files)
         self._truth = self._sources.pop(GROUND_TRUTH, self._truth)
         self.models, self.ground_truth = tuple(self._sources), self._truth is not None
 

@@ -26,7 +26,7 @@ from semstab.task import read, truth_task
 NONE = -1
 
 
-class Images:
+class WrongPixels:
     """The wrong pixels of each frame, its voxels, and the entropy of its scores."""
 
     def __init__(self, task, scores, size):
@@ -108,7 +108,7 @@ def main(run: Path, model: str = "fcn", scores: str = "fcn-scores", most: int = 
             open_tasks.enter_context(task_of(run, opened, result.manifest["inputs"]))[0] for opened in (record, soft)
         )
         tasks = annotation_tasks(ExportedUnit(result, record, columns=("op",)), task, most)
-        images = Images(task, soft_task, ExportedUnit(result, record, columns=("op",)).first.table.voxel_size)
+        images = WrongPixels(task, soft_task, ExportedUnit(result, record, columns=("op",)).first.table.voxel_size)
     masks = []
     for one in tasks:
         mask = np.zeros(one.size[::-1], np.uint8)
@@ -122,7 +122,7 @@ def main(run: Path, model: str = "fcn", scores: str = "fcn-scores", most: int = 
     for name, edges in (("random on an edge of labels", True), ("random", False)):
         drawn = [images.held(at_random(images, areas, np.random.default_rng(s), edges=edges)) for s in range(20)]
         rows[name] = tuple(float(np.mean(values)) for values in zip(*drawn, strict=True))
-    table = measuring.Table(
+    table = measuring.MarkdownTable(
         regions="",
         pixels=",.0f",
         wrong=",.0f",

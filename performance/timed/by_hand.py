@@ -37,7 +37,7 @@ def frames_of(kind: str) -> tuple[list[semstab.Frame], int]:
         return [soft(flight.street(i, 1920, 1080, 41), 41, "float32") for i in range(2)], 41
     import scenes
 
-    scene = scenes.Scene(
+    scene = scenes.SceneSettings(
         kind="boxes", width=3840, height=2160, K=7, altitude=30.0, pitch=42.0, field_of_view=65.0, far=300.0, step=0.9,
         wrong=0.12, patch=24, salt=0.0, pixels_a_voxel=10.0, seed=77,
     )  # fmt: skip
@@ -85,7 +85,7 @@ def main(rounds: int = 3, runs: int = 3) -> Any:
 
     cases = [f"{backend} {kind}" for backend, kind in CASES]
     columns = {column: spec for case in cases for column, spec in ((f"{case} ms", ".1f"), (f"{case} ratio", ".2f"))}
-    table = measuring.Table(without="", **columns)
+    table = measuring.MarkdownTable(without="", **columns)
     with tempfile.TemporaryDirectory() as folder:
         for name in plain_loops.BY_HAND:
             pairs = [[measured(one, rounds, Path(folder)) for one in (AS_IS, name)] for _ in range(runs)]

@@ -56,7 +56,7 @@ def main(size: str = "4000x2250", triangles: int = 400_000, rounds: int = 3) -> 
     both = o3d.core.Tensor(np.concatenate([origins, rays], axis=1))
     theirs.cast_rays(both[:1])
 
-    table = measuring.Table(step="", CPU_s=".2f", of_the_bare_cast=".2f")
+    table = measuring.MarkdownTable(step="", CPU_s=".2f", of_the_bare_cast=".2f")
 
     def say(step: str, *ms: float) -> None:
         seconds = median(ms) / 1e3

@@ -86,7 +86,7 @@ def main(frames: int = 200, size: str = "640x480", voxel_size: float = 0.01, run
         for one, processes in taken.items()
     }
     table, base = (
-        measuring.Table(command="", wall_s=".1f", ratio=".2f", CPU_s=".1f", CPU_ratio=".2f"),
+        measuring.MarkdownTable(command="", wall_s=".1f", ratio=".2f", CPU_s=".1f", CPU_ratio=".2f"),
         rows["all three off"],
     )
     for one, (wall, cpu) in rows.items():

@@ -112,7 +112,7 @@ def main(
     threads: int = 2,
 ) -> Any:
     measuring.use_cores(threads)
-    table = measuring.Table(
+    table = measuring.MarkdownTable(
         size="", depth="", noise_mm="g", backend="", voxel_m=".2g", MB=".1f", decode_ms=".1f", loop_ms=".1f",
         ratio=".2f", CPU_ratio=".2f", whole_s=".2f", start_s=".2f", read_ms=".1f", fuse_ms=".1f", observe_ms=".1f",
     )  # fmt: skip

@@ -35,7 +35,7 @@ def milliseconds(step: Any, W: int, H: int, K: int, frames: int) -> float:
 
 
 def main(size: str = "640x480", classes: int = 8, frames: int = 12) -> Any:
-    table = measuring.Table(filter="", CPU_ms=".0f")
+    table = measuring.MarkdownTable(filter="", CPU_ms=".0f")
     for name in REGISTRY.builtin:
         spec = parse(name)
         table.add(filter=str(spec), CPU_ms=milliseconds(spec(), *measuring.sides(size), classes, frames))

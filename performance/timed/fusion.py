@@ -107,7 +107,7 @@ def main(
     backends: tuple[str, ...] = ("numba", "open3d"),
     rounds: int = 3,
 ) -> Any:
-    table = measuring.Table(
+    table = measuring.MarkdownTable(
         size="", K="", condition="", implementation="", first_ms=".1f", later_ms=".1f", faster=".2f"
     )
     for size, K, condition in itertools.product(sizes, classes, conditions):

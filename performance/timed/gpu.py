@@ -30,7 +30,7 @@ VOXEL_SIZE, APART, WARM_UP, MODELS = 0.2, 200.0, 5, 3
 
 
 @dataclasses.dataclass
-class Case:
+class DeviceView:
     """A view on the device: its frame, and what is fused of it at a place."""
 
     frame: semstab.Frame
@@ -39,7 +39,7 @@ class Case:
     logits: torch.Tensor
 
     @classmethod
-    def of(cls, frame: semstab.Frame, K: int, dtype: torch.dtype, device: torch.device) -> Case:
+    def from_frame(cls, frame: semstab.Frame, K: int, dtype: torch.dtype, device: torch.device) -> DeviceView:
         """Logits that favour the frame's labels."""
         ids = torch.tensor(frame.labels, device=device)
         logits = torch.empty((K, *frame.shape), dtype=dtype, device=device)
@@ -80,7 +80,7 @@ def copy_bandwidth(device: torch.device, megabytes: int) -> float:
 
 
 def measure(
-    case: Case, K: int, voxels: int, device: str, rounds: int, logits: str, *, several: bool
+    case: DeviceView, K: int, voxels: int, device: str, rounds: int, logits: str, *, several: bool
 ) -> list[dict[str, Any]]:
     """Rows of the table for one map: ids, logits, and ids of several models."""
     backend = TorchMap(VOXEL_SIZE, K, device=device, reserve=voxels + voxels // 5)
@@ -151,9 +151,9 @@ def main(
     bandwidth = copy_bandwidth(there, copied_megabytes)
     name = torch.cuda.get_device_name(there) if there.type == "cuda" else "CPU"
     print(f"{name}, torch {torch.__version__}; a copy moves {bandwidth / 1e9:.0f} GB/s\n")
-    table = measuring.Table(size="", K="", voxels=",", input="", by="", ms=".3f", floor_ms=".3f", ratio=".1f")
+    table = measuring.MarkdownTable(size="", K="", voxels=",", input="", by="", ms=".3f", floor_ms=".3f", ratio=".1f")
     for size, K in itertools.product(sizes, classes):
-        case = Case.of(flight.frame(0, *measuring.sides(size), K), K, getattr(torch, logits), there)
+        case = DeviceView.from_frame(flight.frame(0, *measuring.sides(size), K), K, getattr(torch, logits), there)
         rows = [
             {"by": "torch", **row}
             for wanted in voxels

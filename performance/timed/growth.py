@@ -105,7 +105,7 @@ def main(
     growing: tuple[Literal["frames", "voxels", "classes"], ...] = ("frames", "voxels", "classes"),
     figure: Path | None = None,
 ) -> Any:
-    table = measuring.Table(
+    table = measuring.MarkdownTable(
         growing="", frames="", seen=",", classes="", ms=".1f", bytes=".0f", most=".0f", estimate=".2f"
     )
     for what in growing:
@@ -116,7 +116,7 @@ def main(
                 row = pool.submit(measured, backend, measuring.sides(size), *base.values()).result()
             table.add(growing=what, times=factor, **base, **row)
     print()
-    fits = measuring.Table(exponent="", ms=".2f", bytes=".2f")
+    fits = measuring.MarkdownTable(exponent="", ms=".2f", bytes=".2f")
     for what in growing:
         of_kind = [row for row in table.rows if row["growing"] == what]
         factors = np.log([row["seen" if what == "voxels" else "times"] for row in of_kind])

@@ -46,7 +46,7 @@ def write(root: Path, count: int, *, still: bool) -> Path:
 
 
 def main(frames: int = 100_000, fused: tuple[int, ...] = (2000, 10_000), still: bool = False) -> Any:
-    table, dataset = measuring.Table(step="", CPU_s=".2f", MB=".0f"), "posed_folder"
+    table, dataset = measuring.MarkdownTable(step="", CPU_s=".2f", MB=".0f"), "posed_folder"
 
     def step(name: str, work: Any) -> Any:
         found: list[Any] = []
@@ -62,10 +62,10 @@ def main(frames: int = 100_000, fused: tuple[int, ...] = (2000, 10_000), still: 
         (unit,) = step("open again, select frames", lambda: make_plan(Config.model_validate(settings))).units
         step("hash the input", lambda: unit.task.digest)
         tile = UnitTile("", 64, (0, 0))
-        work = Work.of(unit, Start("", root)).in_tile(tile, unit.task.indices[:4096])
+        work = Work.from_unit(unit, Start("", root)).in_tile(tile, unit.task.indices[:4096])
         sent = step("pickle a task of 4096 frames", lambda: pickle.dumps(work))
         print(f"\nthe pickled task has {len(sent) / 1e3:.0f} kB\n")
-        peaks = measuring.Table(fused_frames=",", peak_MB=".0f", kB_a_further_frame=".1f")
+        peaks = measuring.MarkdownTable(fused_frames=",", peak_MB=".0f", kB_a_further_frame=".1f")
         for count in fused:
             words = ("--data", root, "--frames", f"0:{count}", "--voxel-size", "0.5", "--check", "none")
             peak = 1e3 * measuring.command(Path(folder) / f"run{count}", *words, "--no-geometry-check").peak_gb

@@ -49,7 +49,7 @@ def main(
     frames: int | None = None,
     most_gb: float = 4.0,
 ) -> Any:
-    table = measuring.Table(
+    table = measuring.MarkdownTable(
         backend="", K="", kind="", voxels=",", run="", MB=".0f", estimate_MB=".0f", ratio=".2f", stage=""
     )
     for kind, K in itertools.product(kinds, classes):

@@ -45,7 +45,7 @@ def main(frames: int = 200, voxel_size: float = 0.02, runs: int = 3) -> Any:
     ways = {"fusion alone": fused, "metric": partial(measured, True), "metric, alpha=False": partial(measured, False)}
     taken = {name: measuring.medians(ms) for name, ms in measuring.in_turns(ways, runs).items()}
     print(f"{frames} frames of 640x480, {voxel_size:g} m, one core\n")
-    table = measuring.Table(way="", update_ms=".1f", compute_s=".1f", ms_a_frame=".1f", ratio=".2f")
+    table = measuring.MarkdownTable(way="", update_ms=".1f", compute_s=".1f", ms_a_frame=".1f", ratio=".2f")
     for name, ms in taken.items():
         table.add(way=name, update_ms=ms["update"] / frames, compute_s=ms["compute"] / 1e3,
                   ms_a_frame=ms["all"] / frames, ratio=ms["all"] / taken["fusion alone"]["all"])  # fmt: skip

@@ -47,7 +47,14 @@ def floor_bytes(frame: semstab.Frame, voxels: int) -> int:
 
 
 def measured(
-    scene: scenes.Scene, views: Any, size: float, noise: str, share: float, names: Any, most_gb: float, rounds: int
+    scene: scenes.SceneSettings,
+    views: Any,
+    size: float,
+    noise: str,
+    share: float,
+    names: Any,
+    most_gb: float,
+    rounds: int,
 ) -> Any:
     """The row of a scene at a level of noise, a share of depth."""
     frames = [scenes.spoilt(scene, view, share) for view in views]
@@ -81,7 +88,7 @@ def main(
     csv_: Path | None = None,
 ) -> Any:
     backend_columns = {f"{name}_{what}": spec for name in backends for what, spec in (("ms", ".1f"), ("faster", ".2f"))}
-    table = measuring.Table(
+    table = measuring.MarkdownTable(
         seed="",
         kind="",
         width="",
@@ -101,7 +108,7 @@ def main(
         for level, share in shares.items():
             table.add(**measured(scene, views, size, level, share, backends, most_gb, rounds))
     print()
-    ratios = measuring.Table(noise="", backend="", scenes="", median=".2f", worst=".2f")
+    ratios = measuring.MarkdownTable(noise="", backend="", scenes="", median=".2f", worst=".2f")
     for level in dict.fromkeys(row["noise"] for row in table.rows):
         for name in backends:
             found = [row[f"{name}_faster"] for row in table.rows if row["noise"] == level and row[f"{name}_faster"]]
@@ -110,7 +117,7 @@ def main(
     if large := [row for row in table.rows if row["voxels"] >= many and row[f"{backends[0]}_ms"]]:
         rate = copy_rate()
         print(f"\nroofline of {backends[0]}, a copy moves {rate / 1e9:.1f} GB/s\n")
-        roofline = measuring.Table(seed="", noise="", voxels=",", MB_at_least=".0f", ms=".1f", share=".0%")
+        roofline = measuring.MarkdownTable(seed="", noise="", voxels=",", MB_at_least=".0f", ms=".1f", share=".0%")
         for row in large:
             ms = row[f"{backends[0]}_ms"]
             row["share"] = row["floor_bytes"] / rate / (ms / 1e3)

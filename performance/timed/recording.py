@@ -62,7 +62,7 @@ def main(
 
         works = {"with": lambda: run(True), "without": lambda: run(False)}
         taken = {name: measuring.medians(rows) for name, rows in measuring.in_turns(works, runs).items()}
-    table = measuring.Table(
+    table = measuring.MarkdownTable(
         recording="", run_s=".2f", CPU_s=".2f", loop_ms=".1f", observers_ms=".1f", recording_MB=".1f"
     )
     for name, row in taken.items():

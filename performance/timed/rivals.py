@@ -263,7 +263,7 @@ def main(
             keep_maps(keep, {name: maps[name] for name in rivals}, views(size, frames, classes), voxel_size, classes)
     print(f"{frames} frames of {size}, K = {classes}, {voxel_size:g} m, one core")
     print(*(f"{name}: {which}" for name, which in commits.items()), sep="\n", end="\n\n")
-    table = measuring.Table(
+    table = measuring.MarkdownTable(
         implementation="", CPU_ms=".1f", faster=".2f", voxels=",", bytes=",.0f", peak=",.0f", missing=",", extra=",",
         label_differs=".2%", without_ties=".2%",
     )  # fmt: skip

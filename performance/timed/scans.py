@@ -96,7 +96,7 @@ def main(
     taken = measuring.in_turns(works, rounds)
     counts = [np.count_nonzero(frame.valid) for frame in frames]
     print(f"{len(frames)} scans of {np.median(counts):,.0f} points, K = {K}, {voxel_size:g} m, {voxels:,} voxels\n")
-    table = measuring.Table(implementation="", CPU_ms=".1f", faster=".2f")
+    table = measuring.MarkdownTable(implementation="", CPU_ms=".1f", faster=".2f")
     ms = {name: float(np.median(np.median(np.array(seconds_taken), axis=0))) for name, seconds_taken in taken.items()}
     for name in works:
         table.add(implementation=name, CPU_ms=ms[name], faster=ms["numpy"] / max(ms[name], 1e-6))

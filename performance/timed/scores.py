@@ -102,7 +102,7 @@ def main(
     noise: tuple[float, ...] = (0.0,),
     rounds: int = 5,
 ) -> Any:
-    table = measuring.Table(
+    table = measuring.MarkdownTable(
         size="", K="", type="", noise=".2%", voxels=",", read=".1f", keys=".1f", rows=".1f", frame=".1f",
         of_floor=".2f", with_rows=".2f",
     )  # fmt: skip

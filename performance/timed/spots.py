@@ -30,7 +30,7 @@ from semstab.statistics.loops import answers as loops
 from semstab.statistics.sparse_depth import SparseDepth
 
 PARTS: dict[str, tuple[Any, str]] = {
-    "is depth sparse": (SparseDepth, "of"),
+    "is depth sparse": (SparseDepth, "from_frame"),
     "view: hash of labels, mean area": (Sampler, "_view_of"),
     "new spots": (Sampler, "_find"),
     "projection": (loops, "project"),
@@ -138,7 +138,7 @@ def main(
     rounds: int = 5,
     frames: int = 500,
 ) -> Any:
-    table = measuring.Table(
+    table = measuring.MarkdownTable(
         size="", noise="g", known=",.0f", answers=",.0f", sampler_ms=".2f", fusion_ms=".2f", ratio=".2f"
     )
     details = []
@@ -148,11 +148,11 @@ def main(
             table.add(size=size, noise=percent, **whole)
             details += [(size, percent, name, by_part[name]) for name in (*PARTS, "the rest", "all") if name in by_part]
     print()
-    part = measuring.Table(size="", noise="g", part="", ms=".2f")
+    part = measuring.MarkdownTable(size="", noise="g", part="", ms=".2f")
     for size, percent, name, ms in details:
         part.add(size=size, noise=percent, part=name, ms=ms)
     print()
-    long = measuring.Table(
+    long = measuring.MarkdownTable(
         size="", frames="", spots=",.0f", answers=",.0f", held_MB=".1f", peak_MB=".1f", ms_at_its_end=".2f"
     )
     long.add(size=sizes[0], **memory(measuring.sides(sizes[0]), classes, frames))

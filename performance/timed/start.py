@@ -48,7 +48,7 @@ def main(backend: Literal["numba", "open3d", "numpy"] = "numba", rounds: int = 3
             words = ("--backend", backend, "--data", root, "--out", out, "--quiet", "--check", "none")
             return seconds("-c", UNTIL_FUSED, *words, "--rerun", "off", "--report", "off", **variables)
 
-    table = measuring.Table(until="", CPU_s=".2f", cache_MB=".1f")
+    table = measuring.MarkdownTable(until="", CPU_s=".2f", cache_MB=".1f")
     runs = range(rounds)
     table.add(until="help", CPU_s=median(seconds("-m", "semstab", "--help") for _ in runs))
     table.add(until=f"import {backend}", CPU_s=median(seconds("-c", f"import {backend}") for _ in runs))

@@ -102,7 +102,7 @@ def main(
     watch("- agreement by class", lambda: statistics.class_agreement(table, events))
     n, m = len(table), len(events)
     print(f"{frames} frames, {m:,} observations of {n:,} voxels ({m / n:.1f} each), K = {K}\n")
-    told = measuring.Table(
+    told = measuring.MarkdownTable(
         step="", CPU_s=".2f", us_an_observation=".3f", of_fusion=".2f", of_loop=".2f", peak_bytes_a_voxel=",.0f"
     )
     loop = sum(watch.seconds[name] for name in LOOP)

@@ -44,7 +44,7 @@ def main(
     cores = len(os.sched_getaffinity(0))
     counts = [count for count in threads if count <= cores]
     print(f"{cores} cores\n")
-    table = measuring.Table(size="", backend="", threads="", ms=".1f", faster=".2f")
+    table = measuring.MarkdownTable(size="", backend="", threads="", ms=".1f", faster=".2f")
     for size, name in itertools.product(sizes, backends):
         found: dict[int, float] = {}
         for count in counts:

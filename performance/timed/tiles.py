@@ -34,7 +34,7 @@ def main(
     jobs: int = 1,
     record: bool = False,
 ) -> Any:
-    table = measuring.Table(
+    table = measuring.MarkdownTable(
         voxels=",", run="", tiles="", peak_GB=".2f", CPU_s=".1f", us_a_voxel=".2f", **dict.fromkeys(STAGES, ".3f")
     )
     forced = ["--tile-size", tile_size] if tile_size else []

@@ -74,7 +74,7 @@ def main(
             large = write_scene(folder / "large", 6, (3840, 2160))
             words["large frames"] = ("--data", large, "--voxel-size", "0.05", *OFF)
             words["large frames open3d"] = (*words["large frames"], "--backend", "open3d")
-        table = measuring.Table(without="", **dict.fromkeys((c.replace(" ", "_") for c in commands), ".2f"))
+        table = measuring.MarkdownTable(without="", **dict.fromkeys((c.replace(" ", "_") for c in commands), ".2f"))
         ratios: dict[str, dict[str, float]] = {way: {} for way in ways}
         for command in commands:
 

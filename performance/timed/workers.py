@@ -68,7 +68,7 @@ def cpu_seconds(pid: int) -> float:
 def main(
     frames: int = 150, memory_gb: float = 1.0, workers: tuple[int, ...] = (1, 2), repeat: int = 2, cold: bool = False
 ) -> Any:
-    table = measuring.Table(
+    table = measuring.MarkdownTable(
         workers="", wall_s=".1f", command_CPU_s=".1f", workers_CPU_s=".1f", busiest_CPU_s=".1f",
         **dict.fromkeys(("sizing", "assemble", "keep", "all"), ".1f"),
     )  # fmt: skip

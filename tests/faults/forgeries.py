@@ -49,7 +49,7 @@ class Parts:
     about: list[Content]
 
     @classmethod
-    def of(cls, file: Path) -> Parts:
+    def load(cls, file: Path) -> Parts:
         with zipfile.ZipFile(file) as archive:
             content = json.loads(archive.read("summary.json"))
             tables = [pq.read_table(io.BytesIO(archive.read(f"{i}.parquet"))) for i in range(len(content["scenes"]))]
@@ -358,11 +358,11 @@ def level(parts: Parts, wanted: str = "stable") -> None:
 
 
 def each(change: Callable[[Table, Content], None]) -> Callable[[Parts], None]:
-    def of(parts: Parts) -> None:
+    def apply(parts: Parts) -> None:
         for sums, about in zip(parts.sums, parts.about, strict=True):
             change(sums, about)
 
-    return of
+    return apply
 
 
 def take(sums: Table, rows: np.ndarray) -> None:
@@ -474,10 +474,10 @@ def answers(*of: int) -> Callable[[Table, Content], None]:
 
 
 def named(change: Callable[[list[str]], list[str]]) -> Callable[[Table, Content], None]:
-    def of(sums: Table, about: Content) -> None:
+    def apply(sums: Table, about: Content) -> None:
         about["classes"] = change(about["classes"])
 
-    return of
+    return apply
 
 
 def if_truth(**columns: Callable[[Table], np.ndarray]) -> Callable[[Table, Content], None]:
@@ -542,7 +542,9 @@ class Referee:
     honest: dict[str, Loaded]
 
     @classmethod
-    def of(cls, folder: Path, benchmark_name: str, definitions: Mapping[str, Benchmark] | None = None) -> Referee:
+    def from_folder(
+        cls, folder: Path, benchmark_name: str, definitions: Mapping[str, Benchmark] | None = None
+    ) -> Referee:
         files = sorted(folder.glob(f"{benchmark_name}__*{SUFFIX}"))
         loaded = {file.name: load_submission(file, definitions) for file in files}
         benchmark = next(iter(loaded.values()))[0]
@@ -590,7 +592,7 @@ def _parts(sums: Any) -> tuple[Any, ...]:
 
 def judged(referee: Referee, file: Path, *, fields: bool = True, one_in: int = 1) -> Iterator[tuple[str, str, str]]:
     """Yield the kind of each forgery of a result, what it does, and what becomes of it; `fields`: also single ones."""
-    before, honest = referee.ranks(), Parts.of(file)
+    before, honest = referee.ranks(), Parts.load(file)
     with tempfile.TemporaryDirectory() as folder:
         forged = Path(folder) / file.name
         for kind, what, change in itertools.islice(forgeries(honest, fields=fields), 0, None, one_in):
@@ -610,7 +612,7 @@ def main() -> None:
     parser.add_argument("model", nargs="?", help="the one whose result is forged; that of the last rank by default")
     parser.add_argument("--hand", action="store_true", help="leave out changes of single fields and columns")
     given = parser.parse_args()
-    referee = Referee.of(given.folder, given.benchmark)
+    referee = Referee.from_folder(given.folder, given.benchmark)
     ranks = referee.ranks()
     file = max(ranks, key=lambda name: (ranks[name][0] or 0, name))
     if given.model:

@@ -17,7 +17,7 @@ RESULTS = Path(__file__).parents[2] / "results"
     pytest.param("city@1", "trick-world-locked", 6, marks=combination),
 ])  # fmt: skip
 def test_no_forgery_changes_a_rank(name, model, one_in) -> None:
-    referee = forgeries.Referee.of(RESULTS, name)
+    referee = forgeries.Referee.from_folder(RESULTS, name)
     file = RESULTS / f"{name}__{model}.semstab"
     outcomes = [(what, outcome) for _, what, outcome in forgeries.judged(referee, file, fields=False, one_in=one_in)]
     assert len(outcomes) >= 100 // one_in

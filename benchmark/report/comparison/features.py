@@ -32,7 +32,7 @@ def compared_features(runs: Sequence[RunHandle]) -> tuple[list[str], Table]:
             rows.append((run.name, found.alpha, by_scene[k] if by_scene else math.nan, found.components))
         groups.append(Group(scene, tuple(rows)))
     columns = (
-        Column("run", "Run"), Column.of(FEATURE_ALPHA), Column("change", "Change", 3, "higher", signed=True),
+        Column("run", "Run"), Column.for_quantity(FEATURE_ALPHA), Column("change", "Change", 3, "higher", signed=True),
         Column("components", "Components", 0),
     )  # fmt: skip
     caption = (

@@ -54,7 +54,7 @@ class Located:
     georeference: Georeference | None
 
     @classmethod
-    def of(cls, above: FromAbove, georeference: Georeference | None = None) -> Located:
+    def from_view(cls, above: FromAbove, georeference: Georeference | None = None) -> Located:
         """Locate the picture of the voxels that are seen."""
         H, W = above.rows.shape
         centers = above.table.centers

@@ -50,7 +50,7 @@ WIDE = 1.4
 
 def draw_stability(above: FromAbove, georeference: Georeference | None = None) -> Figure:
     """Return the stability category of the topmost voxels and the measures that have a panel, with coordinates."""
-    table, rows, located = above.table, above.rows, Located.of(above, georeference)
+    table, rows, located = above.table, above.rows, Located.from_view(above, georeference)
     panel_measures = [measure for measure in measures() if measure.panel]
     figure, (kind, *panels) = map_panels(rows, 1 + len(panel_measures))
     draw_kinds(figure, kind, rows, categories(table), CATEGORY_COLORS, CATEGORIES)
@@ -170,7 +170,7 @@ def draw_overview(above: FromAbove, overview: Overview, georeference: Georeferen
     mark_panel(axes[-1], "abc"[len(images)], f"fused, {above.view}")
     for panel in axes:
         framed(panel)
-    locate(axes[-1], Located.of(above, georeference), rows.shape)
+    locate(axes[-1], Located.from_view(above, georeference), rows.shape)
     names = table.classes or tuple(str(k) for k in range(table.K))
     class_ids = sorted({int(k) for k in np.unique(label)} | {int(k) for k in np.unique(overview.labels) if k < table.K})
     entries = [(names[k], tuple(channel / 255 for channel in palette[k])) for k in class_ids]
@@ -364,7 +364,7 @@ class TopViews:
         if self._last is None or self._last[0] != slug:
             large = record.in_tiles and record.map_summary.voxels > MOST
             table = topmost(record.tiles(), up) if large else self._tables.table_of(record)
-            self._last = slug, FromAbove.of(table, up)
+            self._last = slug, FromAbove.from_table(table, up)
         return self._last[1]
 
 

@@ -119,7 +119,7 @@ class FromAbove:
     corner: tuple[float, float] = (0.0, 0.0)
 
     @classmethod
-    def of(cls, table: VoxelTable, up: npt.ArrayLike) -> FromAbove:
+    def from_table(cls, table: VoxelTable, up: npt.ArrayLike) -> FromAbove:
         """Return the voxels of a map that are seen; see `best_view` and `top_down`."""
         selected, axis, view = best_view(table, up)
         centers = table.centers[selected]

@@ -91,7 +91,7 @@ def fusion_correctness(result: Result) -> list[Table]:
     if not groups:
         return []
     columns = (
-        Column("backend", "Backend"), *(Column.of(quantity) for quantity in (ACCURACY, MIOU, ECE, BRIER)),
+        Column("backend", "Backend"), *(Column.for_quantity(quantity) for quantity in (ACCURACY, MIOU, ECE, BRIER)),
     )  # fmt: skip
     caption = (
         f"{settings(result.select())} The table shows the voxels seen twice or more with a true class. ECE is the"

@@ -65,7 +65,7 @@ def _correct_by_stratum(result: Result) -> list[Table]:
     columns = (
         Column("persistence", "Persistence"),
         Column("voxels", "Voxels", 0),
-        *(Column.of(quantity, over=OF_ROW) for quantity in RIGHT),
+        *(Column.for_quantity(quantity, over=OF_ROW) for quantity in RIGHT),
     )
     groups = tuple(Group(name, _stratum_rows(strata)) for name, strata in by_model.items() if strata)
     caption = (

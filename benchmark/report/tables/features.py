@@ -41,7 +41,7 @@ def features(result: Result) -> list[Table]:
     if not groups:
         return []
     columns = (
-        SCENE, Column.of(ALPHA), Column("cosine", "of two views", 3, over="Mean cosine"),
+        SCENE, Column.for_quantity(ALPHA), Column("cosine", "of two views", 3, over="Mean cosine"),
         Column("chance", "of any two", 3, over="Mean cosine"), Column("components", "Components", 0),
         Column("spots", "Spots", 0), Column("one_in", "Kept, 1 in", 0),
     )  # fmt: skip

@@ -8,7 +8,7 @@ from collections.abc import Iterator
 from semstab.comparison.prompts import ChangedVocabulary, Effect, changed_vocabularies
 from semstab.data.records import Record, Result
 from semstab.data.statistics import UNKNOWN, Estimate
-from semstab.predict.prompts import Changes
+from semstab.predict.prompts import VocabularyChanges
 from semstab.report.tables.statistics import INTERVALS, SCENE
 from semstab.report.tables.table import Column, Group, Row, Table
 from semstab.statistics.agreement import ALPHA
@@ -29,7 +29,7 @@ def prompts(result: Result) -> list[Table]:
         changed_rows = [_row(row.record, row.changes, row.effect, several=several) for row in rows]
         groups.append(Group(name, (*full, *changed_rows)))
     columns = (
-        *((SCENE,) if several else ()), Column("prompt", "Prompt"), Column.of(ALPHA),
+        *((SCENE,) if several else ()), Column("prompt", "Prompt"), Column.for_quantity(ALPHA),
         Column("alpha_change", "Change", 3, "higher", signed=True), Column("changed_percent", "Labels changed (%)", 1),
         Column("most", "Most of them"), Column("most_percent", "(%)", 0),
     )  # fmt: skip
@@ -42,7 +42,9 @@ def prompts(result: Result) -> list[Table]:
     return [Table("prompts", "Names removed, added and renamed", caption, columns, tuple(groups), by="vocabulary")]
 
 
-def _row(record: Record, changes: Changes | None = None, effect: Effect | None = None, *, several: bool) -> Row:
+def _row(
+    record: Record, changes: VocabularyChanges | None = None, effect: Effect | None = None, *, several: bool
+) -> Row:
     """Return the row of a change, or of the full vocabulary."""
     scene = (record.unit.scene,) if several else ()
     alpha = UNKNOWN if record.statistics is None else record.statistics.headline.alpha
@@ -53,7 +55,7 @@ def _row(record: Record, changes: Changes | None = None, effect: Effect | None =
     return (*scene, "; ".join(_words(changes)), alpha, difference, changed, effect.most, share)
 
 
-def _words(changes: Changes) -> Iterator[str]:
+def _words(changes: VocabularyChanges) -> Iterator[str]:
     """Yield changes as the table says them."""
     yield from (f"without {name}" for name in changes.without)
     yield from (f"with {name}" for name in changes.add)

@@ -19,9 +19,9 @@ from semstab.statistics.correctness import MIOU
 
 COLUMNS = (
     SCENE, Column("model", "Model"), Column("verdict", "Verdict"), Column("probability_percent", "Probability (%)", 0),
-    Column.of(ALPHA), Column("scope", "For"), Column("agree_percent", "Agree (%)", 1, "higher"),
+    Column.for_quantity(ALPHA), Column("scope", "For"), Column("agree_percent", "Agree (%)", 1, "higher"),
     Column("flicker_percent", "Flicker (%)", 1, "lower"),
-    Column.of(VSS), Column.of(SBD), Column.of(MIOU),
+    Column.for_quantity(VSS), Column.for_quantity(SBD), Column.for_quantity(MIOU),
     Column("voxel_size", "Voxel (m)", 3), Column("frames", "Frames", 0),
 )  # fmt: skip
 

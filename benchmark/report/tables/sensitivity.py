@@ -49,7 +49,7 @@ def _table(result: Result, sweep: Sweep) -> Table:
     by_model = {name: levels(result, sweep.name, name) for name in models}
     assessed = any(level.assessed for of_model in by_model.values() for level in of_model)
     agreement = (
-        *(Column.of(quantity, compared=True) for quantity in (PSA, ALPHA)),
+        *(Column.for_quantity(quantity, compared=True) for quantity in (PSA, ALPHA)),
         Column("sbd_excess_op2", "SBD excess (OP>=2)", 4, signed=True),
     )
     columns = (
@@ -104,8 +104,8 @@ def reduced(result: Result) -> list[Table]:
     columns = (
         Column("scene", "Scene"),
         Column("vss_all", "VSS, all voxels", VSS.digits[0], VSS.better),
-        Column.of(VSS),
-        Column.of(VOXEL_ALPHA),
+        Column.for_quantity(VSS),
+        Column.for_quantity(VOXEL_ALPHA),
     )
     groups = tuple(
         Group(name, tuple(_reduced_row(record) for record in rows)) for name, rows in by_model(records).items()

@@ -20,7 +20,7 @@ SBD_OVER = "Means of SBD (bits) run over the voxels seen twice or more."
 
 def of_measures(*, over: str, compared: bool = False) -> list[Column]:
     """Return a column for each measure under its population `over`; the paper prints more decimals to compare."""
-    return [Column.of(measure, compared=compared, over=over) for measure in measures()]
+    return [Column.for_quantity(measure, compared=compared, over=over) for measure in measures()]
 
 
 def settings(records: Sequence[Record]) -> str:
@@ -47,11 +47,11 @@ _HEADLINES = (VSS, SBD)
 
 _COLUMNS = (
     Column("model", "Model"),
-    Column.of(ALPHA),
+    Column.for_quantity(ALPHA),
     Column("once_percent", "Seen once (%)", 2),
     Column("recurrent_percent", "OP>=3 (%)", 2),
-    *(Column.of(measure, over=ALL_VOXELS) for measure in _HEADLINES),
-    *(Column.of(measure, over="OP>=3") for measure in _HEADLINES),
+    *(Column.for_quantity(measure, over=ALL_VOXELS) for measure in _HEADLINES),
+    *(Column.for_quantity(measure, over="OP>=3") for measure in _HEADLINES),
     Column("flicker_percent", "Pixel flicker (%)", 2, "lower"),
     Column("compensated_flicker_percent", "Flicker (%)", 2, "lower"),
 )

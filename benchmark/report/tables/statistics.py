@@ -46,16 +46,16 @@ Number = Callable[[MapStatistics], float | Estimate]
 def temporal_agreement(result: Result) -> list[Table]:
     """Return alpha with the data that it rests on, and the agreement at voxels, which depends on their size."""
     columns = (
-        Column.of(ALPHA),
-        Column.of(ALPHA_BY_MEANING),
+        Column.for_quantity(ALPHA),
+        Column.for_quantity(ALPHA_BY_MEANING),
         Column("spots", "Spots", 0),
         Column("views", "Views", 0),
         Column("labelled_percent", "Labelled (%)", 0, "higher"),
         REPEATED,
-        *(Column.of(q, over="OP>=2") for q in (VSS, PSA, KAPPA, VOXEL_ALPHA)),
+        *(Column.for_quantity(q, over="OP>=2") for q in (VSS, PSA, KAPPA, VOXEL_ALPHA)),
         Column("within", "within a frame", 3, "lower", over="Disagreement"),
         Column("between", "between frames", 3, "lower", over="Disagreement"),
-        Column.of(FLIP_RATE),
+        Column.for_quantity(FLIP_RATE),
     )
     numbers: tuple[Number, ...] = (
         lambda stats: stats.headline.alpha.ends,
@@ -91,10 +91,10 @@ def class_agreement(result: Result) -> list[Table]:
         return []
     columns = (
         Column("observations", "Observations", 0),
-        Column.of(ALPHA),
+        Column.for_quantity(ALPHA),
         Column("counts_for_verdict", "Counts for verdict"),
         Column("unstable_percent", "Unstable (%)", 0, "lower"),
-        *(Column.of(q, over="OP>=2") for q in (KAPPA, VOXEL_ALPHA)),
+        *(Column.for_quantity(q, over="OP>=2") for q in (KAPPA, VOXEL_ALPHA)),
     )
     cells = [row[1:] for group in groups for row in group.rows]
     filled = [k for k in range(len(columns)) if any(_has_content(row[k]) for row in cells)]
@@ -134,7 +134,7 @@ def ranges(result: Result) -> list[Table]:
         return []
     columns = (
         Column("range", "Range (m)"), Column("observations_percent", "Observations (%)", 1),
-        Column("spots", "Spots seen twice", 0), Column.of(ALPHA),
+        Column("spots", "Spots seen twice", 0), Column.for_quantity(ALPHA),
     )  # fmt: skip
     caption = (
         "The range of an observation is the distance from which a spot was seen; two of one spot count together where"
@@ -164,7 +164,7 @@ def merges(result: Result) -> list[Table]:
     columns = (
         *((Column("scene", "Scene"),) if several else ()),
         Column("first", "Merged"), Column("second", "With"), Column("groups", "Groups left", 0),
-        Column("effective", "Effective", 1), Column.of(ALPHA),
+        Column("effective", "Effective", 1), Column.for_quantity(ALPHA),
     )  # fmt: skip
     caption = (
         "Of all merges of two groups of classes each row has the one that raises alpha most, until two groups are left."
@@ -246,7 +246,7 @@ def _frame_rows(record: Record, outlying: OutlyingFrames) -> Iterator[Row]:
 def uncertainty(result: Result) -> list[Table]:
     """Return the entropy of the belief, within frames and between them."""
     columns = (
-        Column.of(ENTROPY, over="OP>=2"),
+        Column.for_quantity(ENTROPY, over="OP>=2"),
         Column("within", "within frames", 4, "lower"),
         Column("between", "between frames", 4, "lower"),
         Column("within_percent", "within (%)", 0),
@@ -280,7 +280,7 @@ def verdicts(result: Result) -> list[Table]:
         Column("verdict", "Verdict"),
         Column("of_all", "Of all"),
         Column("probability_percent", "Probability (%)", 0),
-        Column.of(ALPHA),
+        Column.for_quantity(ALPHA),
         Column("labelled_percent", "Labelled (%)", 0, "higher"),
         Column("wrong_of_consistent_op3_percent", "Wrong of consistent (OP>=3, %)", 0, "lower"),
         REPEATED,

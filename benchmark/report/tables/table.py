@@ -55,7 +55,7 @@ class Column:
     over: str = ""
 
     @classmethod
-    def of(cls, quantity: Quantity, *, compared: bool = False, over: str = "") -> Column:
+    def for_quantity(cls, quantity: Quantity, *, compared: bool = False, over: str = "") -> Column:
         """Return the column of a measure, with the decimals of a summary or of a comparison.
 
         Its header holds its population, unless the heading `over` it does; its key does, unless each row has its own.

@@ -10,7 +10,7 @@ from semstab.data.measures import headlines
 from semstab.data.records import Record, Result
 from semstab.data.statistics import UNDEFINED, short
 from semstab.metrics import CATEGORIES
-from semstab.predict.prompts import Changes
+from semstab.predict.prompts import VocabularyChanges
 from semstab.report.means import ENOUGH
 from semstab.report.ranking import order_of_models
 from semstab.report.terminal.disagreement import class_lines, outlying_lines
@@ -112,7 +112,7 @@ def several_models(result: Result, records: Sequence[Record], width: int) -> Ite
 
 def _is_change_of(record: Record, models: Sequence[str]) -> bool:
     """Return whether it is a vocabulary of the run with other names."""
-    full, changes = Changes.of_model(record.unit.model)
+    full, changes = VocabularyChanges.of_model(record.unit.model)
     return bool(changes) and full in models
 
 

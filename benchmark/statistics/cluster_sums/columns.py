@@ -96,7 +96,7 @@ class FirstColumns(NamedTuple):
     class_predicted: int
 
     @classmethod
-    def of(cls, K: int, *, truth: bool) -> FirstColumns:
+    def for_classes(cls, K: int, *, truth: bool) -> FirstColumns:
         """Return the first columns of a layout with K classes."""
         columns = layout(K, truth=truth)
         return cls(*(columns[name].start if name in columns else -1 for name in cls._fields))

@@ -43,7 +43,7 @@ class ClusterIndex:
     per_group: float
 
     @classmethod
-    def of(
+    def from_cells(
         cls, cell: npt.NDArray[np.integer], frame: npt.NDArray[np.integer] | None, edge: float, per_group: float = 0
     ) -> ClusterIndex:
         """Index rows by cube (m, 3) and group of frames (m,), -1 where unknown; without frames all are of one."""

@@ -116,7 +116,7 @@ class ClusterSums:
         """The cube and the group of frames of each row."""
         groups = len(np.unique(self.frame[self.frame >= 0]))
         per_group = self.fused / groups if self.fused and groups and self.step else self.step
-        return ClusterIndex.of(self.cell, self.frame, self.edge, per_group)
+        return ClusterIndex.from_cells(self.cell, self.frame, self.edge, per_group)
 
     @property
     def frames(self) -> int:
