@@ -62,12 +62,12 @@ def charts(comparison: RunComparison) -> dict[str, list[dict[str, str]]]:
         for row in against.contrasts:
             if row.measure in quantities:
                 dot = (colors[against.other], against.other, row.difference)
-                panels.setdefault(quantities[row.measure].named, {}).setdefault(scope, []).append(dot)
+                panels.setdefault(quantities[row.measure].full_title, {}).setdefault(scope, []).append(dot)
     for quantity in (quantity for quantity in IN_CLASSES if quantity is not PSA):
         for of_run in comparison.overall if any(of_run.by_class for of_run in comparison.overall) else ():
             for row in (*of_run.contrasts, *of_run.by_class):
                 if row.measure == (MIOU.name if quantity is IOU and not row.of else quantity.name):
-                    dots = by_class.setdefault(quantity.named, {}).setdefault(row.of or "all classes", [])
+                    dots = by_class.setdefault(quantity.full_title, {}).setdefault(row.of or "all classes", [])
                     dots.append((colors[of_run.other], of_run.other, row.difference))
     less = f"less {comparison.base}"
     return {

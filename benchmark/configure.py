@@ -18,7 +18,7 @@ from semstab.predict.dataset import NAME as PREDICTED
 from semstab.predict.filters import parse
 from semstab.predict.predictor import NAME as STORED
 from semstab.predict.predictor import PredictorConfig, StoredSequence
-from semstab.predict.vocabulary import named
+from semstab.predict.vocabulary import vocabularies_by_name
 from semstab.predict.vocabulary_dataset import NAME as VOCABULARIES
 
 
@@ -197,7 +197,7 @@ def with_vocabularies(config: Config, files: Sequence[Path]) -> Config:
     Raises:
         ConfigError: If a file is no vocabulary.
     """
-    vocabularies = named(files)
+    vocabularies = vocabularies_by_name(files)
     options = {"dataset": config.dataset.model_dump(mode="json"), "vocabularies": [str(file) for file in files]}
     models = config.models
     if models is not None:

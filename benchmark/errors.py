@@ -82,12 +82,12 @@ def nearest(name: str, names: Sequence[str]) -> str:
     return f"did you mean '{near[0]}'?" if near else f"known: {', '.join(names) or 'none'}"
 
 
-def shown(text: str, keep: str = "") -> str:
+def printable(text: str, keep: str = "") -> str:
     r"""Return a text for people, with codes for characters that have no shape of their own, but for those to keep.
 
     These are what steers a terminal (ESC, carriage return), turns the direction of writing, or cannot be seen.
 
-    >>> shown("a\x1b[31mb\u202ec")
+    >>> printable("a\x1b[31mb\u202ec")
     'a\\x1b[31mb\\u202ec'
     """
     return "".join(c if c.isprintable() or c in keep else c.encode("unicode_escape").decode() for c in text)
@@ -101,7 +101,7 @@ def sanitize(text: str) -> str:
     """
     head = LONGEST_LINE * 2 // 3
     ends = text[:LONGEST_LINE] + text[LONGEST_LINE:][-LONGEST_LINE:]
-    line = shown(ends)
+    line = printable(ends)
     is_short = len(text) <= 2 * LONGEST_LINE and len(line) <= LONGEST_LINE
     return line if is_short else f"{line[:head]} ... {line[head + 5 - LONGEST_LINE :]}"
 

@@ -116,7 +116,7 @@ def tasks_of(scene: Scene, config: Config, others: Sequence[str] = ()) -> Iterat
         predicted = [*dict.fromkeys((*source.classes, *target.classes))]
         for setting, classes in (("classes", target.classes), ("predicted_classes", predicted)):
             for name in getattr(config.exclude, setting):
-                if name not in classes and not (setting == "predicted_classes" and mapping.named([name])):
+                if name not in classes and not (setting == "predicted_classes" and mapping.positions_of([name])):
                     raise ConfigError(f"{scene.name}: exclude.{setting}: no class '{name}'; {nearest(name, classes)}")
         fused_by = tuple(backend.name for backend in config.fused_by() if applies(backend, scene.name, model))
         yield Task(
@@ -174,7 +174,7 @@ def read(task: Task, index: int, pixel_stride: int = 1, *, color: bool = False) 
 
 def prepare(task: Task, frame: Frame, pixel_stride: int = 1) -> Frame:
     """Return a scene's frame, ready to fuse: no moving things, rows 0..K-1 of the label space, noise, pixel stride."""
-    classes = task.mapping.named(task.exclude.predicted_classes)
+    classes = task.mapping.positions_of(task.exclude.predicted_classes)
     if frame.labels is not None:
         classes = tuple(task.mapping.source.ids[k] for k in classes)
     frame = leave_out(frame, classes, masks=task.exclude.masks)

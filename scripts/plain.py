@@ -1,9 +1,9 @@
-"""Find habits of English that make sentences hard to read: `python scripts/plain.py [FILE ...]`, exit code 1 if any.
+"""Find names and English that make code hard to read: `python scripts/plain.py [FILE ...]`, exit code 1 if any.
 
 It reads docstrings, comments and texts of Python files, prose and table cells of Markdown pages, and the Markdown cells
 of notebooks: of the named files, or of all files in git without the tests. Code and texts in backticks are left out.
 CONTRIBUTING.md says what to write instead; a sentence that a rule meets is written again, the word is not replaced.
-This file is left out: it lists them.
+This file is left out: it lists them. Of Python files, tests as well, it reads the names of variables and functions.
 """
 
 from __future__ import annotations
@@ -39,6 +39,13 @@ RULES = {
 
 INDENTED = re.compile(r"(?<=\n)\n(?: {4}.*(?:\n|$))+")
 """A paragraph of a module's docstring in which every line is indented: commands or a table."""
+
+VAGUE = {"each", "own", "known", "seen", "named", "shown", "kept"}
+"""Names of variables that do not say what a variable holds."""
+
+VAGUE_NAME, VAGUE_FUNCTION = "a variable's name says what it holds", "a function's name says what it does"
+MOST_LETTERS = 80
+LONG_NAME = f"a test's name has at most {MOST_LETTERS} characters: one behaviour"
 
 BEGINS = re.compile(r"(?:What|Of|Whether|Which|Those|That)\b")
 BEGIN, LONG = "a docstring begins with What, Of, Whether, Which, Those, That", f"more than {MOST_WORDS} words"
@@ -80,6 +87,30 @@ def python_texts(source: str) -> Iterator[Text]:
     for token in tokenize.generate_tokens(io.StringIO(source).readline):
         if token.type == tokenize.COMMENT:
             yield Text(token.start[0], token.string.lstrip("# "))
+
+
+def names(source: str) -> Iterator[tuple[int, str, str]]:
+    """Yield the line of a name that a rule meets, the rule, and the name; fields of a class are not variables."""
+    tree = ast.parse(source)
+    classes = [node for node in ast.walk(tree) if isinstance(node, ast.ClassDef)]
+    fields = {
+        id(statement.target) for node in classes for statement in node.body if isinstance(statement, ast.AnnAssign)
+    }
+    for node in ast.walk(tree):
+        if (
+            isinstance(node, ast.Name)
+            and isinstance(node.ctx, ast.Store)
+            and id(node) not in fields
+            and node.id in VAGUE
+        ):
+            yield node.lineno, VAGUE_NAME, node.id
+        elif isinstance(node, ast.arg) and node.arg in VAGUE:
+            yield node.lineno, VAGUE_NAME, node.arg
+        elif isinstance(node, ast.FunctionDef):
+            if node.name in VAGUE | {"of"}:
+                yield node.lineno, VAGUE_FUNCTION, node.name
+            if node.name.startswith("test_") and len(node.name) > MOST_LETTERS:
+                yield node.lineno, LONG_NAME, node.name
 
 
 def is_code(text: str) -> bool:
@@ -126,7 +157,11 @@ TEXTS = {".py": python_texts, ".md": page_texts, ".ipynb": notebook_texts}
 
 
 def findings(file: str, source: str) -> Iterator[Offence]:
-    """Yield what the rules meet in a file."""
+    """Yield what the rules meet in a file; of a test its names alone."""
+    if file.endswith(".py"):
+        yield from (Offence(file, *name) for name in names(source))
+    if file.startswith("tests/"):
+        return
     for text in TEXTS.get(Path(file).suffix, page_texts)(source):
         content = re.sub(r"(?m)`[^`]*`|^ *(?:>>>|\.\.\.).*", "X", text.content)
         if text.docstring and BEGINS.match(content):
@@ -142,7 +177,7 @@ def findings(file: str, source: str) -> Iterator[Offence]:
 
 
 def files() -> list[str]:
-    """Return the Python files, pages and notebooks of the repository, without tests, generated pages and links."""
+    """Return the Python files, pages and notebooks of the repository, without generated pages and links."""
     listed = subprocess.run(["git", "ls-files"], cwd=ROOT, capture_output=True, text=True, check=True).stdout.split(
         "\n"
     )
@@ -150,16 +185,16 @@ def files() -> list[str]:
         name
         for name in listed
         if name.endswith(tuple(TEXTS))
-        and not name.startswith(("tests/", "docs/reference/", "src/"))
+        and not name.startswith(("docs/reference/", "src/"))
         and name != "scripts/plain.py"
         and not (ROOT / name).is_symlink()
     ]
 
 
-def main(names: list[str]) -> int:
+def main(given: list[str]) -> int:
     """Print findings by file, and their number by rule; return the exit code."""
     found = sorted(
-        {finding for name in names or files() for finding in findings(name, (ROOT / name).read_text(encoding="utf-8"))}
+        {finding for name in given or files() for finding in findings(name, (ROOT / name).read_text(encoding="utf-8"))}
     )
     for finding in found:
         print(f"{finding.file}:{finding.line}: {finding.rule}: ...{finding.text}...")

@@ -216,6 +216,6 @@ def main(drives: int = 20, seed: int = 0, only: str = "") -> None:
             continue
         seeds = range(seed, seed + (drives if mistake.name != "none" else 2 * drives))
         lines = [said(mistake.plant(drive(seed, swept=mistake.swept))) for seed in seeds]
-        named = [any(part in line for part in mistake.said for line in of_drive) for of_drive in lines]
-        other = sum(bool(of_drive) and not is_named for of_drive, is_named in zip(lines, named, strict=True))
-        cases.row([mistake.name, *map(str, (len(seeds), sum(named), other, len(seeds) - sum(named) - other))])
+        found = [any(part in line for part in mistake.said for line in of_drive) for of_drive in lines]
+        other = sum(bool(of_drive) and not is_named for of_drive, is_named in zip(lines, found, strict=True))
+        cases.row([mistake.name, *map(str, (len(seeds), sum(found), other, len(seeds) - sum(found) - other))])

@@ -117,7 +117,7 @@ def course(frames: int, rng: np.random.Generator) -> np.ndarray:
     return poses
 
 
-def named(made: MadeScene, bad: bool, rng: np.random.Generator) -> tuple[set[int], set[int]]:
+def planted_and_found(made: MadeScene, bad: bool, rng: np.random.Generator) -> tuple[set[int], set[int]]:
     """Return the frames that are bad, and those that are named."""
     first, sampler, planted = int(rng.integers(THIRD)), Sampler(made.K), set[int]()
     for frame in made.frames(rng):
@@ -139,7 +139,7 @@ def main(trials: int = 100, seed: int = 0) -> None:
         innocent = exact = found = planted = 0
         for trial in range(trials):
             rng = np.random.default_rng([seed, trial, bad])
-            truth, blamed = named(MadeScene.drawn(np.random.default_rng([seed, trial]), uneven), bad, rng)
+            truth, blamed = planted_and_found(MadeScene.drawn(np.random.default_rng([seed, trial]), uneven), bad, rng)
             innocent, exact = innocent + bool(blamed - truth), exact + (blamed == truth)
             found, planted = found + len(blamed & truth), planted + len(truth)
         share = f"{found / planted:.3f}" if planted else "-"

@@ -187,7 +187,7 @@ class Counts:
     def add(self, spots: SpotObservations, mover: np.ndarray, far: np.ndarray, counted: np.ndarray) -> None:
         """Add spots (n,): on a mover, on one that went by its length, with answers."""
         assert spots.votes is not None
-        moved, told = spots.votes.moved & counted, spots.votes.known & counted
+        moved, told = spots.votes.moved & counted, spots.votes.decided & counted
         self.called, self.right = self.called + int(moved.sum()), self.right + int((moved & mover).sum())
         self.movers, self.known = self.movers + int(far.sum()), self.known + int((far & told).sum())
         self.found += int((far & moved).sum())
@@ -236,7 +236,9 @@ def made(scenes: int, seed: int, noises: tuple[float, ...], movers: int) -> None
                 if box.speed and noise == noises[0]:
                     of_object = on == number
                     sums = by_speed.setdefault((box.way, round(abs(box.speed) / box.size[0], 3)), [0, 0, 0])
-                    for k, some in enumerate((of_object, of_object & spots.votes.known, of_object & spots.votes.moved)):
+                    for k, some in enumerate(
+                        (of_object, of_object & spots.votes.decided, of_object & spots.votes.moved)
+                    ):
                         sums[k] += int(some.sum())
         off = np.array(counts.errors)
         share = f"{off.mean():.3f}, {off.max():.2f}, {np.count_nonzero(off > 0.1)}" if movers else "-"
@@ -288,7 +290,7 @@ def real(data: Path) -> None:
         spots = sampler.sample()
         votes, answered = spots.votes, np.unique(spots.spot)
         assert votes is not None
-        is_told, moved = votes.known[answered], votes.moved[answered]
+        is_told, moved = votes.decided[answered], votes.moved[answered]
         share = f"{100 * moved.sum() / max(is_told.sum(), 1):.3f} %"
         chance, gap = f"{100 * votes.false_share:.4f} %", f"{100 * votes.gap:.1f} %"
         told = f"{100 * is_told.mean():.0f} %"

@@ -150,7 +150,7 @@ def _of_street(scene: Scene, scans: list[tuple[Float64, UInt8]]) -> tuple[Counts
     spots, first, counts = sampler.sample(), first_answers(sampler), Counts()
     counts.add(spots, (first == MOVES) | (first == WENT), first == WENT, (first >= 0) & (first != UNSAID))
     assert spots.votes is not None
-    return counts, float(spots.votes.known[first >= 0].mean())
+    return counts, float(spots.votes.decided[first >= 0].mean())
 
 
 def _on_image(frame: Frame, world: Float64, labels: np.ndarray) -> np.ndarray:

@@ -41,7 +41,7 @@ class Street:
         return zip(self.scans, self.ids, self.poses, strict=True)
 
     @property
-    def known(self):
+    def stored_ids(self):
         """The stored ids that there are, ascending, those of IDS among them."""
         return np.unique(np.concatenate([IDS, *self.ids]))
 
@@ -97,11 +97,11 @@ def _cast(origin, rays, boxes):
 def write_street(folder, street):
     """Write it with its true labels, and predictions of three models: right, flipped in each third scan, worse far."""
     rng = np.random.default_rng(1)
-    classes = [Scan(points, np.searchsorted(street.known, ids), T) for points, ids, T in street]
-    names = write_semantickitti(folder, classes, street.known, TO_CAMERA)
+    classes = [Scan(points, np.searchsorted(street.stored_ids, ids), T) for points, ids, T in street]
+    names = write_semantickitti(folder, classes, street.stored_ids, TO_CAMERA)
     for k, (name, scan) in enumerate(zip(names, classes, strict=True)):
         far = np.clip((np.linalg.norm(scan.points, axis=1) - 12) / 70, 0, 0.8)
         for model, share in (("clean", 0.0), ("flips", 0.25 if k % 3 == 1 else 0.0), ("far", far)):
             wrong = rng.random(len(scan.walls)) < share
             predicted = np.where(wrong, rng.integers(0, len(IDS), len(scan.walls)), scan.walls)
-            predict_semantickitti(folder, name, predicted, model, street.known)
+            predict_semantickitti(folder, name, predicted, model, street.stored_ids)

@@ -25,7 +25,7 @@ def vote(*labels):
     return fuse([sight_line(t, [(0.5, label)]) for t, label in enumerate(labels)])
 
 
-def named(table, thresholds=None):
+def names_of(table, thresholds=None):
     return [CATEGORIES[c] for c in categories(table, thresholds)]
 
 
@@ -47,7 +47,7 @@ def named(table, thresholds=None):
     ],
 )
 def test_a_vote_has_its_category(labels, category):
-    assert named(vote(*labels)) == [category]
+    assert names_of(vote(*labels)) == [category]
 
 
 def test_the_numbers_of_the_thresholds_docstring():
@@ -62,10 +62,10 @@ def test_the_numbers_of_the_thresholds_docstring():
 def test_thresholds_count_as_reached():
     table = vote(0, 0, 0, 1)
     drift, entropy = float(sbd(table)[0]), float(entropy_bits(normalise(table.evidence))[0])
-    assert named(table, CategoryThresholds(min_op=5)) == ["low persistence"]
-    assert named(table, CategoryThresholds(min_op=4, drifting_bits=drift)) == ["drifting"]
-    assert named(table, CategoryThresholds(drifting_bits=drift + 1e-9, uncertain_bits=entropy)) == ["uncertain"]
-    assert named(table, CategoryThresholds(drifting_bits=drift + 1e-9, uncertain_bits=entropy + 1e-9)) == ["stable"]
+    assert names_of(table, CategoryThresholds(min_op=5)) == ["low persistence"]
+    assert names_of(table, CategoryThresholds(min_op=4, drifting_bits=drift)) == ["drifting"]
+    assert names_of(table, CategoryThresholds(drifting_bits=drift + 1e-9, uncertain_bits=entropy)) == ["uncertain"]
+    assert names_of(table, CategoryThresholds(drifting_bits=drift + 1e-9, uncertain_bits=entropy + 1e-9)) == ["stable"]
 
 
 @pytest.mark.parametrize(
@@ -82,7 +82,7 @@ def test_thresholds_out_of_range_are_refused(settings, name):
 def test_each_voxel_is_what_its_numbers_say(sequence):
     table = fuse(as_frames(sequence))
     entropy, drift = entropy_bits(normalise(table.evidence)), sbd(table)
-    for row, name in enumerate(named(table)):
+    for row, name in enumerate(names_of(table)):
         seen_enough, moves, ambiguous = table.op[row] >= 3, drift[row] >= 0.05, entropy[row] >= 0.8
         assert (name == "low persistence") == (not seen_enough)
         assert (name == "drifting") == bool(seen_enough and moves)

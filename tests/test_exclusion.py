@@ -135,9 +135,9 @@ def test_a_name_of_the_run_s_own_taxonomy_leaves_out_all_that_becomes_it(tmp_pat
     source = LabelSpace(name="s", classes=("static car", "moving car", "road"))
     target = LabelSpace(name="t", classes=("car", "road"), members=(("static car", "moving car"), ()), ids=(0, 1))
     mapping = source.mapping_to(target)
-    assert mapping.named(["car"]) == (0, 1)
-    assert mapping.named(["Moving_Car"]) == (1,)
-    assert mapping.named(["tree"]) == ()
+    assert mapping.positions_of(["car"]) == (0, 1)
+    assert mapping.positions_of(["Moving_Car"]) == (1,)
+    assert mapping.positions_of(["tree"]) == ()
 
 
 def test_an_unknown_class_is_refused_with_the_nearest(root) -> None:

@@ -24,13 +24,13 @@ def beliefs(n=6, seed=0):
     return raw / raw.sum(axis=3, keepdims=True)
 
 
-def shown(k=0):
+def shown_image(k=0):
     return Shown(predicted_scene.image(k), predicted_scene.frame(k, 1))
 
 
 def after(text, given):
     step = parse(text)()
-    return [step(belief, shown(k)) for k, belief in enumerate(given)]
+    return [step(belief, shown_image(k)) for k, belief in enumerate(given)]
 
 
 def moved(values):

@@ -21,11 +21,11 @@ def result():
     (record,) = semstab.fuse(list(flight(10, flicker=0.1)), voxel_size=0.1, classes="abc").records
     return dataclasses.replace(
         semstab.fuse(list(flight(3)), voxel_size=0.1, classes="abc"),
-        records=tuple(named(record, f"scene{n:02d}", model) for n in range(11) for model in MODELS),
+        records=tuple(renamed(record, f"scene{n:02d}", model) for n in range(11) for model in MODELS),
     )
 
 
-def named(record, scene, model):
+def renamed(record, scene, model):
     unit = dataclasses.replace(record.unit, scene=scene, model=model)
     return dataclasses.replace(record, unit=unit)
 

@@ -52,15 +52,15 @@ def test_the_overlap_of_a_flight_in_legs_is_seen(root, monkeypatch) -> None:
     plan, _ = planned(root)
     x, y = (axis.ravel() for axis in np.indices((20, 20)))
 
-    def seen(index: int) -> np.ndarray:
+    def voxels_of_frame(index: int) -> np.ndarray:
         leg, along = divmod(index, 20)
         return np.stack([x + 12 * leg, y + 10 * along, np.zeros(400, int)], axis=1)
 
     monkeypatch.setattr(map_size, "geometry", lambda task, settings, index: index)
-    monkeypatch.setattr(map_size, "voxels_in", lambda index, voxel_size: seen(index))
+    monkeypatch.setattr(map_size, "voxels_in", lambda index, voxel_size: voxels_of_frame(index))
     flight = dataclasses.replace(plan.tasks[0], indices=[*range(240)])
     size = map_size.map_size(flight, plan.units[0].config)
-    true = len(np.unique(np.concatenate([seen(index) for index in range(240)]), axis=0))
+    true = len(np.unique(np.concatenate([voxels_of_frame(index) for index in range(240)]), axis=0))
     assert size.voxels == pytest.approx(true, rel=0.1)
     assert size.observations == pytest.approx(240 * 400)
 
@@ -69,11 +69,11 @@ def test_of_large_frames_a_part_is_looked_at(root, monkeypatch) -> None:
     plan, _ = planned(root)
     x, y, z = (axis.ravel() for axis in np.indices((300, 300, 3)))
 
-    def seen(index: int) -> np.ndarray:
+    def voxels_of_frame(index: int) -> np.ndarray:
         return np.stack([x + 30 * index, y, z], axis=1)
 
     monkeypatch.setattr(map_size, "geometry", lambda task, settings, index: index)
-    monkeypatch.setattr(map_size, "voxels_in", lambda index, voxel_size: seen(index))
+    monkeypatch.setattr(map_size, "voxels_in", lambda index, voxel_size: voxels_of_frame(index))
     size = map_size.map_size(dataclasses.replace(plan.tasks[0], indices=[*range(10)]), plan.units[0].config)
     assert size.voxels == pytest.approx(570 * 300 * 3, rel=0.03)
     assert size.by_column == 3

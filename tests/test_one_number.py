@@ -196,7 +196,7 @@ def test_python_and_summary_json_have_them_under_names_with_the_population(run):
 def test_compare_and_gate_judge_the_numbers_of_the_screen(run):
     """A run compared with itself has its own numbers, each under the name that has its population."""
     result, folder = run
-    titles = {quantity.name: quantity.named for quantity in quantities()}
+    titles = {quantity.name: quantity.full_title for quantity in quantities()}
     names = {model: f"{folder}:{model}" for model in result.models}
     compared = {model: semstab.compare(source, source) for model, source in names.items()}
     for record in result.select():
@@ -241,9 +241,9 @@ def test_the_recording_has_them_in_its_text_and_at_the_end_of_its_series(run):
         logged = [row["TextLog:text"][0] for row in rows[path(unit.scene, "log")] if row.get("TextLog:text")]
         (text,) = (text for text in logged if text.startswith(f"{unit.model}, {unit.backend}: "))
         for measure in measures():
-            printed = re.search(rf"{re.escape(measure.named)} (\S+?)[ ,]", text)[1]
+            printed = re.search(rf"{re.escape(measure.full_title)} (\S+?)[ ,]", text)[1]
             value = table.recurrent.means.value[measure.key]
-            assert (printed == "nan" and math.isnan(value)) or agree(printed, value), measure.named
+            assert (printed == "nan" and math.isnan(value)) or agree(printed, value), measure.full_title
         (*_, verdict) = (row["TextDocument:text"][0] for row in rows[path(unit.scene, "verdict")])
         assert f"alpha {short(record.statistics.headline.alpha.value)}" in verdict or (
             f" {short(record.statistics.headline.alpha.value)} (" in verdict

@@ -109,3 +109,34 @@ def test_plain_sentences_pass(tmp_path, capsys):
     file.write_text("It is drawn anew.\n")
     assert plain.main([str(file)]) == 1
     assert f"{file}:1: anew" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize(
+    "source",
+    [
+        "each = 1\n",
+        "for own in files: pass\n",
+        "with folder as kept: pass\n",
+        "f(lambda seen: 1)\n",
+        "def f(known): pass\n",
+        "rows = [0 for shown in rows]\n",
+        "class A:\n    def f(self):\n        named: int = 1\n",
+    ],
+)
+def test_a_variable_whose_name_says_nothing_is_found_in_tests_too(source):
+    assert rules("a.py", source) == rules("tests/test_a.py", source) == [plain.VAGUE_NAME]
+
+
+def test_functions_and_tests_have_names_that_say_what_they_do():
+    assert rules("a.py", "class A:\n    def of(self): pass\n") == [plain.VAGUE_FUNCTION]
+    assert rules("a.py", f"def test_{'x' * 76}(): pass\n") == [plain.LONG_NAME.partition(":")[0]]
+    assert rules("a.py", f"def test_{'x' * 75}(): pass\n") == []
+
+
+def test_a_field_an_attribute_and_an_argument_of_a_call_may_have_such_a_name():
+    """They are named where they are declared, beside what they belong to."""
+    assert rules("a.py", "class A:\n    seen: int\n\n\nA().seen = f(known=a.own)\n") == []
+
+
+def test_english_of_tests_is_not_looked_at():
+    assert rules("tests/test_a.py", "# Drops so many frames.\n") == []

@@ -799,7 +799,7 @@ def test_the_real_flight_in_a_turned_frame_lies_where_it_lay(brighton, project, 
         ours, theirs = here.geometry(9), there.geometry(9)
         both = (ours.depth > 0) & (theirs.depth > 0)
         assert np.mean((ours.depth > 0) != (theirs.depth > 0)) < 3e-4
-        gap = here.georeference.projected(seen(ours, both)) - there.georeference.projected(seen(theirs, both))
+        gap = here.georeference.projected(points_at(ours, both)) - there.georeference.projected(points_at(theirs, both))
         assert np.quantile(np.abs(gap), 0.999) < 0.001
 
 
@@ -854,7 +854,7 @@ def test_a_bundle_of_images_that_distort_is_of_the_photographs(tmp_path, radial)
         np.testing.assert_allclose(ours.depth, theirs.depth, rtol=1e-4)
 
 
-def seen(frame, mask: np.ndarray) -> np.ndarray:
+def points_at(frame, mask: np.ndarray) -> np.ndarray:
     """(n, 3) the points of the scene at pixels of a frame."""
     K, (v, u) = frame.intrinsics, np.nonzero(mask)
     rays = np.stack([(u - K.cx) / K.fx, (v - K.cy) / K.fy, np.ones(len(u))], axis=1)

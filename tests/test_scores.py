@@ -134,7 +134,7 @@ def test_the_fast_logarithm(features, monkeypatch) -> None:
         monkeypatch.setattr("numba.core.codegen.JITCPUCodegen.magic_tuple", lambda _: ("", "", features))
 
     @numba.njit
-    def each(p, found):
+    def logarithms(p, found):
         sums = np.zeros(LANES)
         for i in range(p.shape[0]):
             sums[i % LANES] = p[i]
@@ -144,7 +144,7 @@ def test_the_fast_logarithm(features, monkeypatch) -> None:
 
     p = np.concatenate([[0.0, 0.5, 1.0, 1e-300], np.random.default_rng(0).random(1000), 1 + 1e-9 * np.arange(-50, 50)])
     found = np.empty((len(p), 2))
-    each(p, found)
+    logarithms(p, found)
     expected = p * np.log2(np.where(p > 0, p, 1).astype(np.longdouble))
     for each_found in found.T:
         np.testing.assert_allclose(each_found, expected.astype(np.float64), rtol=2e-15, atol=1e-300)

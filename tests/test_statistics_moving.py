@@ -398,7 +398,7 @@ def test_a_spot_at_an_edge_that_other_views_see_is_not_told_by_spots_that_moved(
     firm = np.array([True, True, True, False, False])
     votes = memory.votes_on(point, np.full(5, 2, np.int32), firm, 5, 0.0, 5.0)
     assert votes.moved.tolist() == [True, True, True, False, True]
-    assert not votes.known[3]
+    assert not votes.decided[3]
 
 
 def test_an_oncoming_car_is_found_in_scans_by_what_it_left_behind() -> None:
@@ -408,7 +408,7 @@ def test_an_oncoming_car_is_found_in_scans_by_what_it_left_behind() -> None:
     assert spots.votes is not None
     assert spots.votes.moved[drives].mean() > 0.8
     assert not spots.votes.moved[classes(spots) == 0].any()
-    assert spots.votes.known[classes(spots) >= 0].mean() > 0.5
+    assert spots.votes.decided[classes(spots) >= 0].mean() > 0.5
     assert still[1].votes is not None
     assert not still[1].votes.moved.any()
 

@@ -17,7 +17,7 @@ from semstab.core.files import write_image
 from semstab.datasets import open_dataset
 from semstab.datasets.posed_folder import PosedFolder
 from semstab.errors import ConfigError, DataError
-from semstab.predict.vocabulary import Vocabulary, named
+from semstab.predict.vocabulary import Vocabulary, vocabularies_by_name
 from semstab.statistics.accumulate import sums_of_spots
 from semstab.statistics.cluster_sums import value
 
@@ -208,7 +208,7 @@ def test_names_change_as_the_text_beside_the_file_says(tmp_path, monkeypatch):
     path = tmp_path / "five.yaml"
     path.write_text(yaml.safe_dump({"names": [*CLASSES], "encoder": {"checkpoint": "clip"}}))
     texts = ["", ",without=crate,add=lamp", ",rename=shelf:rack"]
-    full, other, renamed = module.named([f"{path}{text}" for text in texts]).values()
+    full, other, renamed = module.vocabularies_by_name([f"{path}{text}" for text in texts]).values()
     assert other.space.name == "five,without=crate,add=lamp"
     assert other.space.classes == (*(name for name in CLASSES if name != "crate"), "lamp")
     assert renamed.space.classes == tuple("rack" if name == "shelf" else name for name in CLASSES)
@@ -293,9 +293,9 @@ def test_two_vocabularies_have_two_names(tmp_path):
     one, other = vocabulary(tmp_path), vocabulary(tmp_path, "other", name_="five")
     other.write_text(other.read_text().replace("name_", "name"))
     with pytest.raises(ConfigError, match="two vocabularies are called 'five'"):
-        named([one, other])
+        vocabularies_by_name([one, other])
     with pytest.raises((ConfigError, DataError)):
-        named([tmp_path / "none.yaml"])
+        vocabularies_by_name([tmp_path / "none.yaml"])
 
 
 def test_a_text_encoder_makes_embeddings(tmp_path):
@@ -318,7 +318,7 @@ def test_a_text_encoder_makes_embeddings(tmp_path):
             mean = torch.stack(parts).mean(dim=0)
         assert row == pytest.approx((mean / mean.norm()).numpy(), abs=1e-5)
     assert words.of.tolist() == [0, 1, 1]
-    changed = named([f"{path},without=road,add=grass,add=sky", f"{path},rename=road:street"])
+    changed = vocabularies_by_name([f"{path},without=road,add=grass,add=sky", f"{path},rename=road:street"])
     less, more = changed.values()
     assert less.space.classes == ("tree", "grass", "sky")
     assert np.array_equal(less.embeddings[:2], words.embeddings[1:])

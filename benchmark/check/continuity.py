@@ -159,7 +159,7 @@ class Neighbours:
         """Compare few frames, of which one pair may not fit: nothing is usual."""
         return dataclasses.replace(chained(((p, self._view(p)) for p in positions), self._configured), usual=0.0)
 
-    def named(self, position: int) -> str:
+    def frame_name(self, position: int) -> str:
         """Return the name of a frame for people."""
         return self.scene.frame_name(self.indices[position])
 
@@ -178,7 +178,7 @@ class Neighbours:
         around = max(chain.error(first - 2, first - 1), chain.error(first, first + 1))
         return self._jump(
             (first - 1, first),
-            f"depth reprojects with {across:.1%} error from frame {self.named(first - 1)} to it, with {around:.2%}"
+            f"depth reprojects with {across:.1%} error from frame {self.frame_name(first - 1)} to it, with {around:.2%}"
             " among the frames before and among those after",
         )
 
@@ -186,7 +186,7 @@ class Neighbours:
         """Return the line on poses that go on in another frame of reference, while the view goes on."""
         return self._jump(
             pair,
-            f"by its pose it sees nothing of what frame {self.named(pair[0])} sees, though their depth images are"
+            f"by its pose it sees nothing of what frame {self.frame_name(pair[0])} sees, though their depth images are"
             " nearly the same: the poses from it on are in another frame of reference",
             "bring them into one",
         )
@@ -202,7 +202,7 @@ class Neighbours:
     def _jump(self, pair: Pair, why: str, mend: str = "correct the poses") -> str:
         before, index = (self.indices[position] for position in pair)
         return (
-            f"poses jump at frame {self.named(pair[1])}: {why}; {mend}, or fuse the two parts one by one"
+            f"poses jump at frame {self.frame_name(pair[1])}: {why}; {mend}, or fuse the two parts one by one"
             f" (--frames :{before + 1} and --frames {index}:)"
         )
 
@@ -216,7 +216,7 @@ class Neighbours:
             return None
         is_identity = any(np.allclose(poses[k], origin_of(self._configured), atol=1e-9) for k in lost)
         what = "the identity as pose" if is_identity else "the pose of a frame before once more"
-        frames = f"frame {self.named(lost[0])} has {what}"
+        frames = f"frame {self.frame_name(lost[0])} has {what}"
         if len(lost) > 1:
             frames = f"{len(lost)} frames have {what} ({self._list(lost, MOST_LOST)})"
         return (
@@ -251,9 +251,8 @@ class Neighbours:
     def _misfit(self, chain: Chain, position: int, neighbours: Pair) -> str:
         before, after = neighbours
         link, without = chain.links[before, position], chain.error(before, after)
-        text = (
-            f"frame {self.named(position)} does not fit frames {self.named(before)} and {self.named(after)} beside it"
-        )
+        beside = f"frames {self.frame_name(before)} and {self.frame_name(after)}"
+        text = f"frame {self.frame_name(position)} does not fit {beside} beside it"
         if not math.isfinite(link.error):
             return f"{text}, which see each other, but hardly anything of it: its pose or its depth is wrong"
         text += f": {link.error:.1%} error, they fit each other with {without:.2%}"
@@ -270,15 +269,16 @@ class Neighbours:
         for position, (before, after) in mislabelled[:MOST_NAMED]:
             agreement = max(chain.agreement(before, position), chain.agreement(position, after))
             yield (
-                f"labels of {self.source}: the map of frame {self.named(position)} ({self._file(position, 'labels')})"
-                f" agrees with those of the frames beside it in {agreement:.0%} of the points, they with each other in"
-                f" {chain.agreement(before, after):.0%}: is it of another frame? Predict it again"
+                f"labels of {self.source}: the map of frame {self.frame_name(position)}"
+                f" ({self._file(position, 'labels')}) agrees with those of the frames beside it in {agreement:.0%}"
+                f" of the points, they with each other in {chain.agreement(before, after):.0%}: is it of another frame?"
+                f" Predict it again"
             )
         if len(mislabelled) > MOST_NAMED:
             yield f"labels of {self.source}: so it is in {len(mislabelled) - MOST_NAMED} more frames"
 
     def _list(self, positions: Sequence[int], most: int = MOST_NAMED) -> str:
-        listed = ", ".join(map(self.named, positions[:most]))
+        listed = ", ".join(map(self.frame_name, positions[:most]))
         return f"{listed}, ..." if len(positions) > most else listed
 
     def _file(self, position: int, what: str) -> str:

@@ -152,7 +152,7 @@ def wrong_ids(neighbours: Neighbours, chain: Chain) -> str | None:
     changes = [change for change in (ids.renaming(place, 1) for place in range(1, ids.count)) if change.tells]
     rolling = [change for change in changes if change.ids]
     if len(rolling) >= max(LEAST_POINTS // 3, ROLLING * len(changes)):
-        frame_name = neighbours.named(chain.positions[rolling[0].at])
+        frame_name = neighbours.frame_name(chain.positions[rolling[0].at])
         return (
             f"have other ids from frame to frame, first from frame {frame_name} on ({_listed(rolling[0])}), and so at"
             f" {len(rolling)} of {len(changes)} frames: write class ids of one taxonomy in all frames"
@@ -167,7 +167,7 @@ def wrong_ids(neighbours: Neighbours, chain: Chain) -> str | None:
     first = ids.placed(min(separate, key=lambda change: change.at), REACH)
     repeats = {0: "", 1: ", and once more"}.get(more := len(separate) - 1, f", and {more} more times")
     return (
-        f"have other ids from frame {neighbours.named(chain.positions[first.at])} on{repeats}: {_listed(first)}"
+        f"have other ids from frame {neighbours.frame_name(chain.positions[first.at])} on{repeats}: {_listed(first)}"
         f" ({first.share:.0%} of the points of these classes): write the ids of one taxonomy in all frames"
     )
 
@@ -179,7 +179,7 @@ def _listed(renaming: Renaming) -> str:
 
 def remarks_on_maps(neighbours: Neighbours, chain: Chain) -> Iterator[str]:
     """Yield lines on maps that are empty, or of one class where those around have several; 'labels of X ...'."""
-    maps, frame_name = chain.maps, neighbours.named
+    maps, frame_name = chain.maps, neighbours.frame_name
     empty = [position for position, content in maps.items() if not content.labelled]
     if empty and len(empty) < len(maps):
         yield (

@@ -135,21 +135,21 @@ def with_order(verdict: Verdict, scene: Scene, indices: Sequence[int], ordered: 
         return verdict
     chain = ordered.chain
 
-    def named(position: int) -> str:
+    def scan_name(position: int) -> str:
         return scene.frame_name(indices[position])
 
     misfits = chain.misfits()
     if len(misfits) <= MOST_BAD * len(chain.positions):
-        verdict = verdict.remarking(*_said_of(misfits, chain, named))
+        verdict = verdict.remarking(*_said_of(misfits, chain, scan_name))
     rest = chain.without([position for position, _ in misfits])
     breaks = [(pair, chain.error(*pair), chain.usual) for pair in rest.breaks()]
     if (jump := breaks[0] if breaks else rest.shift()) is None:
         return verdict
     (before, first), error, usual = jump
     text = (
-        f"poses jump at scan {named(first)}: points of scans before it are {error:.2%} of their range off the surfaces"
-        f" of scans from it on, {usual:.2%} in others as far apart; correct the poses, or fuse the two parts one by one"
-        f" (--frames :{indices[before] + 1} and --frames {indices[first]}:)"
+        f"poses jump at scan {scan_name(first)}: points of scans before it are {error:.2%} of their range off the"
+        f" surfaces of scans from it on, {usual:.2%} in others as far apart; correct the poses, or fuse the two"
+        f" parts one by one (--frames :{indices[before] + 1} and --frames {indices[first]}:)"
     )
     return verdict.refuted(text) if error >= STRIKING_SHIFT * usual else verdict.remarking(text)
 

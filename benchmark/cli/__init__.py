@@ -24,7 +24,7 @@ from semstab.cli.result_commands import calibrate, compare, conform, export, gat
 from semstab.cli.run_commands import benchmark, filters, run, study
 from semstab.cli.show_commands import list_, show, view
 from semstab.core.process import configure_process
-from semstab.errors import OUT_OF_MEMORY, ConfigError, SemstabError, shown, summarize_error
+from semstab.errors import OUT_OF_MEMORY, ConfigError, SemstabError, printable, summarize_error
 
 # Ctrl-C may interrupt any code: an import, a callback from compiled code.
 
@@ -255,7 +255,7 @@ class _Once(logging.Filter):
         message = record.getMessage()
         new = message not in self._printed
         self._printed.add(message)
-        record.msg, record.args = shown(message, keep="\n"), ()
+        record.msg, record.args = printable(message, keep="\n"), ()
         return new
 
 

@@ -352,7 +352,7 @@ def _scene(scene: str, runs: Sequence[RunHandle], scope: Scope) -> tuple[SceneCo
     for n, of_all, of_classes in zip(numbers, everything, classes, strict=True):
         result = Against(names[n], of_all, of_classes)
         if common.regions is not None:
-            worse, name_frames = worse_areas(common, n), entries[n].named
+            worse, name_frames = worse_areas(common, n), entries[n].with_names
             changes[names[n]] = worse.changes
             result = dataclasses.replace(
                 result,

@@ -78,7 +78,7 @@ class Entry:
             return self.small[1]
         return _flicker(self.record.series)
 
-    def named(self, frames: Sequence[FrameShare]) -> tuple[FrameShare, ...]:
+    def with_names(self, frames: Sequence[FrameShare]) -> tuple[FrameShare, ...]:
         """Return frames with the names of their files, where the run stored them."""
         if self.record.series is None:
             return tuple(frames)

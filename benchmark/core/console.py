@@ -9,7 +9,7 @@ from typing import Any
 import rich.console
 from rich.segment import Segment
 
-from semstab.errors import shown
+from semstab.errors import printable
 
 WIDTH = 80
 """Columns that a text takes at most, unless the caller says otherwise."""
@@ -27,7 +27,7 @@ class Console(rich.console.Console):
             if segment.control or segment.text.isprintable():
                 yield segment
             else:
-                yield Segment(shown(segment.text, keep="\n"), segment.style)
+                yield Segment(printable(segment.text, keep="\n"), segment.style)
 
 
 def wrapped(text: str, width: int = WIDTH, *, begin: str = "  ", hanging: int = 4) -> list[str]:

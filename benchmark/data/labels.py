@@ -268,7 +268,7 @@ class LabelMapping:
                 f"taxonomy {self.target.name}: every class of {self.source.name} is ignored; nothing is left"
             )
 
-    def named(self, names: Iterable[str]) -> tuple[int, ...]:
+    def positions_of(self, names: Iterable[str]) -> tuple[int, ...]:
         """Return positions of the source classes that have one of these names, or become a class that has."""
         keys = {name_key(name) for name in names}
         rows = {row for row, name in enumerate(self.target.classes) if name_key(name) in keys}

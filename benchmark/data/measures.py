@@ -139,7 +139,7 @@ class Quantity:
         return f"{self.key}_op{self.op}" if self.op else self.key
 
     @property
-    def named(self) -> str:
+    def full_title(self) -> str:
         """The title with the population: 'VSS (OP>=3)'; two numbers of one name are one number."""
         return f"{self.title} ({self.population})" if self.op else self.title
 

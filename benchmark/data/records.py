@@ -413,7 +413,7 @@ class Result:
                 verdict, alpha = str(run.statistics.verdict), run.statistics.headline.alpha.text()
                 colors[verdict] = KIND_COLORS[KINDS.get(run.statistics.verdict.decisive, "bad")]
             rows.append([unit.scene, unit.model, unit.backend, verdict, alpha, table.voxels, *numbers])
-        titles = [measure.named for measure in measures()]
+        titles = [measure.full_title for measure in measures()]
         headers = [
             "scene",
             "model",

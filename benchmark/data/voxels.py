@@ -54,7 +54,7 @@ def to_pandas(columns: Mapping[str, Any]) -> pd.DataFrame:
     return to_arrow(columns).to_pandas()
 
 
-def named(rows: npt.NDArray[np.integer[Any]], names: Sequence[str]) -> pa.DictionaryArray:
+def name_column(rows: npt.NDArray[np.integer[Any]], names: Sequence[str]) -> pa.DictionaryArray:
     """Return a column of names by their rows."""
     import pyarrow as pa
 
@@ -271,7 +271,7 @@ class VoxelTable:
         evidence = self.evidence[:]
         return {
             "ix": self.ix, "iy": self.iy, "iz": self.iz, "x": x, "y": y, "z": z, "op": self.op,
-            "label": dominant(self), "class": named(dominant(self), names),
+            "label": dominant(self), "class": name_column(dominant(self), names),
             **{measure.key: measure.of(self) for measure in measures()},
             **{name: getattr(self, name) for name in self._types if name not in (*INDEX, "op", "evidence")},
             **{f"evidence_{name}": evidence[:, k] for k, name in enumerate(names)},

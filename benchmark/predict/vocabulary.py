@@ -292,7 +292,7 @@ def _encoded(encoder: EncoderSettings, words: list[str], path: Path) -> Float32:
     return text_embeddings(where, words, encoder.templates)
 
 
-def named(vocabularies: Sequence[Path]) -> dict[str, Vocabulary]:
+def vocabularies_by_name(vocabularies: Sequence[Path]) -> dict[str, Vocabulary]:
     """Return vocabularies by their names, with the changes that follow their files.
 
     'FILE,without=each' stands for the vocabulary of the file, and for the same without each of its names.

@@ -19,7 +19,7 @@ from semstab.data.labels import LabelSpace
 from semstab.datasets import Dataset, Filtering, Scene, open_dataset, resolved
 from semstab.datasets.relabelled import RelabelledScene
 from semstab.errors import ConfigError
-from semstab.predict.vocabulary import Vocabulary, named
+from semstab.predict.vocabulary import Vocabulary, vocabularies_by_name
 
 NAME = "vocabularies"
 
@@ -51,7 +51,7 @@ class VocabularyDataset(Dataset):
 
     def __init__(self, options: VocabularyOptions) -> None:
         self._dataset = open_dataset(options.dataset.name, options.dataset.options)
-        self._vocabularies = named(options.vocabularies)
+        self._vocabularies = vocabularies_by_name(options.vocabularies)
 
     @property
     def scenes(self) -> tuple[str, ...]:

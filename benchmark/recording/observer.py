@@ -149,7 +149,7 @@ class GroupLog:
         note += f"; {silent}" if silent else ""
         of_map = record.map_summary
         recurrent = of_map.recurrent
-        means = (f"{m.named} {recurrent[m]:.{m.digits[0]}f} {m.unit}".rstrip() for m in measures())
+        means = (f"{m.full_title} {recurrent[m]:.{m.digits[0]}f} {m.unit}".rstrip() for m in measures())
         text = (
             f"{unit.model}, {unit.backend}: {of_map.voxels:,} voxels, mean OP {of_map.mean_op:.2f},"
             f" {', '.join(means)} (K = {of_map.K}){note}"

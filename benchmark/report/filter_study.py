@@ -145,11 +145,11 @@ def of_interest(result: Result) -> Result:
     if not filters_by_model:
         return result
 
-    def shown(record: Record) -> bool:
+    def is_listed(record: Record) -> bool:
         quality = record.quality
         return quality is None or quality.filters in filters_by_model.get(quality.model, {quality.filters})
 
-    names = {record.unit.model for record in result.select() if shown(record)}
+    names = {record.unit.model for record in result.select() if is_listed(record)}
     records = tuple(record for record in result.records if record.unit.model in names)
     return dataclasses.replace(result, records=records)
 

@@ -205,9 +205,9 @@ def _numbers(
     for measure in headlines():
         value = short(together.recurrent[measure], digits=measure.digits[0]) if enough else "-"
         note = measure.unit
-        yield measure.named, value, note if enough else few
+        yield measure.full_title, value, note if enough else few
     overlap = macro_mean([miou(record) for record in records])
-    yield MIOU.named, "" if math.isnan(overlap) else short(overlap, digits=MIOU.digits[0]), "of the fused labels"
+    yield MIOU.full_title, "" if math.isnan(overlap) else short(overlap, digits=MIOU.digits[0]), "of the fused labels"
     wrong = [stats.headline.wrong_of_consistent_op3.value for stats in assessed]
     yield "consistent but wrong", mean(wrong, "{:.1f} %", 100), "of the consistent locations"
 
@@ -461,7 +461,7 @@ def _by_op(result: Result) -> Iterator[dict[str, str]]:
 
 def _sweeps(result: Result) -> Iterator[dict[str, str]]:
     """Yield alpha and the first headline measure by the settings of each sweep."""
-    first = [(measure.named, over_recurrent(measure)) for measure in headlines()[:1]]
+    first = [(measure.full_title, over_recurrent(measure)) for measure in headlines()[:1]]
     for sweep in swept(result):
         for title, take in (("alpha", lambda p: p.alpha.value), *first):
             lines = []

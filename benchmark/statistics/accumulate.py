@@ -96,7 +96,7 @@ class Cubes:
         """Return (G, K) for values of the entries of the voxels' evidence: their sums by cube and class."""
         return evidence.sums_by_class(self.at, self.count, *values)
 
-    def named(self, sums: Mapping[str, Float64]) -> ClusterSums:
+    def sums_by_name(self, sums: Mapping[str, Float64]) -> ClusterSums:
         """Return sums (G, C) over these cubes by name."""
         return ClusterSums.of_cubes(self.cell, self.edge, sums)
 
@@ -108,7 +108,7 @@ class Cubes:
         scale: Scale = "share",
     ) -> Interval:
         """Return the statistic of sums of columns (n, C), the second of which counts, with its interval."""
-        return estimate(self.named({"": self.sums(columns)}), Functional(("",), statistic, *bounds, scale))
+        return estimate(self.sums_by_name({"": self.sums(columns)}), Functional(("",), statistic, *bounds, scale))
 
 
 # --- Sums of a map ----------------------------------------------------------------------------------------------------

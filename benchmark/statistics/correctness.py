@@ -224,7 +224,7 @@ def quadrants(table: VoxelTable, truth: Truth, consistent: Float64, edge: float,
         return Quadrants(0, *[UNKNOWN] * 5)
     cubes = Cubes.from_table(table, edge, where=counted)
     parts = (likely * right, likely * ~right, (1 - likely) * right, (1 - likely) * ~right)
-    sums = cubes.named(cubes.means(dict(zip(QUADRANTS, parts, strict=True))))
+    sums = cubes.sums_by_name(cubes.means(dict(zip(QUADRANTS, parts, strict=True))))
     shares = {name: estimate(sums, mean_functional(name)) for name in QUADRANTS}
     return Quadrants(int(counted.sum()), **shares, wrong_of_consistent_op3=wrong)
 

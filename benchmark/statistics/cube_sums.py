@@ -74,7 +74,7 @@ def location_sums(table: VoxelTable, columns: Columns, cubes: Cubes) -> ClusterS
     )
     (by_voxel,) = cubes.sums_by_class(table.evidence, lambda weight, voxel: weight / table.op[voxel])
     kappa = np.hstack([sums["psa"], by_voxel])  # as of `kappa_columns`
-    return cubes.named(sums | {"kappa": kappa})
+    return cubes.sums_by_name(sums | {"kappa": kappa})
 
 
 # --- Locations that flip
@@ -105,7 +105,7 @@ class FlippingSums:
     def from_table(cls, table: VoxelTable, consistent: Float64, cubes: Cubes) -> FlippingSums:
         """Return the sums of a table by the stability posterior (n,), over the cubes of its voxels with OP >= 2."""
         inconsistent = np.round((1 - consistent) / UNIT) * UNIT
-        share = cubes.named(cubes.means({"inconsistent": inconsistent}))
+        share = cubes.sums_by_name(cubes.means({"inconsistent": inconsistent}))
         return cls(share, int(np.count_nonzero(table.op >= ENOUGH)), _together(table, inconsistent))
 
     def flipping(self, classes: Sequence[str] = ()) -> Flipping:
@@ -145,4 +145,4 @@ def log_sums(sample: MapSample, cubes: Cubes) -> tuple[Columns, ClusterSums | No
         "frames_since": changes.since,
     }
     columns: Columns = {"flip_rate": changes.rate, "frames_since_flip": changes.since}
-    return columns, cubes.named(cubes.means(means))
+    return columns, cubes.sums_by_name(cubes.means(means))

@@ -90,7 +90,7 @@ def losses(table: VoxelTable, limit: VoxelTable) -> Losses:
     cubes = Cubes.from_table(table.rows(rows), where=np.ones(len(rows), np.bool_))
     means = cubes.means({"total": total, "geometry": geometry, "model": total - geometry})
     means["share"] = np.stack([means["geometry"][:, 0], means["total"][:, 0]], axis=1)
-    sums = cubes.named(means)
+    sums = cubes.sums_by_name(means)
     return Losses(
         voxels=len(rows),
         total=estimate(sums, mean_functional("total")).ends,

@@ -41,7 +41,7 @@ def moved_spots(
         return None
     asked = np.zeros(len(spots.point), np.bool_)
     asked[spots.spot] = True
-    decided, moved = asked & votes.known, asked & votes.moved
+    decided, moved = asked & votes.decided, asked & votes.moved
     share, static = 0.0, alpha
     if moved.any():
         share, rest = share_of_disagreement(spots, moved, decided & ~moved), sums_of_spots(static_spots(spots))

@@ -167,7 +167,7 @@ class SpotVotes:
         return np.asarray((self.votes >= LEAST_VOTES) & few & ~self.next_to, np.bool_)
 
     @property
-    def known(self) -> Mask:
+    def decided(self) -> Mask:
         """(n,) spots of which it is known whether they moved."""
         return self.moved | self.static
 
@@ -186,7 +186,7 @@ class SpotVotes:
         """
         from scipy import special
 
-        n, count = np.unique(self.votes[self.known & (self.votes >= LEAST_VOTES)], return_counts=True)
+        n, count = np.unique(self.votes[self.decided & (self.votes >= LEAST_VOTES)], return_counts=True)
         if not len(n):
             return math.nan
         least = np.maximum(LEAST_THROUGH, np.floor(SHARE_THROUGH * n + 1e-9) + 1)

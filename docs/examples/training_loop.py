@@ -48,8 +48,8 @@ def network() -> nn.Module:
 
 def miou(predicted: torch.Tensor, labels: torch.Tensor) -> float:
     """Mean intersection over union of the classes that are there."""
-    known = labels < K
-    pairs = torch.bincount(labels[known] * K + predicted[known], minlength=K * K).reshape(K, K)
+    labelled = labels < K
+    pairs = torch.bincount(labels[labelled] * K + predicted[labelled], minlength=K * K).reshape(K, K)
     right, union = pairs.diag(), pairs.sum(0) + pairs.sum(1) - pairs.diag()
     return float((right / union)[union > 0].mean())
 

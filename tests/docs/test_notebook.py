@@ -35,7 +35,7 @@ def executed(folder: Path):
     return notebook
 
 
-def shown(notebook) -> list[str]:
+def texts_of_cells(notebook) -> list[str]:
     """What the cells show, without pictures."""
     texts = []
     for cell in notebook.cells:
@@ -60,8 +60,8 @@ def test_the_notebook_says_what_it_says_in_the_documentation(tmp_path, tmp_path_
     (startup / "coarse.py").write_text(COARSE)
     stored = nbformat.read(NOTEBOOK, nbformat.NO_CONVERT)
     assert len(stored.cells) <= 12
-    again = shown(executed(tmp_path))
-    assert again == shown(stored)
+    again = texts_of_cells(executed(tmp_path))
+    assert again == texts_of_cells(stored)
     assert "the gate passes" in "".join(again)
     assert "<table>" in again[0]
 

@@ -240,95 +240,103 @@ def forged_rows() -> Iterator[Forgery]:
 
 def forged_places() -> Iterator[Forgery]:
     """Yield edits of cubes, frames and their sizes."""
-    yield "places", "each row a cube of its own", each(put_all(ix=number))
-    yield "places", "each cube its own", each(put_all(ix=lambda sums: 1000 * sums["ix"] + sums["frame"]))
-    yield "places", "cubes a mile away", each(put_all(iz=lambda sums: sums["iz"] + 100))
+    yield "places", "each row a cube of its own", in_each_part(put_all(ix=number))
+    yield "places", "each cube its own", in_each_part(put_all(ix=lambda sums: 1000 * sums["ix"] + sums["frame"]))
+    yield "places", "cubes a mile away", in_each_part(put_all(iz=lambda sums: sums["iz"] + 100))
     yield (
         "places",
         "one cube",
-        each(put_all(ix=lambda s: 0 * s["ix"], iy=lambda s: 0 * s["iy"], iz=lambda s: 0 * s["iz"])),
+        in_each_part(put_all(ix=lambda s: 0 * s["ix"], iy=lambda s: 0 * s["iy"], iz=lambda s: 0 * s["iz"])),
     )
-    yield "places", "frames shifted", each(put_all(frame=lambda sums: sums["frame"] + 1))
+    yield "places", "frames shifted", in_each_part(put_all(frame=lambda sums: sums["frame"] + 1))
     yield (
         "places",
         "frames reversed",
-        each(put_all(frame=lambda s: np.where(s["frame"] < 0, -1, s["frame"].max() - s["frame"]))),
+        in_each_part(put_all(frame=lambda s: np.where(s["frame"] < 0, -1, s["frame"].max() - s["frame"]))),
     )
-    yield "places", "one frame", each(put_all(frame=lambda sums: np.minimum(sums["frame"], 0)))
-    yield "places", "groups of 0 frames", each(said(step=lambda values: [0] * len(values)))
-    yield "places", "groups of 64 frames", each(said(step=lambda values: [64] * len(values)))
-    yield "places", "100 frames more were fused", each(said(fused=lambda values: [n + 100 for n in values]))
-    yield "places", "0 frames were fused", each(said(fused=lambda values: [0] * len(values)))
-    yield "places", "cubes said to be twice as large", each(said(edge=lambda values: [2 * x for x in values]))
-    yield "places", "cubes said to be half as large", each(said(edge=lambda values: [x / 2 for x in values]))
-    yield "places", "voxels said to be larger", each(said(voxel_size=lambda values: [2 * x for x in values]))
+    yield "places", "one frame", in_each_part(put_all(frame=lambda sums: np.minimum(sums["frame"], 0)))
+    yield "places", "groups of 0 frames", in_each_part(said(step=lambda values: [0] * len(values)))
+    yield "places", "groups of 64 frames", in_each_part(said(step=lambda values: [64] * len(values)))
+    yield "places", "100 frames more were fused", in_each_part(said(fused=lambda values: [n + 100 for n in values]))
+    yield "places", "0 frames were fused", in_each_part(said(fused=lambda values: [0] * len(values)))
+    yield "places", "cubes said to be twice as large", in_each_part(said(edge=lambda values: [2 * x for x in values]))
+    yield "places", "cubes said to be half as large", in_each_part(said(edge=lambda values: [x / 2 for x in values]))
+    yield "places", "voxels said to be larger", in_each_part(said(voxel_size=lambda values: [2 * x for x in values]))
     for times, groups in ((2, 1), (4, 1), (64, 1), (1, 2), (1, 16), (64, 64)):
-        yield "places", f"cubes {times} times as large, groups of {groups}", each(larger(times, groups))
+        yield "places", f"cubes {times} times as large, groups of {groups}", in_each_part(larger(times, groups))
 
 
 def forged_scaled_sums() -> Iterator[Forgery]:
     """Yield edits of sums that are multiplied."""
     for factor in (1000.0, 10.0, 2.0, 1.5, 0.5, 0.1):
-        yield "all sums", f"times {factor:g}", each(times(factor))
-        yield "all sums", f"of spots times {factor:g}", each(times(factor, (1, 2, 3)))
-        yield "all sums", f"of the map times {factor:g}", each(times(factor, (0,)))
-        yield "all sums", f"of second answers times {factor:g}", each(times(factor, (2,)))
-        yield "all sums", f"of third answers times {factor:g}", each(times(factor, (3,)))
+        yield "all sums", f"times {factor:g}", in_each_part(times(factor))
+        yield "all sums", f"of spots times {factor:g}", in_each_part(times(factor, (1, 2, 3)))
+        yield "all sums", f"of the map times {factor:g}", in_each_part(times(factor, (0,)))
+        yield "all sums", f"of second answers times {factor:g}", in_each_part(times(factor, (2,)))
+        yield "all sums", f"of third answers times {factor:g}", in_each_part(times(factor, (3,)))
 
 
 def forged_agreement() -> Iterator[Forgery]:
     """Yield edits of agreement of the answers."""
     for parts, of in (((1,), "first"), ((2,), "second"), ((3,), "third"), ((1, 2, 3), "all")):
-        yield "agreement", f"all of {of} answers agree", each(within(parts, agreeing=all_agree))
+        yield "agreement", f"all of {of} answers agree", in_each_part(within(parts, agreeing=all_agree))
         yield (
             "agreement",
             f"a tenth more of {of} answers agree",
-            each(within(parts, agreeing=lambda s: 1.1 * s["agreeing"])),
+            in_each_part(within(parts, agreeing=lambda s: 1.1 * s["agreeing"])),
         )
-        yield "agreement", f"no one's own in {of} answers", each(within(parts, own=lambda s: 0 * s["own"]))
-        yield "agreement", f"pairs agree in {of} answers", each(within(parts, twice_agreeing=lambda s: s["twice"]))
-        yield "agreement", f"psa is 1 in {of} answers", each(within(parts, psa=lambda s: s["voxels"]))
-    yield "agreement", "second answers are near", each(within((2,), square=lambda s: s["square"] / 4))
-    yield "agreement", "second answers are far", each(within((2,), square=lambda s: 4 * s["square"]))
-    yield "agreement", "first answers are far", each(within((1,), square=lambda s: 4 * s["square"]))
+        yield "agreement", f"no one's own in {of} answers", in_each_part(within(parts, own=lambda s: 0 * s["own"]))
+        yield (
+            "agreement",
+            f"pairs agree in {of} answers",
+            in_each_part(within(parts, twice_agreeing=lambda s: s["twice"])),
+        )
+        yield "agreement", f"psa is 1 in {of} answers", in_each_part(within(parts, psa=lambda s: s["voxels"]))
+    yield "agreement", "second answers are near", in_each_part(within((2,), square=lambda s: s["square"] / 4))
+    yield "agreement", "second answers are far", in_each_part(within((2,), square=lambda s: 4 * s["square"]))
+    yield "agreement", "first answers are far", in_each_part(within((1,), square=lambda s: 4 * s["square"]))
     yield (
         "agreement",
         "evidence of two classes swapped",
-        each(within((1, 2, 3), evidence_0=lambda s: s["evidence_1"], evidence_1=lambda s: s["evidence_0"])),
+        in_each_part(within((1, 2, 3), evidence_0=lambda s: s["evidence_1"], evidence_1=lambda s: s["evidence_0"])),
     )
-    yield "agreement", "classes are as frequent as each other", each(even)
-    yield "agreement", "first and second answers exchanged", each(answers(2, 1, 3))
-    yield "agreement", "answers in the opposite order", each(answers(3, 2, 1))
-    yield "agreement", "third answers are the second ones", each(answers(1, 2, 2))
-    yield "agreement", "third answers are the first ones", each(answers(1, 2, 1))
-    yield "agreement", "second answers are the third ones", each(answers(1, 3, 3))
+    yield "agreement", "classes are as frequent as each other", in_each_part(even)
+    yield "agreement", "first and second answers exchanged", in_each_part(answers(2, 1, 3))
+    yield "agreement", "answers in the opposite order", in_each_part(answers(3, 2, 1))
+    yield "agreement", "third answers are the second ones", in_each_part(answers(1, 2, 2))
+    yield "agreement", "third answers are the first ones", in_each_part(answers(1, 2, 1))
+    yield "agreement", "second answers are the third ones", in_each_part(answers(1, 3, 3))
 
 
 def forged_classes() -> Iterator[Forgery]:
     """Yield edits of classes."""
-    yield "classes", "an unknown class", each(named(lambda names: ["x", *names[1:]]))
-    yield "classes", "classes in another order", each(named(lambda names: names[::-1]))
-    yield "classes", "no names", each(named(lambda names: []))
+    yield "classes", "an unknown class", in_each_part(with_names(lambda names: ["x", *names[1:]]))
+    yield "classes", "classes in another order", in_each_part(with_names(lambda names: names[::-1]))
+    yield "classes", "no names", in_each_part(with_names(lambda names: []))
     yield (
         "classes",
         "a class more",
-        each(lambda sums, about: about.update(K=about["K"] + 1, classes=[*about["classes"], "x"])),
+        in_each_part(lambda sums, about: about.update(K=about["K"] + 1, classes=[*about["classes"], "x"])),
     )
     yield (
         "classes",
         "a class fewer",
-        each(lambda sums, about: about.update(K=about["K"] - 1, classes=about["classes"][:-1])),
+        in_each_part(lambda sums, about: about.update(K=about["K"] - 1, classes=about["classes"][:-1])),
     )
-    yield "classes", "no ground truth", each(lambda sums, about: about.update(truth=not about["truth"]))
+    yield "classes", "no ground truth", in_each_part(lambda sums, about: about.update(truth=not about["truth"]))
 
 
 def forged_truth() -> Iterator[Forgery]:
     """Yield edits of what is right by the ground truth."""
-    yield "truth", "nothing consistent is wrong", each(if_truth(consistent_wrong=zeros))
-    yield "truth", "nothing is consistent", each(if_truth(consistent_wrong=zeros, consistent=zeros))
-    yield "truth", "all is right", each(if_truth(right=lambda s: s["known"]))
-    yield "truth", "all is right, nothing wrong", each(if_truth(right=lambda s: s["known"], consistent_wrong=zeros))
-    yield "truth", "all is right, class by class", each(right)
+    yield "truth", "nothing consistent is wrong", in_each_part(if_truth(consistent_wrong=zeros))
+    yield "truth", "nothing is consistent", in_each_part(if_truth(consistent_wrong=zeros, consistent=zeros))
+    yield "truth", "all is right", in_each_part(if_truth(right=lambda s: s["known"]))
+    yield (
+        "truth",
+        "all is right, nothing wrong",
+        in_each_part(if_truth(right=lambda s: s["known"], consistent_wrong=zeros)),
+    )
+    yield "truth", "all is right, class by class", in_each_part(right)
     yield "truth", "cubes that are mostly wrong left out", of_rows(only_right)
     for name in ("accuracy", "miou", "wrong_of_consistent"):
         yield "truth", f"{name} is stated as .99", stated(name, value=0.99, undecided="x")
@@ -357,7 +365,7 @@ def level(parts: Parts, wanted: str = "stable") -> None:
         record["verdict"].update(level=wanted, of_all=None)
 
 
-def each(change: Callable[[Table, Content], None]) -> Callable[[Parts], None]:
+def in_each_part(change: Callable[[Table, Content], None]) -> Callable[[Parts], None]:
     def apply(parts: Parts) -> None:
         for sums, about in zip(parts.sums, parts.about, strict=True):
             change(sums, about)
@@ -371,7 +379,7 @@ def take(sums: Table, rows: np.ndarray) -> None:
 
 
 def of_rows(choose: Callable[[Table], np.ndarray]) -> Callable[[Parts], None]:
-    return each(lambda sums, about: take(sums, choose(sums)))
+    return in_each_part(lambda sums, about: take(sums, choose(sums)))
 
 
 def worst(share: float, parts: tuple[int, ...] = (1, 2, 3)) -> Callable[[Table], np.ndarray]:
@@ -473,7 +481,7 @@ def answers(*of: int) -> Callable[[Table, Content], None]:
     return change
 
 
-def named(change: Callable[[list[str]], list[str]]) -> Callable[[Table, Content], None]:
+def with_names(change: Callable[[list[str]], list[str]]) -> Callable[[Table, Content], None]:
     def apply(sums: Table, about: Content) -> None:
         about["classes"] = change(about["classes"])
 

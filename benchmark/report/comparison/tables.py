@@ -101,13 +101,13 @@ COUNTED = {"better": "more", "worse": "fewer"}
 
 def _titled(quantity: Quantity) -> str:
     unit = f", {quantity.unit}" if quantity.unit else ""
-    return f"{quantity.named}{unit}"
+    return f"{quantity.full_title}{unit}"
 
 
 def _by_class(comparison: RunComparison) -> Table:
     measured = {row.measure for _, against in scopes(comparison) for row in against.by_class}
     quantities = [quantity for quantity in IN_CLASSES if quantity.name in measured]
-    columns = (Column("class", "Class"), *(Column(q.name, q.named, 3, q.better, signed=True) for q in quantities))
+    columns = (Column("class", "Class"), *(Column(q.name, q.full_title, 3, q.better, signed=True) for q in quantities))
     worse = Column("worse", "Worse"), Column("better", "Better")
     groups = tuple(
         Group(heading(comparison, scope, against), _class_rows(against, quantities))

@@ -60,7 +60,7 @@ class Column:
 
         Its header holds its population, unless the heading `over` it does; its key does, unless each row has its own.
         """
-        digits, title = quantity.digits[compared], quantity.title if over else quantity.named
+        digits, title = quantity.digits[compared], quantity.title if over else quantity.full_title
         key = quantity.key + POPULATIONS[over] if over else quantity.name
         return cls(key, title, digits, quantity.better, over=over)
 
