@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import math
 import re
 
 import numpy as np
@@ -10,6 +11,7 @@ import pytest
 import tiny_scene
 from posed_config import configure
 from posed_scene import fails
+from scipy.stats import binomtest
 from simulated_events import grid, log_of
 from typer.testing import CliRunner
 
@@ -18,11 +20,8 @@ from semstab import AcceptanceThresholds, VoxelTable
 from semstab.cli import app
 from semstab.data.measures import dominant, vss
 from semstab.errors import ConfigError, DataError
-from semstab.statistics import acceptance
-from semstab.statistics.acceptance import calibrate
+from semstab.statistics.acceptance import calibrate, share_of_few_cubes
 from semstab.statistics.correctness import Truth
-
-OF_FEW = acceptance._of_few
 
 CLASSES = ("road", "car", "tree")
 
@@ -74,18 +73,24 @@ def test_labels_that_err_together_count_as_few():
     assert low[0] > low[1]
 
 
-def test_labels_without_an_error_have_the_lower_end_of_clopper_and_pearson(monkeypatch):
-    """All cubes are right: the lower end is error^(1 / m), m the number of cubes of one size that tell as much."""
+def test_the_lower_end_of_few_cubes_is_that_of_clopper_and_pearson():
+    """Cubes of unequal size tell as much as fewer equal ones; without an error the lower end is error^(1 / m)."""
+    size = np.array([4.0, 4.0, 2.0, 1.0, 1.0])
+    m = 12**2 / 38
+    assert share_of_few_cubes(np.stack([size, size], axis=1), 0.05) == pytest.approx((1.0, 0.05 ** (1 / m)))
+    right = np.r_[np.full(19, 3.0), 0.0]
+    expected = binomtest(19, 20, alternative="greater").proportion_ci(0.95, method="exact").low
+    assert share_of_few_cubes(np.stack([right, np.full(20, 3.0)], axis=1), 0.05) == pytest.approx((0.95, expected))
+
+
+def test_labels_without_an_error_in_two_such_maps_have_the_lower_end_of_twice_the_cubes():
     index = np.stack(np.meshgrid(*[np.arange(8)] * 3, indexing="ij"), axis=-1).reshape(-1, 3).astype(np.int32)
     table = dataclasses.replace(log_of(np.zeros((len(index), 3), int), index=index).table(), classes=("a", "b", "c"))
     label = dominant(table).astype(np.int64)
-    tried = []
-    monkeypatch.setattr(acceptance, "_of_few", lambda sums, error: tried.append((sums, error)) or OF_FEW(sums, error))
-    found = calibrate([(table, Truth(label >= 0, label))], precision=0.01).classes["a"]
-    sums, error = tried[0]
-    m = sums[:, 1].sum() ** 2 / (sums[:, 1] ** 2).sum()
-    assert 0.5 * len(sums) < m < len(sums)
-    assert found.low == pytest.approx(error ** (1 / m))
+    scene = (table, Truth(label >= 0, label))
+    one, two = (calibrate([scene] * count, precision=0.01).classes["a"].low for count in (1, 2))
+    assert 0.5 < one < two < 1
+    assert math.log(one) / math.log(two) == pytest.approx(2)
 
 
 def test_a_file_keeps_it_and_another_kind_of_map_is_refused(commit, tmp_path):

@@ -28,7 +28,7 @@ from semstab.configure import shipped_benchmarks
 from semstab.core.sealed_zip import packed, unpacked
 from semstab.datasets import city
 from semstab.errors import ConfigError, DataError
-from semstab.leaderboard.board import board_of, boards, tables_of
+from semstab.leaderboard.board import board_of_numbers, boards, numbers_of, tables_of
 from semstab.leaderboard.definition import load_benchmark
 from semstab.leaderboard.geometry import geometry_file, save_geometry
 from semstab.leaderboard.submission import load_submission, require_whole, submissions
@@ -374,12 +374,18 @@ def test_the_level_of_a_verdict_is_computed_from_the_sums(home, results) -> None
         assert [scene.level for scene in row.scenes.values()] == levels
 
 
-def test_a_model_that_alpha_does_not_assess_is_shown_without_a_rank(home, results, monkeypatch) -> None:
+def test_a_model_that_alpha_does_not_assess_is_shown_without_a_rank(home, results) -> None:
     levels = {"good": ("misleading", "misleading"), "same": ("stable", "usable"), "bad": ("uninformative", "usable")}
-    given = iter([level for name in results for level in levels[name]])
-    monkeypatch.setattr("semstab.leaderboard.board._level", lambda *_: next(given))
     loaded = {name: load_submission(file, definitions(home)) for name, file in results.items()}
-    board = board_of(loaded["good"][0], [(name, about, handle) for name, (_, about, handle) in loaded.items()])
+    benchmark, listed = loaded["good"][0], [(name, about, handle) for name, (_, about, handle) in loaded.items()]
+    numbers = {
+        name: {
+            scene: dataclasses.replace(of_scene, level=level)
+            for (scene, of_scene), level in zip(scenes.items(), levels[name], strict=True)
+        }
+        for name, scenes in numbers_of(benchmark, listed).items()
+    }
+    board = board_of_numbers(benchmark, listed, numbers)
     assert [(row.name, row.ranks, row.verdict) for row in board.rows] == [
         ("same", "1", "stable 1, usable 1"), ("bad", "2", "uninformative 1, usable 1"), ("good", "-", "misleading"),
     ]  # fmt: skip

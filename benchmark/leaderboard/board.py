@@ -205,15 +205,31 @@ def board_of(benchmark: Benchmark, results: Sequence[Result]) -> Board:
     Raises:
         DataError: For two results of one name.
     """
+    return board_of_numbers(benchmark, results, numbers_of(benchmark, results))
+
+
+def numbers_of(benchmark: Benchmark, results: Sequence[Result]) -> dict[str, dict[str, SceneNumbers]]:
+    """Return the numbers of each result, by its name and by scene.
+
+    Raises:
+        DataError: For two results of one name.
+    """
     names = [_name(about, handle) for _, about, handle in results]
     if twice := next((name for name in names if names.count(name) > 1), None):
         first, second = (file for (file, _, _), name in zip(results, names, strict=True) if name == twice)
         raise DataError(f"{first} and {second}: both are called '{twice}'; name one otherwise in its card")
-    places, geometry = benchmark.places(), benchmark.geometry
-    numbers = {
+    geometry = benchmark.geometry
+    return {
         name: {scene: SceneNumbers.from_sums(handle.scenes[scene].sums, geometry[scene]) for scene in benchmark.scenes}
         for name, (_, _, handle) in zip(names, results, strict=True)
     }
+
+
+def board_of_numbers(
+    benchmark: Benchmark, results: Sequence[Result], numbers: Mapping[str, Mapping[str, SceneNumbers]]
+) -> Board:
+    """Return the table of results whose numbers are these, in the order of the results."""
+    places, names = benchmark.places(), [*numbers]
     unranked = _unranked(numbers)
     compared = [name for name in names if not any(name in unranked_names for unranked_names in unranked.values())]
     ranking = ranked(

@@ -224,13 +224,13 @@ class _ClassLabels:
         sums: Float64 = np.stack([np.bincount(of, w, cells) for w in (right, ones)], axis=1).astype(np.float64)
         sums = sums[sums[:, 1] > 0]
         if np.count_nonzero(sums[:, 0] < sums[:, 1]) <= FEW_CUBES:
-            return _of_few(sums, error)
+            return share_of_few_cubes(sums, error)
         there = ClusterSums.of_cubes(self._cell[np.unique(of)], self._edge, {"right": sums})
         result = estimate(there, mean_functional("right"), level=1 - 2 * error)
         return result.value, result.low if result.decided else 0.0
 
 
-def _of_few(sums: Float64, error: float) -> tuple[float, float]:
+def share_of_few_cubes(sums: Float64, error: float) -> tuple[float, float]:
     """Return the share that is right and its lower end, where few cubes (m, 2) hold an error.
 
     Cubes, of one size, count as right or wrong as a whole (Clopper and Pearson 1934).
