@@ -35,7 +35,7 @@ MEAN, STD = (
 )  # of ImageNet, as EdgeNets trains
 
 
-class PretrainedNetwork:
+class Network:
     """A network with the weights of one file.
 
     Args:
@@ -71,25 +71,25 @@ class PretrainedNetwork:
         return y.softmax(0).permute(1, 2, 0).numpy() if self.soft else y.argmax(0).numpy().astype(np.uint8)
 
 
-class espnetv2_voc(PretrainedNetwork):  # noqa: N801  a name of --predict
+class espnetv2_voc(Network):  # noqa: N801  a name of --predict
     """ESPNetv2, PASCAL VOC 2012: scale 0.5, 1.0, 1.5, 2.0."""
 
     family, data, size, classes = "espnetv2", "pascal", (384, 384), VOC
 
 
-class espnetv2_city(PretrainedNetwork):  # noqa: N801
+class espnetv2_city(Network):  # noqa: N801
     """ESPNetv2, Cityscapes: scale 0.5, 1.0, 1.5, 2.0."""
 
     family, data, size, classes = "espnetv2", "city", (256, 512), CITY
 
 
-class dicenet_voc(PretrainedNetwork):  # noqa: N801
+class dicenet_voc(Network):  # noqa: N801
     """DiCENet, PASCAL VOC 2012: scale 0.2, 0.5, 0.75, 1.0, 1.25, 1.75."""
 
     family, data, size, classes = "dicenet", "pascal", (384, 384), VOC
 
 
-class dicenet_city(PretrainedNetwork):  # noqa: N801
+class dicenet_city(Network):  # noqa: N801
     """DiCENet, Cityscapes: scale 0.5, 0.75, 1.0, 1.25, 1.5, 1.75."""
 
     family, data, size, classes = "dicenet", "city", (256, 512), CITY

@@ -83,7 +83,7 @@ def test_the_lower_end_of_few_cubes_is_that_of_clopper_and_pearson():
     assert share_of_few_cubes(np.stack([right, np.full(20, 3.0)], axis=1), 0.05) == pytest.approx((0.95, expected))
 
 
-def test_labels_without_an_error_in_two_such_maps_have_the_lower_end_of_twice_the_cubes():
+def test_labels_without_an_error_in_two_maps_have_the_lower_end_of_twice_the_cubes():
     index = np.stack(np.meshgrid(*[np.arange(8)] * 3, indexing="ij"), axis=-1).reshape(-1, 3).astype(np.int32)
     table = dataclasses.replace(log_of(np.zeros((len(index), 3), int), index=index).table(), classes=("a", "b", "c"))
     label = dominant(table).astype(np.int64)

@@ -70,8 +70,8 @@ def view_of(scene: CityScene, index: int, *, as_frame: int | None = None) -> Cit
     return CityView(index if as_frame is None else as_frame, rendered, frame.intrinsics, frame.T_wc)
 
 
-def simulated(scene: CityScene, view: CityView, **model: Any) -> np.ndarray:
-    return Simulation(SimulatedModel(**model), 0, "test", scene.name).labels(view)
+def simulated(scene: CityScene, city_view: CityView, **model: Any) -> np.ndarray:
+    return Simulation(SimulatedModel(**model), 0, "test", scene.name).labels(city_view)
 
 
 def test_frames_depend_on_the_seed_and_not_on_the_order_of_calls(small) -> None:

@@ -11,6 +11,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
+import cv2
 import numpy as np
 import pytest
 import rerun as rr
@@ -34,7 +35,6 @@ from semstab.recording import (
     color_modes,
     drift,
     lacks_pictures,
-    observer,
     record_finished,
     timeline,
     voxel_maps,
@@ -197,18 +197,20 @@ def test_the_final_voxels_are_those_of_the_run(run, model) -> None:
     np.testing.assert_array_equal(voxels["category"], expected)
 
 
-def test_a_map_about_which_its_frames_say_nothing_has_no_categories(tmp_path, monkeypatch) -> None:
-    told = "uninformative: 98 % of the observations of b are wall"
-    monkeypatch.setattr(observer, "not_assessed", lambda run: told if run.unit.model == "b" else "")
-    file, root = tmp_path / "run.rrd", tiny_scene.write(tmp_path / "data" / "wall")
-    semstab.run(config_of(root), out=tmp_path / "run", observers=[Recording(file)], report=False)
+def test_a_map_of_one_class_has_no_categories(tmp_path) -> None:
+    file, root = tmp_path / "run.rrd", tiny_scene.write(tmp_path / "data" / "wall", frames=60)
+    for labels in (root / "labels/b").iterdir():
+        cv2.imwrite(str(labels), np.zeros((tiny_scene.HEIGHT, tiny_scene.WIDTH), np.uint8))
+    config = configure(root, backends=["numpy"], statistics=True)
+    result = semstab.run(config, out=tmp_path / "run", observers=[Recording(file)], report=False)
+    assert result.record(model="b").statistics.verdict.level == "uninformative"
     colors = {model: {*grid(read(file), f"/wall/map/{model}/numpy")["category"]} for model in "ab"}
     assert colors["b"] == {*voxel_maps.packed([metrics.NOT_ASSESSED]).tolist()}
     assert colors["a"] <= {*voxel_maps.packed(metrics.CATEGORY_COLORS).tolist()}
     titles = [row.get("ViewBlueprint:display_name") for rows in read_blueprints(file) for row in rows]
     assert ["b: not assessed (uninformative)"] in titles
     assert ["a: not assessed (uninformative)"] not in titles
-    assert any(told in note for note in notes(read(file)))
+    assert any("uninformative: all of the observations of b are wall" in note for note in notes(read(file)))
 
 
 def test_voxels_have_the_colours_of_the_legend(run) -> None:

@@ -3,9 +3,12 @@
 from __future__ import annotations
 
 import io
+import math
 import shutil
 from dataclasses import replace
 
+import cv2
+import numpy as np
 import pytest
 import tiny_scene
 from posed_config import configure
@@ -72,6 +75,18 @@ def test_every_pair_is_compared_and_corrected(result):
 def test_a_map_of_nearly_one_class_has_no_rank(result):
     assert ranking(result[0]).unranked == ("constant",)
     assert "not ranked, as nearly the whole map is one class: constant" in list(order_of_models(result[0]))
+
+
+def test_a_model_that_gives_one_class_in_a_short_run_has_no_place_in_the_order(tmp_path):
+    """Chance alone would always agree: its alpha is undefined, of all pixels, too."""
+    root = tiny_scene.write(tmp_path / "wall")
+    for labels in (root / "labels/b").iterdir():
+        cv2.imwrite(str(labels), np.zeros((tiny_scene.HEIGHT, tiny_scene.WIDTH), np.uint8))
+    found = semstab.run(configure(root, statistics=True), out=tmp_path / "run", report=False)
+    assert found.record(model="b").statistics.verdict.level == "no verdict"
+    assert math.isnan(found.record(model="b").statistics.headline.alpha.value)
+    assert "b     no verdict     -" in printed(found, tmp_path / "run")
+    assert not any("b" in text.split() for text in order_of_models(found))
 
 
 SIX = ["colour-clusters,clusters=6,name=six", "colour-clusters,clusters=6,seed=2,name=other"]

@@ -46,7 +46,7 @@ def spots(*arguments, **options):
 
 
 def ground_truth():
-    return model(0.0, 1, seen=1.0).table()
+    return model(0.0, 1, share_seen=1.0).table()
 
 
 @pytest.fixture(scope="module")
@@ -284,7 +284,7 @@ def test_the_line_names_unstable_classes_the_most_probable_first():
 
 
 def test_voxels_seen_once_change_no_verdict():
-    events = model(0.3, 8, seen=0.3)
+    events = model(0.3, 8, share_seen=0.3)
     table = events.table()
     again = table.op >= 2
     columns = ("ix", "iy", "iz", "op", "evidence", "drift_sum", "pixels", "first_frame", "last_frame", "self_sum",

@@ -8,7 +8,7 @@ import math
 import numpy as np
 import pytest
 from simulated_events import log_of_evidence
-from striped_floor import K, flight, sampled
+from striped_floor import K, flight, numbered, sampled
 
 from semstab.comparison.differences import sums_difference
 from semstab.comparison.observations import common_observations, compared_observations, psa_bounds
@@ -66,6 +66,23 @@ def test_the_order_is_said_to_depend_on_errors_that_were_left_out():
     assert missing["silent"].missing == pytest.approx(share, abs=0.03)
     assert missing["better"].missing == 0
     assert missing["silent"].alpha < missing["better"].alpha
+
+
+def hovering(flicker, frames=4):
+    """A camera that stands at eight places; its labels err differently in each frame."""
+    series = [flight(8, flicker=flicker, patch=10, seed=seed) for seed in range(frames)]
+    return numbered(frame for of_place in zip(*series, strict=True) for frame in of_place)
+
+
+def test_frames_of_a_standing_camera_that_repeat_others_leave_nothing_out():
+    """They count once: a model that repeats its labels has fewer answers than one that flickers."""
+    found = compared(steady=hovering(0.0), nervous=hovering(0.3)).compared
+    assert [row.missing for row in found.ignored] == [0, 0]
+    assert found.order == found.order_ignored == ("steady", "nervous")
+    assert not found.depends
+    half = without(hovering(0.0), lambda frame: np.arange(80) < 40)
+    (left, _) = compared(half=half, nervous=hovering(0.3)).compared.ignored
+    assert left.missing == pytest.approx(0.5, abs=0.03)
 
 
 def test_bounds_hold_the_agreement_that_there_is_where_nothing_is_left_out():

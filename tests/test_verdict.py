@@ -75,6 +75,8 @@ def test_probabilities_of_all_sum_to_one():
         assert sum(level_probabilities(Interval(0.8, 0.7, 0.9, degrees=9), pairs=pairs).values()) == pytest.approx(1)
         assert pairs.of_labelled(pairs.of_all(0.8)) == pytest.approx(0.8)
     assert math.isinf(LabelledPairs(0.0, 0.3).of_labelled(0.5))
+    assert math.isnan(LabelledPairs(0.9, 1.0).of_all(math.nan))
+    assert math.isnan(LabelledPairs(0.9, 1.0).of_labelled(0.8))
 
 
 def test_the_share_of_pairs_is_that_of_views_that_both_label():

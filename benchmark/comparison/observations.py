@@ -60,14 +60,17 @@ def common_observations(models: Sequence[SpotObservations]) -> CommonObservation
         near[k], far[k] = (np.bincount(numbers, squares, len(first)) for squares in (sample.near, sample.far))
     elsewhere = (near == near[0]).all(axis=0) & (far != far[0]).any(axis=0)
     common: Mask = (labelled > 0).all(axis=0) & (silent == 0).all(axis=0) & ~elsewhere
+    answers = labelled + silent
     most = labelled.max(axis=0)
+    # a frame that repeats another one of its view gives no answer of its own: it leaves nothing out
+    left_out = np.where(answers > 0, silent, most)
     asked = SpotObservations.stacked(models).only(first)
     shared, ignoring = [], []
-    for sample, numbers, counts in zip(models, of, labelled, strict=True):
+    for sample, numbers, ignored in zip(models, of, left_out, strict=True):
         shared.append(sample.only(common[numbers]))
-        ignoring.append(_filled(sample.labelled(), asked, most - counts))
-    total = most.sum()
-    missing = tuple(float(1 - counts.sum() / total) if total else math.nan for counts in labelled)
+        ignoring.append(_filled(sample.labelled(), asked, ignored))
+    shares = left_out / np.maximum(np.where(answers > 0, answers, most), 1)
+    missing = tuple(float(np.average(share, weights=most)) if most.any() else math.nan for share in shares)
     return CommonObservations(tuple(shared), tuple(ignoring), missing)
 
 
@@ -132,8 +135,13 @@ def compared_observations(samples: Mapping[str, SpotObservations]) -> SharedObse
         spots=len(first.ix),
         observations=len(first),
         ignored=tuple(ignored),
-        order=tuple(sorted(names, key=lambda name: -value_of(sums[name], ALPHA.key))),
-        order_ignored=tuple(row.model for row in sorted(ignored, key=lambda row: -row.alpha)),
+        order=_falling({name: value_of(sums[name], ALPHA.key) for name in names}),
+        order_ignored=_falling({row.model: row.alpha for row in ignored}),
         bounded=all(bounds[better][0] >= bounds[worse][1] for better, worse in itertools.pairwise(by_psa)),
     )
     return SharedObservations(sums, logs, compared)
+
+
+def _falling(alpha: Mapping[str, float]) -> tuple[str, ...]:
+    """Return the models by alpha, the highest first; a model whose alpha is undefined, as it gives one class, last."""
+    return tuple(sorted(alpha, key=lambda name: (math.isnan(alpha[name]), -alpha[name])))

@@ -212,15 +212,24 @@ class LabelledPairs:
         Observed disagreement is then share * D + 1 - share, expected disagreement stays 1 - chance:
 
             alpha of all = share * alpha - (1 - share) * chance / (1 - chance)
+
+        NaN if chance alone would always agree.
         """
         if self.share >= 1:
             return alpha
+        if self.chance >= 1:
+            return math.nan
         return self.share * alpha - (1 - self.share) * self.chance / (1 - self.chance)
 
     def of_labelled(self, alpha: float) -> float:
-        """Return the alpha of labelled pairs that is this alpha of all pairs; infinite if no pair has labels."""
+        """Return the alpha of labelled pairs that is this alpha of all pairs; infinite if no pair has labels.
+
+        NaN if chance alone would always agree.
+        """
         if self.share >= 1:
             return alpha
+        if self.chance >= 1:
+            return math.nan
         if not self.share > 0:
             return math.inf
         return (alpha + (1 - self.share) * self.chance / (1 - self.chance)) / self.share
