@@ -183,15 +183,15 @@ def tenths(rows: Sequence[Flown]) -> Iterator[list[str]]:
     for low in np.arange(6, 10) / 10:
         line = [f"{low:.0%} to {low + 0.1:.0%}"]
         for group in ("others", *GROUPS):
-            stated = [
+            in_tenth = [
                 (p, is_right) for name, p, is_right in right if name == group and low <= p < low + 0.1 + (low > 0.85)
             ]
             line += (
-                [f"{np.mean([x for _, x in stated]):.2f}, stated {np.mean([p for p, _ in stated]):.2f}"]
-                if stated
+                [f"{np.mean([x for _, x in in_tenth]):.2f}, stated {np.mean([p for p, _ in in_tenth]):.2f}"]
+                if in_tenth
                 else ["-"]
             )
-            line += [str(len(stated))]
+            line += [str(len(in_tenth))]
         yield line
     line = ["undecided"]
     for group in ("others", *GROUPS):

@@ -508,8 +508,8 @@ def test_the_coverage_rule_sees_both_kinds_of_silence(run, quiet_models, name):
     assert (result.exit_code, judgement.reason, judgement.interval.low) == (4, "counted", judgement.interval.high)
     voxels, observations = map(float, re.findall(r"([\d.]+) % of", *result.notes))
     assert 100 * (1 - judgement.interval.value) == pytest.approx(min(voxels, observations), abs=0.051)
-    table = {run_: semstab.load_result(run_).record(model=model).table().op
-             for run_, model in ((quiet_models, name), (run, "a"))}  # fmt: skip
+    table = {folder: semstab.load_result(folder).record(model=model).table().op
+             for folder, model in ((quiet_models, name), (run, "a"))}  # fmt: skip
     new, base = (op[op >= 2].astype(int) for op in table.values())
     assert voxels == pytest.approx(100 * len(new) / len(base), abs=0.051)
     assert observations == pytest.approx(100 * new.sum() / base.sum(), abs=0.051)

@@ -37,7 +37,7 @@ def test_what_is_promised_stays(promised) -> None:
 ])  # fmt: skip
 def test_each_surface_is_held(promised, surface, name) -> None:
     assert name in promised[surface]
-    found = {**promised, surface: [other for other in promised[surface] if other != name]}
+    found = {**promised, surface: [promise for promise in promised[surface] if promise != name]}
     (line,) = complaints(promised, found)
     assert line.startswith(f"{surface}: {name} is gone; keep the old name for a minor version")
 

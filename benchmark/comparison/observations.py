@@ -69,7 +69,7 @@ def common_observations(models: Sequence[SpotObservations]) -> CommonObservation
     for sample, numbers, ignored in zip(models, of, left_out, strict=True):
         shared.append(sample.only(common[numbers]))
         ignoring.append(_filled(sample.labelled(), asked, ignored))
-    shares = left_out / np.maximum(np.where(answers > 0, answers, most), 1)
+    shares = np.where(answers > 0, silent / np.maximum(answers, 1), 1.0)
     missing = tuple(float(np.average(share, weights=most)) if most.any() else math.nan for share in shares)
     return CommonObservations(tuple(shared), tuple(ignoring), missing)
 
